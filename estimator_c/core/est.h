@@ -105,7 +105,7 @@ typedef struct {
     float   p0;                    ///< initial variance of each a and b; > 0
     float   p0_offset;             ///< initial variance of d; > 0 [codes^2]
     float   noise_variance;        ///< of the noise e, not underestimated; > 0 [codes^2]
-    float   c[EST_NA_MAX];         ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 64
+    float   c[EST_NA_MAX];         ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 70
     est_trigger_config_t trigger;
 } est_config_t;
 
@@ -118,12 +118,19 @@ typedef struct {
 
 typedef enum {
     EST_UPDATED = 0,  ///< the sample entered the estimate
-    EST_MISSING = 1,  ///< the sample was declared missing; theta, its covariance and the statistic are as they were
-    EST_REFUSED = 2,  ///< u or y was not finite or absurd (beyond EST_CODE_LIMIT): counted, treated as missing
+    EST_MISSING = 1,  ///< the sample was declared missing: theta, its covariance and the statistic stay as they were
+    EST_REFUSED = 2,  ///< u or y was not finite, or beyond EST_CODE_LIMIT: counted, otherwise as a missing sample
 } est_status_t;
 
-/// A sample of larger magnitude than this is refused.
+/// A sample of larger magnitude than this is refused [codes].
 #define EST_CODE_LIMIT 1.0e6F
+
+/// The largest ceiling of a trigger [codes, or ln(ARL0)].
+#define EST_CEILING_LIMIT 1.0e9F
+
+/// The range of p0, p0_offset and noise_variance.
+#define EST_VARIANCE_MIN 1.0e-9F
+#define EST_VARIANCE_MAX 1.0e9F
 
 typedef struct {
     est_status_t status;
@@ -144,7 +151,8 @@ typedef struct {
 /// The state of a trigger. Private to the trigger.
 typedef struct {
     float    statistic;
-    uint32_t mean_n;   ///< innovations in the running mean
+    float    mean;     ///< of the innovations since the last alarm, signed
+    uint32_t mean_n;   ///< how many they are
     uint32_t quiet_n;  ///< samples for which the statistic is still held at zero
 } est_trigger_t;
 
@@ -156,7 +164,7 @@ typedef struct {
     uint8_t        first;  ///< the first active row: 0 while the initial conditions matter, past afterwards
     bool           running;  ///< false before the first sample and inside a gap
     float          y[EST_NA_MAX];              ///< filtered outputs y_f(k-1), y_f(k-2), ...
-    float          u[EST_INPUT_PAST_MAX + 1U];  ///< filtered inputs u_f(k), u_f(k-1), ...
+    float          u[EST_PAST_MAX + 1U];         ///< filtered inputs u_f(k), u_f(k-1), ...
     float          impulse[EST_PAST_MAX];      ///< impulse response of 1/C at m, m-1, ...: the regressors of the past
     float          theta[EST_DIM_MAX];
     float          d[EST_DIM_MAX];                                ///< P = U D U', U unit upper triangular
