@@ -1,4 +1,5 @@
 #include "est.h"
+#include "est_edges.h"
 #include "est_trigger.h"
 
 #include <float.h>
@@ -26,13 +27,11 @@ static void count(uint32_t* const counter) { *counter += (*counter < UINT32_MAX)
 /// The part of column j of U above its diagonal: rows 0 .. j-1.
 static float* column(est_t* const self, const uint8_t j) { return &self->upper[(j * (j - 1U)) / 2U]; }
 
-static bool is_offset(const est_t* const self, const uint8_t j)
-{
+static bool is_offset(const est_t* const self, const uint8_t j) {
     return self->config.offset && (j == (uint8_t)(self->dim - 1U));
 }
 
-static float prior_variance(const est_t* const self, const uint8_t j)
-{
+static float prior_variance(const est_t* const self, const uint8_t j) {
     if (j < self->past) {
         return UNKNOWN_VARIANCE;
     }
@@ -41,8 +40,7 @@ static float prior_variance(const est_t* const self, const uint8_t j)
 
 /// P := P0 for the rows below `rows`, which become uncorrelated with all others. Since
 /// P_ij = sum over k >= max(i, j) of U_ik d_k U_jk, the covariance of the rows from `rows` on is untouched.
-static void reset_covariance(est_t* const self, const uint8_t rows)
-{
+static void reset_covariance(est_t* const self, const uint8_t rows) {
     for (uint8_t j = 0U; j < self->dim; j++) {
         float* const upper = column(self, j);
         for (uint8_t i = 0U; (i < j) && (i < rows); i++) {
@@ -56,16 +54,14 @@ static void reset_covariance(est_t* const self, const uint8_t rows)
 
 /// Without this the variance of a direction that is not excited grows by 1 / forgetting per sample, without end
 /// ("covariance blow-up", thesis 3.6). No direction needs to be less certain than it was at the start.
-static float capped(const est_t* const self, const uint8_t j, const float d)
-{
+static float capped(const est_t* const self, const uint8_t j, const float d) {
     const float cap = prior_variance(self, j);
     return (d < cap) ? d : cap;
 }
 
 /// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
 /// forgetting factor of thesis Equ 3.21. gain[] receives P phi, unscaled; returns alpha = forgetting + phi' P phi.
-static float update_factors(est_t* const self, const float* const phi, float* const gain)
-{
+static float update_factors(est_t* const self, const float* const phi, float* const gain) {
     const float forgetting = self->config.forgetting;
     float       alpha      = forgetting;
     for (uint8_t j = self->first; j < self->dim; j++) {
@@ -91,15 +87,13 @@ static float update_factors(est_t* const self, const float* const phi, float* co
 
 // ---------------------------------------------  PREFILTER, REGRESSOR  ---------------------------------------------
 
-static void zero(float* const x, const uint8_t n)
-{
+static void zero(float* const x, const uint8_t n) {
     for (uint8_t i = 0U; i < n; i++) {
         x[i] = 0.0F;
     }
 }
 
-static void shift(float* const x, const uint8_t n, const float newest)
-{
+static void shift(float* const x, const uint8_t n, const float newest) {
     for (uint8_t i = (uint8_t)(n - 1U); i > 0U; i--) {
         x[i] = x[i - 1U];
     }
@@ -107,8 +101,7 @@ static void shift(float* const x, const uint8_t n, const float newest)
 }
 
 /// One sample of x / C: past[] holds the newest filtered value first.
-static float filtered(const est_t* const self, const float* const past, const float x)
-{
+static float filtered(const est_t* const self, const float* const past, const float x) {
     float out = x;
     for (uint8_t i = 0U; i < self->config.na; i++) {
         out -= self->config.c[i] * past[i];
@@ -118,12 +111,12 @@ static float filtered(const est_t* const self, const float* const past, const fl
 
 /// The samples before this one are unknown. The filters start from zero, and what they would have remembered enters the
 /// regression as unknown amplitudes of the impulse response of 1/C and its delays.
-static void begin_segment(est_t* const self)
-{
+static void begin_segment(est_t* const self) {
     zero(self->y, self->config.na);
     zero(self->u, (uint8_t)(self->past + 1U));
     zero(self->impulse, self->past);
     zero(self->theta, self->past);
+    est_edges_forget(&self->edges);
     reset_covariance(self, self->past);
     self->first   = 0U;
     self->running = true;
@@ -131,8 +124,7 @@ static void begin_segment(est_t* const self)
 }
 
 /// The impulse response of 1/C, one sample further; its input is the 1 at the first sample of the segment.
-static void advance_impulse(est_t* const self, const bool first_sample)
-{
+static void advance_impulse(est_t* const self, const bool first_sample) {
     shift(self->impulse, self->past, filtered(self, self->impulse, first_sample ? 1.0F : 0.0F));
     if (first_sample) {
         return;
@@ -146,8 +138,7 @@ static void advance_impulse(est_t* const self, const bool first_sample)
 }
 
 /// phi(k) in the order of theta, the initial conditions first.
-static void fill_regressor(const est_t* const self, float* const phi)
-{
+static void fill_regressor(const est_t* const self, float* const phi) {
     const est_config_t* const config = &self->config;
     float*                    out    = phi;
     for (uint8_t i = 0U; i < self->past; i++) {
@@ -173,14 +164,12 @@ static bool within(const float x, const float low, const float high) { return (x
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
-static bool orders_valid(const est_config_t* const config)
-{
+static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
            (config->nk <= EST_NK_MAX);
 }
 
-static bool prefilter_valid(const est_config_t* const config)
-{
+static bool prefilter_valid(const est_config_t* const config) {
     for (uint8_t i = 0U; i < config->na; i++) {
         if (!within(config->c[i], -C_LIMIT, C_LIMIT)) {
             return false;
@@ -189,52 +178,85 @@ static bool prefilter_valid(const est_config_t* const config)
     return true;
 }
 
-static bool config_valid(const est_config_t* const config)
-{
+static bool config_valid(const est_config_t* const config) {
     return orders_valid(config) && prefilter_valid(config) && within(config->forgetting, 0.5F, 1.0F) &&
            within(config->p0, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->p0_offset, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->noise_variance, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
-           est_trigger_config_valid(&config->trigger);
+           within(config->edge_codes, 0.0F, EST_CODE_LIMIT) && est_trigger_config_valid(&config->trigger);
 }
 
-static void react_to_alarm(est_t* const self)
-{
-    count(&self->counters.alarms);
-    if (self->config.trigger.reset == EST_RESET_ALL) {
-        zero(self->theta, self->dim);
+static float predicted(const est_t* const self, const float* const phi, const float* const theta) {
+    float out = 0.0F;
+    for (uint8_t i = self->first; i < self->dim; i++) {
+        out += phi[i] * theta[i];
     }
-    reset_covariance(self, self->dim);
-    est_trigger_restart(&self->trigger, self->config.trigger.hold_off_n);
-    self->running = false;  // the filters remember the old plant
+    return out;
 }
 
-static est_step_t enter_gap(est_t* const self, const est_status_t status)
-{
+/// Three readings of the innovation: as recorded, and with the edges in doubt moved by one sample. The estimate has
+/// followed what was recorded since, so the other two are taken against what was believed before the doubt.
+static void read_innovation(const est_t* const self, const float* const phi, const float y, float* const readings) {
+    readings[0] = y - predicted(self, phi, self->theta);
+    if (self->edges.age_n == 0U) {
+        readings[1] = readings[0];
+        readings[2] = readings[0];
+        return;
+    }
+    const float* const believed = self->edges.theta;
+    const float        e        = y - predicted(self, phi, believed);
+    float              early;
+    float              late;
+    est_edges_shares(&self->edges, &self->config, &believed[self->past + self->config.na], &early, &late);
+    readings[1] = e - early;
+    readings[2] = e - late;
+}
+
+/// Beyond its term a doubt is dropped, unless it is about to decide; see est_trigger_step().
+static void enter_edge(est_t* const self, const float u) {
+    const bool expired = self->edges.age_n >= EST_DOUBT_N;
+    if (expired) {
+        self->edges.age_n = 0U;
+    }
+    if (est_edges_enter(&self->edges, &self->config, u, !expired && est_trigger_in_doubt(&self->trigger))) {
+        est_trigger_begin_doubt(&self->trigger);
+        for (uint8_t i = 0U; i < self->dim; i++) {
+            self->edges.theta[i] = self->theta[i];
+        }
+    }
+}
+
+static est_step_t enter_gap(est_t* const self, const est_status_t status) {
     count((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
     self->running = false;
     return (est_step_t){ .status = status, .alarm = false, .innovation = 0.0F, .statistic = self->trigger.statistic };
 }
 
 /// Thesis Equ 3.19, 3.21 on the filtered signals. Returns the innovation's variance over that of the noise.
-static float update_estimate(est_t* const self, const float* const phi, const float y, float* const innovation)
-{
-    float gain[EST_DIM_MAX];
-    float predicted = 0.0F;
-    for (uint8_t i = self->first; i < self->dim; i++) {
-        predicted += phi[i] * self->theta[i];
-    }
-    *innovation       = y - predicted;
+static float update_estimate(est_t* const self, const float* const phi, const float innovation) {
+    float       gain[EST_DIM_MAX];
     const float alpha = update_factors(self, phi, gain);
-    const float scale = *innovation / alpha;
+    const float scale = innovation / alpha;
     for (uint8_t i = self->first; i < self->dim; i++) {
         self->theta[i] += gain[i] * scale;
     }
     return alpha / self->config.forgetting;
 }
 
-est_config_t est_config_default(void)
-{
+static void react(est_t* const self, const est_finding_t finding) {
+    if (finding == EST_QUIET) {
+        return;
+    }
+    count((finding == EST_ALARM) ? &self->counters.alarms : &self->counters.slips);
+    if ((finding == EST_ALARM) && (self->config.trigger.reset == EST_RESET_ALL)) {
+        zero(self->theta, self->dim);
+    }
+    reset_covariance(self, self->dim);
+    est_trigger_restart(&self->trigger, self->config.trigger.hold_off_n);
+    self->running = false;  // the filters remember the plant, or the clock, as it was
+}
+
+est_config_t est_config_default(void) {
     return (est_config_t){
         .na             = 2U,
         .nb             = 3U,
@@ -245,6 +267,7 @@ est_config_t est_config_default(void)
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
         .c              = { -1.6F, 0.64F },
+        .edge_codes     = 64.0F,
         .trigger        = { .kind       = EST_TRIGGER_CUSUM,
                             .ceiling    = 11.512925F,
                             .hold_off_n = 0U,
@@ -254,8 +277,7 @@ est_config_t est_config_default(void)
     };
 }
 
-bool est_init(est_t* const self, const est_config_t* const config)
-{
+bool est_init(est_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != 0) && (config != 0));
     if (!config_valid(config)) {
         return false;
@@ -268,12 +290,12 @@ bool est_init(est_t* const self, const est_config_t* const config)
     self->counters = (est_counters_t){ 0 };
     zero(self->theta, self->dim);
     reset_covariance(self, self->dim);
+    est_edges_forget(&self->edges);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;
 }
 
-est_step_t est_step(est_t* const self, const est_sample_t sample)
-{
+est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != 0);
     if (!sample.valid) {
         return enter_gap(self, EST_MISSING);
@@ -288,39 +310,39 @@ est_step_t est_step(est_t* const self, const est_sample_t sample)
     if (self->first == 0U) {
         advance_impulse(self, first_sample);
     }
-    const float y_f = filtered(self, self->y, sample.y);
+    const float y = filtered(self, self->y, sample.y);
     shift(self->u, (uint8_t)(self->past + 1U), filtered(self, self->u, sample.u));
+    enter_edge(self, sample.u);
 
     float phi[EST_DIM_MAX];
+    float readings[EST_READINGS];
     fill_regressor(self, phi);
-    est_step_t  step     = { .status = EST_UPDATED, .alarm = false, .innovation = 0.0F, .statistic = 0.0F };
-    const float variance = update_estimate(self, phi, y_f, &step.innovation) * self->config.noise_variance;
-    shift(self->y, self->config.na, y_f);
+    read_innovation(self, phi, y, readings);
+    const float variance = update_estimate(self, phi, readings[0]) * self->config.noise_variance;
+    shift(self->y, self->config.na, y);
     count(&self->counters.updated);
 
-    step.alarm     = est_trigger_step(&self->trigger, &self->config.trigger, step.innovation,
-                                  (step.innovation * step.innovation) / variance);
-    step.statistic = self->trigger.statistic;
-    if (step.alarm) {
-        react_to_alarm(self);
-    }
+    const est_finding_t finding =
+        est_trigger_step(&self->trigger, &self->config.trigger, readings, variance, self->edges.age_n);
+    const est_step_t step = { .status     = EST_UPDATED,
+                              .alarm      = finding == EST_ALARM,
+                              .innovation = readings[0],
+                              .statistic  = self->trigger.statistic };
+    react(self, finding);
     return step;
 }
 
-uint8_t est_theta_count(const est_t* const self)
-{
+uint8_t est_theta_count(const est_t* const self) {
     EST_ASSERT(self != 0);
     return (uint8_t)(self->dim - self->past);
 }
 
-float est_theta(const est_t* const self, const uint8_t index)
-{
+float est_theta(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != 0) && (index < est_theta_count(self)));
     return self->theta[self->past + index];
 }
 
-float est_variance(const est_t* const self, const uint8_t index)
-{
+float est_variance(const est_t* const self, const uint8_t index) {
     EST_ASSERT((self != 0) && (index < est_theta_count(self)));
     const uint8_t row = (uint8_t)(self->past + index);
     float         sum = self->d[row];
@@ -331,14 +353,12 @@ float est_variance(const est_t* const self, const uint8_t index)
     return sum;
 }
 
-est_counters_t est_counters(const est_t* const self)
-{
+est_counters_t est_counters(const est_t* const self) {
     EST_ASSERT(self != 0);
     return self->counters;
 }
 
-bool est_invariants_hold(const est_t* const self)
-{
+bool est_invariants_hold(const est_t* const self) {
     if ((self == 0) || !config_valid(&self->config) || (self->dim > EST_DIM_MAX) || (self->past > EST_PAST_MAX) ||
         (self->dim <= self->past) || ((self->first != 0U) && (self->first != self->past))) {
         return false;

@@ -101,11 +101,14 @@ typedef struct {
     uint8_t nb;      ///< number of b's, 1 .. EST_NB_MAX
     uint8_t nk;      ///< delay of the first b; 0 is the direct term y(k) <- u(k), which a free-running generator needs
     bool    offset;  ///< estimate the constant d as well
-    float   forgetting;            ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
-    float   p0;                    ///< initial variance of each a and b; > 0
-    float   p0_offset;             ///< initial variance of d; > 0 [codes^2]
-    float   noise_variance;        ///< of the noise e, not underestimated; > 0 [codes^2]
-    float   c[EST_NA_MAX];         ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 70
+    float   forgetting;      ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
+    float   p0;              ///< initial variance of each a and b; > 0
+    float   p0_offset;       ///< initial variance of d; > 0 [codes^2]
+    float   noise_variance;  ///< of the noise e, not underestimated; > 0 [codes^2]
+    float   c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 70
+    float   edge_codes;      ///< a step of u at least this large may have been recorded one sample early or late,
+                             ///< as happens when a generator on a clock of its own drifts across a sampling
+                             ///< instant: no alarm is raised for that alone. 0: off. 0 .. EST_CODE_LIMIT [codes]
     est_trigger_config_t trigger;
 } est_config_t;
 
@@ -146,29 +149,44 @@ typedef struct {
     uint32_t refused;
     uint32_t alarms;
     uint32_t restarts;  ///< how often the prefilters began afresh, the first time included
+    uint32_t slips;     ///< how often the edges of u began to be recorded one sample earlier or later
 } est_counters_t;
+
+/// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
+typedef struct {
+    float    u_previous;
+    bool     u_known;
+    uint16_t age_n;                     ///< samples since the first of these edges, that one included; 0: no doubt
+    float    train[EST_PAST_MAX + 2U];  ///< their heights as impulses, filtered by 1/C, newest first
+    float    theta[EST_DIM_MAX];        ///< what was believed before the doubt began
+} est_edges_t;
+
+/// The readings of the recent edges: as recorded, one sample early, one sample late.
+#define EST_READINGS 3U
 
 /// The state of a trigger. Private to the trigger.
 typedef struct {
     float    statistic;
-    float    mean;     ///< of the innovations since the last alarm, signed
-    uint32_t mean_n;   ///< how many they are
-    uint32_t quiet_n;  ///< samples for which the statistic is still held at zero
+    float    rival[EST_READINGS - 1U];  ///< the cumulative sum as it would be under the other readings
+    float    mean;                      ///< of the innovations since the last alarm, signed
+    uint32_t mean_n;                    ///< how many they are
+    uint32_t quiet_n;                   ///< samples for which the statistic is still held at zero
 } est_trigger_t;
 
 /// The state of an estimator. The fields are private; read them through the functions below.
 typedef struct {
     est_config_t   config;
-    uint8_t        past;   ///< number of initial conditions of this model
-    uint8_t        dim;    ///< past + number of parameters
-    uint8_t        first;  ///< the first active row: 0 while the initial conditions matter, past afterwards
-    bool           running;  ///< false before the first sample and inside a gap
-    float          y[EST_NA_MAX];              ///< filtered outputs y_f(k-1), y_f(k-2), ...
-    float          u[EST_PAST_MAX + 1U];         ///< filtered inputs u_f(k), u_f(k-1), ...
-    float          impulse[EST_PAST_MAX];      ///< impulse response of 1/C at m, m-1, ...: the regressors of the past
+    uint8_t        past;           ///< number of initial conditions of this model
+    uint8_t        dim;            ///< past + number of parameters
+    uint8_t        first;          ///< the first active row: 0 while the initial conditions matter, past afterwards
+    bool           running;        ///< false before the first sample and inside a gap
+    float          y[EST_NA_MAX];  ///< filtered outputs y_f(k-1), y_f(k-2), ...
+    float          u[EST_PAST_MAX + 1U];   ///< filtered inputs u_f(k), u_f(k-1), ...
+    float          impulse[EST_PAST_MAX];  ///< impulse response of 1/C at m, m-1, ...: the regressors of the past
     float          theta[EST_DIM_MAX];
-    float          d[EST_DIM_MAX];                                ///< P = U D U', U unit upper triangular
+    float          d[EST_DIM_MAX];                                  ///< P = U D U', U unit upper triangular
     float          upper[(EST_DIM_MAX * (EST_DIM_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
+    est_edges_t    edges;
     est_trigger_t  trigger;
     est_counters_t counters;
 } est_t;

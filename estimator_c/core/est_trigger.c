@@ -1,5 +1,7 @@
 #include "est_trigger.h"
 
+#include "est_edges.h"
+
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
 /// once in exp(h) samples on average: the ceiling is ln(ARL0) without any asymptotics.
@@ -8,60 +10,85 @@
 
 static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
 
-static float prediction_error(const float innovation) { return magnitude(innovation); }
-
 /// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
-static float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation)
-{
+static float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
     const float term = absolute ? magnitude(innovation) : innovation;
     self->mean_n += (self->mean_n < UINT32_MAX) ? 1U : 0U;
     self->mean += (term - self->mean) / (float)self->mean_n;
     return magnitude(self->mean);
 }
 
-static float cusum(const est_trigger_t* const self, const float normalised_square)
-{
-    const float sum = self->statistic + (CUSUM_GAIN * normalised_square) - CUSUM_DRIFT;
+static float cusum(const float before, const float innovation, const float variance) {
+    const float sum = before + ((CUSUM_GAIN * innovation * innovation) / variance) - CUSUM_DRIFT;
     return (sum > 0.0F) ? sum : 0.0F;
 }
 
-bool est_trigger_config_valid(const est_trigger_config_t* const config)
-{
+/// The plant has changed only if no reading of the edges explains the innovations.
+static est_finding_t find_by_cusum(est_trigger_t* const self,
+                                   const float          ceiling,
+                                   const float          readings[EST_READINGS],
+                                   const float          variance,
+                                   const uint16_t       doubt_n) {
+    self->statistic = cusum(self->statistic, readings[0], variance);
+    bool explained  = false;
+    for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+        self->rival[i] = (doubt_n > 0U) ? cusum(self->rival[i], readings[i + 1U], variance) : self->statistic;
+        explained      = explained || (self->rival[i] < ceiling);
+    }
+    if (self->statistic < ceiling) {
+        return EST_QUIET;
+    }
+    if (!explained) {
+        return EST_ALARM;
+    }
+    return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_QUIET;
+}
+
+bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSUM);
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
 
-void est_trigger_restart(est_trigger_t* const self, const uint32_t quiet_n)
-{
+void est_trigger_restart(est_trigger_t* const self, const uint32_t quiet_n) {
     self->statistic = 0.0F;
     self->mean      = 0.0F;
     self->mean_n    = 0U;
     self->quiet_n   = quiet_n;
+    est_trigger_begin_doubt(self);
 }
 
-bool est_trigger_step(est_trigger_t* const              self,
-                      const est_trigger_config_t* const config,
-                      const float                       innovation,
-                      const float                       normalised_square)
-{
+void est_trigger_begin_doubt(est_trigger_t* const self) {
+    for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+        self->rival[i] = self->statistic;
+    }
+}
+
+bool est_trigger_in_doubt(const est_trigger_t* const self) {
+    return (self->rival[0] < self->statistic) || (self->rival[1] < self->statistic);
+}
+
+est_finding_t est_trigger_step(est_trigger_t* const              self,
+                               const est_trigger_config_t* const config,
+                               const float                       readings[EST_READINGS],
+                               const float                       variance,
+                               const uint16_t                    doubt_n) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
-        return false;
+        return EST_QUIET;
     }
     switch (config->kind) {
     case EST_TRIGGER_PREDICTION_ERROR:
-        self->statistic = prediction_error(innovation);
+        self->statistic = magnitude(readings[0]);
         break;
     case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
-        self->statistic = mean_between_faults(self, config->absolute, innovation);
+        self->statistic = mean_between_faults(self, config->absolute, readings[0]);
         break;
     case EST_TRIGGER_CUSUM:
-        self->statistic = cusum(self, normalised_square);
-        break;
+        return find_by_cusum(self, config->ceiling, readings, variance, doubt_n);
     case EST_TRIGGER_NONE:
     default:
-        return false;
+        return EST_QUIET;
     }
-    return self->statistic >= config->ceiling;
+    return (self->statistic >= config->ceiling) ? EST_ALARM : EST_QUIET;
 }

@@ -9,10 +9,27 @@
 /// True iff every value that this kind of trigger uses is in the range stated in est.h.
 bool est_trigger_config_valid(const est_trigger_config_t* config);
 
+typedef enum {
+    EST_QUIET = 0,
+    EST_ALARM = 1,
+    EST_SLIP  = 2,  ///< not the plant, but the edges of u have moved by one sample
+} est_finding_t;
+
 /// Ready for the first innovation; the statistic is zero for the next quiet_n samples.
 void est_trigger_restart(est_trigger_t* self, uint32_t quiet_n);
 
-/// Enters one innovation [codes] and its square divided by its predicted variance [1]; true: alarm.
-bool est_trigger_step(est_trigger_t* self, const est_trigger_config_t* config, float innovation, float normalised_square);
+/// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
+void est_trigger_begin_doubt(est_trigger_t* self);
+
+/// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
+bool est_trigger_in_doubt(const est_trigger_t* self);
+
+/// Enters one innovation [codes] in every reading of the edges in doubt, the first as recorded, and its predicted
+/// variance [codes^2]. doubt_n: samples since the doubt began; 0: no doubt, and only the first reading counts.
+est_finding_t est_trigger_step(est_trigger_t*              self,
+                               const est_trigger_config_t* config,
+                               const float                 readings[EST_READINGS],
+                               float                       variance,
+                               uint16_t                    doubt_n);
 
 #endif  // EST_TRIGGER_H_INCLUDED
