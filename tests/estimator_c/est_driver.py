@@ -1,0 +1,87 @@
+"""The C estimator for the tests: est_driver.c, compiled against the public header when the tests start."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CORE = Path(__file__).parents[2] / "estimator_c" / "core"
+STRICT = "-std=c99 -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror -ffp-contract=off".split()
+COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips")
+
+NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM = range(4)
+UPDATED, MISSING, REFUSED = range(3)
+
+
+class Config(ctypes.Structure):
+    """As driver_config_t: all numbers are doubles."""
+
+    _fields_ = [
+        *((name, ctypes.c_double) for name in "na nb nk offset forgetting p0 p0_offset noise_variance".split()),
+        ("c", ctypes.c_double * 2),
+        *((name, ctypes.c_double) for name in "edge_codes kind ceiling hold_off_n warm_up_n absolute reset".split()),
+    ]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What each of n samples gave."""
+
+    theta: NDArray[np.float32]
+    innovation: NDArray[np.float32]
+    statistic: NDArray[np.float32]
+    alarms: NDArray[np.int64]
+    """Sample indices."""
+    status: NDArray[np.uint8]
+    counters: Mapping[str, int]
+    variance: NDArray[np.float64]
+    """Of each parameter, after the last sample, in noise variances."""
+
+
+class Estimator:
+    """One estimator at a time, as in the driver."""
+
+    def __init__(self, library: Path) -> None:
+        self._c = ctypes.CDLL(str(library))
+        self._c.driver_variance.restype = ctypes.c_float
+
+    def init(self, **changes: float | tuple[float, float]) -> bool:
+        """est_init() with the default configuration and these changes."""
+        config = Config()
+        self._c.driver_default(ctypes.byref(config))
+        for name, value in changes.items():
+            setattr(config, name, (ctypes.c_double * 2)(*value) if isinstance(value, tuple) else value)
+        return bool(self._c.driver_init(ctypes.byref(config)))
+
+    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Result:
+        """est_step() for every sample; fails if the invariants do not hold after any of them."""
+        u_, y_ = (np.ascontiguousarray(x, dtype=np.float64) for x in (u, y))
+        n = len(u_)
+        valid_ = np.ascontiguousarray(np.ones(n) if valid is None else valid, dtype=np.uint8)
+        theta = np.zeros((n, self._c.driver_theta_count()), np.float32)
+        innovation, statistic = np.zeros(n, np.float32), np.zeros(n, np.float32)
+        alarm, status = np.zeros(n, np.uint8), np.zeros(n, np.uint8)
+        arrays = (u_, y_, valid_, theta, innovation, statistic, alarm, status)
+        held = self._c.driver_run(ctypes.c_size_t(n), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
+        assert held, "est_invariants_hold() was false"
+        counters = (ctypes.c_uint * len(COUNTERS))()
+        self._c.driver_counters(counters)
+        variance = np.array([self._c.driver_variance(i) for i in range(theta.shape[1])])
+        named = dict(zip(COUNTERS, counters, strict=True))
+        return Result(theta, innovation, statistic, np.flatnonzero(alarm), status, named, variance)
+
+
+def compile_driver(folder: Path) -> Path:
+    """The driver as a shared library, with the strict warnings of the project."""
+    library = folder / "est_driver.so"
+    sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c"))]
+    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, "-Wno-float-equal", "-shared", "-fPIC", f"-I{CORE}"]
+    subprocess.run([*command, "-o", str(library), *map(str, sources)], check=True)
+    return library

@@ -1,0 +1,161 @@
+"""The recursive estimate against batch least squares in float64, which shares no code with it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from est_driver import MISSING, NONE, REFUSED, UPDATED, Estimator
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+# y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.
+A, B = [1.0, 0.5, 0.8], [0.0, -0.9]
+
+
+class Record(NamedTuple):
+    u: NDArray[np.float64]
+    y: NDArray[np.float64]
+
+
+def record(n: int = 400, noise: float = 0.0, seed: int = 5, offset: float = 0.0) -> Record:
+    rng = np.random.default_rng(seed)
+    u = rng.integers(0, 2, n) * 2000.0 - 1000.0
+    return Record(u, lfilter(B, A, u) + rng.normal(0.0, 1.0, n) * noise + offset)
+
+
+def batch(
+    segments: list[Record], c: tuple[float, float], nb: int, nk: int, forgetting: float, p0: float, p0_offset: float
+) -> NDArray[np.float64]:
+    """The minimum of sum forgetting^(N-k) e(k)^2 + |theta|^2 forgetting^N / P0 over theta and, for each segment of
+    contiguous samples, over what happened before it: amplitudes of the impulse response of 1/C and its delays."""
+    past = max(2, nb + nk - 1)
+    lengths = [len(segment.u) for segment in segments]
+    rows, targets = [], []
+    denominator = [1.0, *c]
+    for i, (u, y) in enumerate(segments):
+        n = len(u)
+        uf, yf = lfilter([1.0], denominator, u), lfilter([1.0], denominator, y)
+        impulse = lfilter([1.0], denominator, np.eye(n)[0])
+        delayed = lambda x, lag: np.concatenate([np.zeros(lag), x])[: len(x)]  # noqa: E731
+        before = np.zeros((n, past * len(segments)))
+        for j in range(past):
+            before[:, i * past + j] = delayed(impulse, j)
+        theta = [-delayed(yf, 1), -delayed(yf, 2), *(delayed(uf, nk + j) for j in range(nb)), np.ones(n)]
+        rows.append(np.column_stack([before, *theta]))
+        targets.append(yf)
+    phi, target = np.concatenate(rows), np.concatenate(targets)
+    total = sum(lengths)
+    weight = forgetting ** np.arange(total - 1, -1, -1.0)
+    prior = np.concatenate([np.zeros(past * len(segments)), np.full(2 + nb, 1.0 / p0), [1.0 / p0_offset]])
+    normal = (phi.T * weight) @ phi + np.diag(prior) * forgetting**total
+    return np.linalg.solve(normal, (phi.T * weight) @ target)[past * len(segments) :]
+
+
+SETTINGS = {"nb": 2, "nk": 0, "p0": 10.0, "p0_offset": 1e4, "kind": NONE}
+
+
+@pytest.mark.parametrize("c", [(0.0, 0.0), (-1.6, 0.64)], ids=["no prefilter", "prefilter"])
+@pytest.mark.parametrize("forgetting", [1.0, 0.97])
+def test_estimate_is_the_weighted_least_squares_one(
+    estimator: Estimator, c: tuple[float, float], forgetting: float
+) -> None:
+    data = record(noise=3.0, offset=40.0)
+    assert estimator.init(**SETTINGS, c=c, forgetting=forgetting)
+    theta = estimator.run(*data).theta
+    for n in (50, 400):
+        expected = batch([Record(data.u[:n], data.y[:n])], c, 2, 0, forgetting, 10.0, 1e4)
+        assert theta[n - 1] == pytest.approx(expected, rel=2e-3, abs=2e-4)
+
+
+def test_variance_is_that_of_least_squares(estimator: Estimator) -> None:
+    data = record(noise=3.0)
+    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=1.0)
+    variance = estimator.run(*data).variance
+    lag = lambda x, d: np.concatenate([np.zeros(d), x])[: len(x)]  # noqa: E731
+    phi = np.column_stack([-lag(data.y, 1), -lag(data.y, 2), data.u, lag(data.u, 1), np.ones(len(data.u))])[2:]
+    covariance = np.linalg.inv(phi.T @ phi + np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]))
+    assert variance == pytest.approx(np.diag(covariance), rel=1e-2)
+
+
+def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:
+    """Thesis Fig. 3.5: a1 = 0.5, a2 = 0.8, b0 = -0.9."""
+    assert estimator.init(na=2, nb=1, nk=1, offset=0, c=(0.0, 0.0), kind=NONE, forgetting=1.0)
+    theta = estimator.run(*record()).theta
+    assert theta[30] == pytest.approx([0.5, 0.8, -0.9], abs=1e-3)
+
+
+@pytest.mark.parametrize("gap_n", [1, 2, 7, 60])
+def test_gap_costs_only_its_own_samples(estimator: Estimator, gap_n: int) -> None:
+    data = record(noise=3.0, offset=40.0)
+    valid = np.ones(400)
+    valid[150 : 150 + gap_n] = 0
+    assert estimator.init(**SETTINGS, c=(-1.6, 0.64), forgetting=1.0)
+    result = estimator.run(*data, valid)
+    pieces = [Record(data.u[:150], data.y[:150]), Record(data.u[150 + gap_n :], data.y[150 + gap_n :])]
+    assert result.theta[-1] == pytest.approx(batch(pieces, (-1.6, 0.64), 2, 0, 1.0, 10.0, 1e4), rel=3e-3, abs=3e-4)
+    assert (result.status[150 : 150 + gap_n] == MISSING).all()
+    assert result.counters["missing"] == gap_n
+    assert result.counters["restarts"] == 2
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1e6], ids=str)
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_absurd_sample_is_counted_and_leaves_theta_untouched(estimator: Estimator, bad: float, channel: str) -> None:
+    data = record(noise=3.0)
+    getattr(data, channel)[200] = bad
+    assert estimator.init()
+    result = estimator.run(*data)
+    assert result.status[200] == REFUSED
+    assert result.theta[200].tobytes() == result.theta[199].tobytes()
+    assert result.statistic[200] == result.statistic[199]
+    assert result.counters["refused"] == 1
+    assert (np.delete(result.status, 200) == UPDATED).all()
+
+
+def test_lost_excitation_does_not_wind_up(estimator: Estimator) -> None:
+    """Thesis section 3.6: P grows by 1/lambda a sample, to overflow after some 3000, when nothing is excited."""
+    data = record(noise=1.0)
+    quiet = 100_000
+    u = np.concatenate([data.u, np.zeros(quiet), data.u])
+    y = np.concatenate([data.y, np.zeros(quiet), data.y])
+    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=0.97)
+    result = estimator.run(u, y)
+    assert np.isfinite(result.theta).all()
+    assert result.theta[-400 + 30, :4] == pytest.approx([0.5, 0.8, 0.0, -0.9], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"na": 0},
+        {"na": 3},
+        {"nb": 0},
+        {"nb": 4},
+        {"nk": 2},
+        {"forgetting": 0.49},
+        {"forgetting": 1.01},
+        {"forgetting": np.nan},
+        {"p0": 0.0},
+        {"p0": np.inf},
+        {"p0_offset": -1.0},
+        {"noise_variance": 0.0},
+        {"c": (np.nan, 0.0)},
+        {"c": (0.0, 71.0)},
+        {"edge_codes": -1.0},
+        {"kind": 4},
+        {"ceiling": 0.0},
+        {"ceiling": np.nan},
+        {"reset": 2},
+    ],
+    ids=str,
+)
+def test_configuration_out_of_range_is_refused(estimator: Estimator, changes: dict[str, float]) -> None:
+    assert not estimator.init(**changes)
+
+
+def test_largest_order_fits(estimator: Estimator) -> None:
+    assert estimator.init(na=2, nb=3, nk=1, offset=1)
+    data = record(noise=1.0)
+    assert np.isfinite(estimator.run(*data).theta).all()

@@ -1,0 +1,139 @@
+"""The triggers: the thesis's two, and the cumulative sum of the normalised innovation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+FRONT = (115.0, 3021.0, 24500.0)
+PERIOD_S = 0.01
+N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
+PLAIN = {"na": 2, "nb": 2, "nk": 1, "offset": 0, "c": (0.0, 0.0), "forgetting": 1.0, "edge_codes": 0.0}
+
+
+def suspension(
+    plants: list[tuple[int, tuple[float, float, float]]], edges: NDArray[np.float64], n: int, noise_codes: float, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Codes of force and displacement of M x'' + B x' + K x = F by exact steps between the edges (at any instants) of a
+    force that toggles between 0 and 2900 N; independent of the emulator."""
+    rng = np.random.default_rng(seed)
+    starts = dict(plants)
+    state, level, pending = np.zeros(2), 0.0, edges.tolist()
+    steps: dict[tuple[tuple[float, float, float], float], NDArray[np.float64]] = {}
+
+    def advance(state: NDArray[np.float64], span: float) -> NDArray[np.float64]:
+        key = (plant, span)
+        if key not in steps:
+            m, b, k = plant
+            steps[key] = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * PERIOD_S * span)
+        return steps[key][:2] @ np.append(state, level)
+
+    force, displacement = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        plant = starts.get(k, plant) if k else starts[0]
+        while pending and pending[0] <= k:
+            level = 2900.0 - level
+            pending.pop(0)
+        force[k], displacement[k] = level, state[0]
+        at = float(k)
+        while pending and pending[0] < k + 1:
+            state = advance(state, pending[0] - at)
+            at = pending.pop(0)
+            level = 2900.0 - level
+        state = advance(state, k + 1 - at)
+    u, y = force / N_PER_CODE, displacement / M_PER_CODE + 410.0
+    return (np.round(u + rng.normal(0.0, noise_codes, n)), np.round(y + rng.normal(0.0, noise_codes, n)))
+
+
+def test_prediction_error_beyond_the_ceiling_resets_everything(estimator: Estimator) -> None:
+    """Thesis 4.4.2: parameter vector to zero, P to its start."""
+    u, y = suspension([(0, FRONT), (245, (115.0, 3021.0, 18000.0))], np.arange(10.0, 400.0, 50.0), 400, 0.0, 1)
+    assert estimator.init(**PLAIN, kind=PREDICTION_ERROR, ceiling=8.0, warm_up_n=50, reset=1)
+    result = estimator.run(u, y - 410.0)
+    first = result.alarms[0]
+    assert 245 < first <= 250
+    assert np.abs(result.innovation[first]) >= 8.0
+    assert (np.abs(result.innovation[50:first]) < 8.0).all()
+    assert (result.theta[first] == 0.0).all()
+    assert result.statistic[first] == np.abs(result.innovation[first])
+
+
+def test_mean_between_faults_follows_the_thesis(estimator: Estimator) -> None:
+    """Thesis 4.4.3: a running mean, off for the first 50 samples, at zero for 4 after an alarm; theta is kept."""
+    u, y = suspension([(0, FRONT), (245, (115.0, 3021.0, 18000.0))], np.arange(10.0, 400.0, 50.0), 400, 0.0, 1)
+    assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=2.0, warm_up_n=50, hold_off_n=4)
+    result = estimator.run(u, y - 410.0)
+    assert len(result.alarms)
+    expected, terms, quiet = [], [], 50
+    for k, innovation in enumerate(result.innovation.astype(float)):
+        if quiet:
+            quiet -= 1
+            expected.append(0.0)
+            continue
+        terms.append(innovation)
+        expected.append(abs(math.fsum(terms) / len(terms)))
+        if k in result.alarms:
+            assert expected[-1] == pytest.approx(2.0, abs=1e-3) or expected[-1] > 2.0
+            terms, quiet = [], 4
+    assert result.statistic == pytest.approx(np.array(expected), rel=1e-3, abs=1e-3)
+    assert (np.diff(result.alarms) > 4).all()
+    assert (result.theta[result.alarms[0]] != 0.0).any()
+
+
+def test_absolute_mean_averages_magnitudes(estimator: Estimator) -> None:
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(0.0, 100.0, 300), rng.normal(0.0, 10.0, 300)
+    assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=1e6, warm_up_n=0, absolute=1)
+    result = estimator.run(u, y)
+    magnitudes = np.abs(result.innovation.astype(float))
+    assert result.statistic == pytest.approx(np.cumsum(magnitudes) / np.arange(1, 301), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_thesis_profile_is_followed_without_a_false_alarm(estimator: Estimator, seed: int) -> None:
+    changes = [(0, FRONT), (1200, (115.0, 3021.0, 18000.0)), (1400, (115.0, 3453.0, 18000.0))]
+    changes += [(1500, (115.0, 2123.0, 20000.0)), (1600, (30.0, 2123.0, 20000.0))]
+    phase = np.random.default_rng(seed).uniform(1.0, 51.0)
+    u, y = suspension(changes, np.arange(phase, 1800.0, 50.001), 1800, 1.0, seed)
+    assert estimator.init()
+    alarms = estimator.run(u, y).alarms
+    assert len(alarms) == 4
+    assert (np.diff([0, *np.searchsorted([1200, 1400, 1500, 1600], alarms)]) == 1).all()
+
+
+def test_false_alarms_are_rarer_than_promised(estimator: Estimator) -> None:
+    """ARL0 = 1e3, so at most 200 of 200,000 samples on average; 260 would be exceeded with p < 2e-5 at exactly 1e-3."""
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 200_000.0, 50.0), 200_000, 1.0, 7)
+    assert estimator.init(ceiling=math.log(1e3))
+    assert len(estimator.run(u, y).alarms) <= 260
+
+
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+@pytest.mark.parametrize("seed", range(5))
+def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator, slip: int, seed: int) -> None:
+    """A generator 20 ppm off, whose edges cross a sampling instant in the middle of the run."""
+    drift = 20e-6 * slip
+    edges = np.arange(10.0, 1800.0, 50.0)
+    edges = edges + (edges - 900.0) * drift
+    u, y = suspension([(0, FRONT)], edges, 1800, 1.0, seed)
+    assert estimator.init()
+    watched = estimator.run(u, y)
+    assert len(watched.alarms) == 0
+    assert watched.counters["slips"] == 1
+    assert estimator.init(edge_codes=0.0)
+    assert len(estimator.run(u, y).alarms) == 1, "without the second look it is a false alarm"
+
+
+def test_missing_samples_do_not_move_the_statistic(estimator: Estimator) -> None:
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 600.0, 50.0), 600, 1.0, 2)
+    valid = np.ones(600)
+    valid[300:340] = 0
+    assert estimator.init(kind=CUSUM)
+    result = estimator.run(u, y, valid)
+    assert (result.statistic[300:340] == result.statistic[299]).all()
+    assert len(result.alarms) == 0
