@@ -1,0 +1,109 @@
+# Everything that is done to this repository is a target here; `make help` lists them.
+# Variables may be overridden on the command line: make test PYTHON=python3.12 PYTEST_ARGS="-k frame"
+
+PYTHON ?= python3
+VENV ?= .venv
+BUILD ?= build
+JOBS ?= 2
+ARGS ?=
+PYTEST_ARGS ?=
+STRICT_CC ?= gcc clang
+STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
+
+BIN := $(VENV)/bin
+
+PRODUCTS := harness/_catalogue.py emulator/_engine.so harness/_device.so harness/bin/analogrig-device \
+            harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
+NATIVE_SOURCES := $(wildcard emulator/*.[ch] estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+                  estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
+PYTHON_SOURCES := emulator harness estimator_c tests setup.py
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_ROOT_USER_ACTION := ignore
+export UV_PYTHON_DOWNLOADS := never
+
+.DELETE_ON_ERROR:
+.PHONY: help setup run test check lint strict format bench wheel lock clean distclean
+MAKEFLAGS += --no-builtin-rules
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every other target does it when needed
+
+run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="--seed 7" goes to analogrig run
+	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
+
+test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
+	@$(BIN)/pytest -n $(JOBS) --dist loadgroup $(PYTEST_ARGS)
+
+check: lint strict ## linters, types, and the C with every warning an error
+
+lint: $(PRODUCTS)
+	@$(BIN)/ruff check --quiet $(PYTHON_SOURCES)
+	@$(BIN)/ruff format --quiet --check $(PYTHON_SOURCES) || { echo "some files are not formatted: make format"; exit 1; }
+	@$(BIN)/mypy --no-error-summary
+
+strict: $(STRICT_CC:%=$(BUILD)/strict/%.ok)
+
+format: $(PRODUCTS) ## lay out the Python sources
+	@$(BIN)/ruff check --quiet --select I --fix $(PYTHON_SOURCES)
+	@$(BIN)/ruff format $(PYTHON_SOURCES)
+
+bench: $(PRODUCTS) ## measure: one line per figure (name, value, unit)
+	@for bench in tests/benchmarks/bench_*.py; do $(BIN)/python "$$bench" $(ARGS) || exit 1; done
+
+wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
+	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
+
+lock: ## resolve requirements.lock again from pyproject.toml; needs uv
+	@$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
+	    uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade --no-annotate \
+	        --custom-compile-command "make lock" --extra test --output-file requirements.lock pyproject.toml -
+
+clean: ## remove what was built, but not the environment
+	rm -rf $(BUILD) analogrig.egg-info harness/bin $(PRODUCTS)
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+
+distclean: clean ## remove the environment too
+	@if test -e $(VENV)/.made-by-make; then rm -rf $(VENV); fi
+
+# The environment, in two steps. Each ends with its stamp, so that one which was interrupted is made again from nothing.
+
+$(VENV)/.requirements: requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "analogrig needs Python 3.11 or newer, not $$($(PYTHON) -V 2>&1): make PYTHON=python3.11" >&2; exit 1; }
+	@command -v $(firstword $(CC)) >/dev/null || \
+	    { echo "analogrig needs a C compiler ($(CC)): apt-get install gcc libc6-dev" >&2; exit 1; }
+	@test ! -e $(VENV) || test -e $(VENV)/.made-by-make || \
+	    { echo "$(VENV) was not made by this Makefile: remove it, or make VENV=another" >&2; exit 1; }
+	@uv --version >/dev/null 2>&1 || $(PYTHON) -c 'import ensurepip' 2>/dev/null || \
+	    { echo "$(PYTHON) cannot make environments: apt-get install python3-venv" >&2; exit 1; }
+	@echo "making $(VENV) from requirements.lock"
+	@rm -rf $(VENV) && mkdir $(VENV) && touch $(VENV)/.made-by-make
+	@if uv --version >/dev/null 2>&1; then \
+	    uv venv --quiet --allow-existing --python "$$(command -v $(PYTHON))" $(VENV) && \
+	    uv pip install --quiet --python $(VENV) --require-hashes -r requirements.lock; \
+	else \
+	    $(PYTHON) -m venv $(VENV) && \
+	    $(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock; \
+	fi
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.requirements pyproject.toml setup.py
+	@echo "installing analogrig into $(VENV)"
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# All products come from one command, whichever is out of date.
+$(PRODUCTS) &: $(NATIVE_SOURCES) | $(VENV)/.installed
+	@$(BIN)/python setup.py --quiet build_products --inplace
+
+$(BUILD)/strict/%.ok: $(NATIVE_SOURCES) setup.py Makefile | $(VENV)/.installed
+	@mkdir -p $(@D)
+	@if command -v $* >/dev/null; then \
+	    CC=$* CFLAGS="$(STRICT_CFLAGS)" $(BIN)/python setup.py --quiet build_products \
+	        --build-lib $(@D)/$* --build-temp $(@D)/$*; \
+	elif test -n "$$ANALOGRIG_CI"; then echo "$* is absent: apt-get install $*" >&2; exit 1; \
+	else echo "$* is absent, so the C was not checked with it (apt-get install $*)"; exit 0; fi
+	@touch $@

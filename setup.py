@@ -1,0 +1,187 @@
+"""The part of the build that pyproject.toml cannot say: codecs from the catalogue, C, and the files of uPlot.
+
+`pip install` runs it as part of every build; in an editable install the products land in the source tree.
+`python setup.py build_products --inplace` makes them again after a source has changed.
+
+The C is plain C99 behind ctypes: neither Python.h nor any library is needed, and one wheel serves every Python 3.
+CC, CFLAGS and LDFLAGS are honoured.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import ClassVar
+
+from setuptools import Command, Distribution, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build import build
+
+CATALOGUE = Path("harness/_catalogue.py")
+ENGINE = Path("emulator/_engine.so")
+DEVICE = Path("harness/_device.so")
+HOST = Path("harness/bin/analogrig-device")
+UPLOT = {
+    Path("harness/report/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
+    Path("harness/report/uPlot.min.css"): "uplot/static/uPlot.min.css",
+}
+PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, *UPLOT)
+
+GENERATE = Path("estimator_c/catalogue/generate.py")
+ENGINE_SOURCES = ("emulator/*.c",)
+DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
+HOST_SOURCES = ("estimator_c/ports/host/*.c",)
+OTHER_SOURCES = (
+    "emulator/*.h",
+    "estimator_c/core/*.h",
+    "estimator_c/device/*.h",
+    "estimator_c/ports/host/*.h",
+    "estimator_c/catalogue/*",
+    "fixtures/**/*",
+)
+
+# Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
+BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
+SHARED = ("-shared", "-fPIC")
+POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals; the port alone may know an operating system
+
+
+class BuildProducts(Command):
+    """Make what is not Python, beside the Python that uses it."""
+
+    description = "generate the codecs, compile the C and fetch the files of uPlot"
+    user_options: ClassVar[list[tuple[str, str | None, str]]] = [
+        ("build-lib=", "b", "directory that receives the products"),
+        ("build-temp=", "t", "directory for generated C"),
+        ("inplace", "i", "put the products into the source tree"),
+    ]
+    boolean_options: ClassVar[list[str]] = ["inplace"]
+
+    build_lib: str
+    build_temp: str
+    inplace: bool
+    editable_mode: bool
+
+    def initialize_options(self) -> None:
+        """Part of the protocol of setuptools."""
+        self.build_lib = self.build_temp = None  # type: ignore[assignment]  # filled in by finalize_options
+        self.inplace = self.editable_mode = False
+
+    def finalize_options(self) -> None:
+        """Part of the protocol of setuptools."""
+        self.set_undefined_options("build", ("build_lib", "build_lib"), ("build_temp", "build_temp"))
+
+    def run(self) -> None:
+        """Make every product; each appears whole or not at all."""
+        in_tree = self.inplace or self.editable_mode
+        destination = Path() if in_tree else Path(self.build_lib)
+        generated = Path("build" if in_tree else self.build_temp) / "generated"
+        for product in PRODUCTS:
+            (destination / product).parent.mkdir(parents=True, exist_ok=True)
+        generate_codecs(generated, destination / CATALOGUE)
+        device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
+        include = tuple(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated))
+        compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
+        compile_c(destination / DEVICE, device, (*SHARED, *include))
+        compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))
+        for product, origin in UPLOT.items():
+            shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)
+        if not in_tree:
+            shutil.copytree("fixtures", destination / "harness/fixtures", dirs_exist_ok=True)
+
+    def get_source_files(self) -> list[str]:
+        """Part of the protocol of setuptools: what an sdist must hold."""
+        return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *HOST_SOURCES, *OTHER_SOURCES))]
+
+    def get_outputs(self) -> list[str]:
+        """Part of the protocol of setuptools."""
+        fixtures = [str(Path("harness") / path) for path in sources(("fixtures/**/*",))]
+        return [str(Path(self.build_lib) / product) for product in (*PRODUCTS, *fixtures)]
+
+    def get_output_mapping(self) -> dict[str, str]:
+        """Part of the protocol of setuptools: where an editable install finds each product."""
+        return {str(Path(self.build_lib) / product): str(product) for product in PRODUCTS}
+
+
+def sources(patterns: Iterable[str]) -> tuple[Path, ...]:
+    """The files that match, in an order that is the same everywhere."""
+    return tuple(sorted(path for pattern in patterns for path in Path().glob(pattern) if path.is_file()))
+
+
+def generate_codecs(generated: Path, tables: Path) -> None:
+    """Generate C into the folder ``generated`` and the Python module ``tables`` from the message catalogue."""
+    generated.mkdir(parents=True, exist_ok=True)
+    if subprocess.run([sys.executable, GENERATE, generated, tables], check=False).returncode != 0:
+        raise SystemExit(f"analogrig: {GENERATE} failed")
+    os.utime(tables)  # it may have been left as it was; make must see that it is up to date
+
+
+def compile_c(product: Path, files: Iterable[Path], flags: Iterable[str]) -> None:
+    """Compile and link in one go.
+
+    A program that has the old product open keeps it: the new one is a new file, moved into place.
+    """
+    part = product.with_name(f".{product.name}.{os.getpid()}")
+    command = [*compiler(), "-O2", *words("CFLAGS"), *flags, *BIT_EXACT, "-o", part, *files, *words("LDFLAGS")]
+    logging.getLogger(__name__).info(shlex.join(map(str, command)))
+    try:
+        if subprocess.run(command, check=False).returncode != 0:
+            raise SystemExit(
+                f"analogrig: cannot compile {product.name}, see above (stdint.h not found? apt-get install libc6-dev)"
+            )
+        part.replace(product)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def compiler() -> list[str]:
+    """The command of the C compiler: that of CC, or the system's."""
+    command = words("CC") or ["cc"]
+    if shutil.which(command[0]) is None:
+        raise SystemExit(f"analogrig: there is no C compiler {command[0]!r}: apt-get install gcc libc6-dev")
+    return command
+
+
+def words(variable: str) -> list[str]:
+    """The words of an environment variable, as a shell would split them."""
+    return shlex.split(os.environ.get(variable, ""))
+
+
+class CleanBuild(build):
+    """A build from nothing, so that a file which is gone from the sources is gone from the wheel."""
+
+    sub_commands: ClassVar[list[tuple[str, object]]] = [*build.sub_commands, ("build_products", None)]  # type: ignore[misc]
+
+    def run(self) -> None:
+        """Forget the last build, then build."""
+        shutil.rmtree(self.build_lib, ignore_errors=True)
+        super().run()
+
+
+class PlatformWheel(bdist_wheel):
+    """A wheel for one platform and every Python 3: its C does not know Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:
+        """Part of the protocol of setuptools."""
+        return "py3", "none", super().get_tag()[2]
+
+
+class PlatformDistribution(Distribution):
+    """A distribution that holds machine code, though no extension module."""
+
+    def has_ext_modules(self) -> bool:
+        """Part of the protocol of setuptools."""
+        return True
+
+
+setup(
+    distclass=PlatformDistribution,
+    cmdclass={"bdist_wheel": PlatformWheel, "build": CleanBuild, "build_products": BuildProducts},
+)
