@@ -38,13 +38,14 @@ GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c",)
+FIXTURES = "fixtures/**/*"
 OTHER_SOURCES = (
     "emulator/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/host/*.h",
     "estimator_c/catalogue/*",
-    "fixtures/**/*",
+    FIXTURES,
 )
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
@@ -102,7 +103,7 @@ class BuildProducts(Command):
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""
-        fixtures = [str(Path("harness") / path) for path in sources(("fixtures/**/*",))]
+        fixtures = [Path("harness") / path for path in sources((FIXTURES,))]
         return [str(Path(self.build_lib) / product) for product in (*PRODUCTS, *fixtures)]
 
     def get_output_mapping(self) -> dict[str, str]:
@@ -129,8 +130,9 @@ def compile_c(product: Path, files: Iterable[Path], flags: Iterable[str]) -> Non
     A program that has the old product open keeps it: the new one is a new file, moved into place.
     """
     part = product.with_name(f".{product.name}.{os.getpid()}")
-    command = [*compiler(), "-O2", *words("CFLAGS"), *flags, *BIT_EXACT, "-o", part, *files, *words("LDFLAGS")]
-    logging.getLogger(__name__).info(shlex.join(map(str, command)))
+    options = ["-O2", *words("CFLAGS"), *flags, *BIT_EXACT]
+    command = [*compiler(), *options, "-o", str(part), *map(str, files), *words("LDFLAGS")]
+    logging.getLogger(__name__).info(shlex.join(command))
     try:
         if subprocess.run(command, check=False).returncode != 0:
             raise SystemExit(
@@ -157,7 +159,7 @@ def words(variable: str) -> list[str]:
 class CleanBuild(build):
     """A build from nothing, so that a file which is gone from the sources is gone from the wheel."""
 
-    sub_commands: ClassVar[list[tuple[str, object]]] = [*build.sub_commands, ("build_products", None)]  # type: ignore[misc]
+    sub_commands: ClassVar = [*build.sub_commands, ("build_products", None)]
 
     def run(self) -> None:
         """Forget the last build, then build."""

@@ -1,4 +1,4 @@
-"""For all tests: a test that needs what a machine lacks skips and says so; in CI, where all is installed, nothing may."""
+"""For all tests: one that needs what a machine lacks skips and says so; in CI, where all is installed, none may."""
 
 from __future__ import annotations
 

@@ -1,0 +1,137 @@
+"""What a user gets: a complete sdist, and a wheel that works in an empty environment, far from this checkout."""
+
+from __future__ import annotations
+
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tarfile
+import time
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[1]
+HELP_PER_START_LIMIT = 5.0
+"""`analogrig --help` against `python -c pass`: 0.1 s where the interpreter itself needs 20 ms."""
+
+pytestmark = [pytest.mark.xdist_group("packaging"), pytest.mark.timeout(300)]
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an sdist of this checkout and the wheel that was built from that sdist."""
+    folder = tmp_path_factory.mktemp("dist")
+    _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, CHECKOUT, cwd=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(distributions: Path) -> Path:
+    return next(distributions.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of a new environment that holds the wheel and what it asks for, nothing else."""
+    folder = tmp_path_factory.mktemp("empty")
+    venv.create(folder, with_pip=False, symlinks=True)
+    _run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", wheel, cwd=folder)
+    return folder / "bin"
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for variable in ("PYTHONPATH", "VIRTUAL_ENV", "CFLAGS", "LDFLAGS"):
+        monkeypatch.delenv(variable, raising=False)
+
+
+def _run(*command: str | Path, cwd: Path | None = None) -> str:
+    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert done.returncode == 0, f"{command} ended with status {done.returncode}:\n{done.stdout}"
+    return done.stdout
+
+
+def test_wheel_serves_every_python_3_on_one_platform(wheel: Path) -> None:
+    assert re.search(r"-py3-none-linux_\w+\.whl$", wheel.name)
+
+
+def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
+    held = set(zipfile.ZipFile(wheel).namelist())
+    assert held >= {
+        "emulator/_engine.so",
+        "emulator/py.typed",
+        "harness/_catalogue.py",
+        "harness/_device.so",
+        "harness/bin/analogrig-device",
+        "harness/fixtures/scenarios/thesis.toml",
+        "harness/py.typed",
+        "harness/report/uPlot.iife.min.js",
+        "harness/report/uPlot.min.css",
+    }
+    assert not [name for name in held if name.endswith((".c", ".h")) or name.startswith("tests/")]
+
+
+def test_sdist_holds_every_shipped_fixture(distributions: Path) -> None:
+    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
+        held = {name.partition("/")[2] for name in sdist.getnames()}
+    fixtures = {str(path.relative_to(CHECKOUT)) for path in CHECKOUT.glob("fixtures/**/*") if path.is_file()}
+    assert fixtures
+    assert held >= fixtures
+
+
+def test_command_works_from_the_wheel(environment: Path) -> None:
+    assert _run(environment / "analogrig", "--help").startswith("usage: analogrig")
+    assert re.fullmatch(r"analogrig \d+\.\d+\.\d+\n", _run(environment / "analogrig", "--version"))
+
+
+def test_installed_device_can_be_executed(environment: Path) -> None:
+    device = next(environment.parent.glob("lib/python*/site-packages/harness/bin/analogrig-device"))
+    assert "analogrig-device" in _run(device, "--help")
+
+
+def test_main_job_works_from_the_wheel(environment: Path, tmp_path: Path) -> None:
+    _run(environment / "analogrig", "run", "--out", tmp_path)
+    assert (tmp_path / "run.npz").stat().st_size > 0
+    assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_help_loads_nothing_heavy(environment: Path) -> None:
+    listing = _run(environment / "python", "-X", "importtime", "-m", "harness.cli", "run", "--help")
+    loaded = set(re.findall(r"\| +(\w+)", listing))
+    assert "argparse" in loaded
+    assert not loaded & {"numpy", "scipy", "serial", "cobs", "anycrc"}
+
+
+def test_help_starts_at_once(environment: Path) -> None:
+    bare, with_help = [], []
+    for _ in range(9):  # by turns, so that a busy machine slows both alike
+        bare.append(_duration_s(environment / "python", "-c", "pass"))
+        with_help.append(_duration_s(environment / "analogrig", "--help"))
+    assert statistics.median(with_help) < HELP_PER_START_LIMIT * statistics.median(bare)
+
+
+def _duration_s(*command: str | Path) -> float:
+    start_s = time.perf_counter()
+    _run(*command)
+    return time.perf_counter() - start_s
+
+
+def test_build_without_a_compiler_names_the_package_to_install(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "setup.py", "--quiet", "build_products", "-b", tmp_path / "lib", "-t", tmp_path / "temp"],
+        cwd=CHECKOUT,
+        env={**os.environ, "CC": "no-such-compiler"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert done.stderr.splitlines() == [
+        "analogrig: there is no C compiler 'no-such-compiler': apt-get install gcc libc6-dev"
+    ]
