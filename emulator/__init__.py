@@ -1,0 +1,48 @@
+"""The analogue computer, its generator and its card.
+
+README.md explains the circuit; SuspensionComputer and Sampler are the way in.
+"""
+
+from .circuit import Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
+from .engine import Engine
+from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
+from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
+from .nodal import PiecewiseLinear, piecewise_linear
+from .opamp import IDEAL, OpAmpModel
+from .sampler import Card, Sampler
+from .spice import to_spice
+from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
+
+__all__ = [
+    "CHANNELS",
+    "FRONT",
+    "IDEAL",
+    "PROGRAMS",
+    "SHOCK",
+    "TICKS_PER_SAMPLE",
+    "Capacitor",
+    "Card",
+    "Circuit",
+    "CircuitError",
+    "Edges",
+    "EmulatorError",
+    "Engine",
+    "EngineError",
+    "Excitation",
+    "ExcitationError",
+    "OpAmp",
+    "OpAmpModel",
+    "PiecewiseLinear",
+    "Pot",
+    "PotError",
+    "Program",
+    "Resistor",
+    "Sampler",
+    "SamplerError",
+    "Scales",
+    "SuspensionComputer",
+    "SuspensionParts",
+    "VoltageSource",
+    "piecewise_linear",
+    "to_spice",
+]

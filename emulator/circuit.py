@@ -1,0 +1,214 @@
+"""A circuit as a netlist: elements with names, between nodes with names. Node "0" is ground.
+
+Elements are frozen; a Circuit is checked once, when it is made, and never changes. Names count without regard to case,
+as in SPICE.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias, TypeVar
+
+from .errors import CircuitError
+from .opamp import OpAmpModel
+from .pot import checked_dial
+
+__all__ = ["GROUND", "Capacitor", "Circuit", "Element", "OpAmp", "Pot", "Resistor", "VoltageSource"]
+
+GROUND = "0"
+
+_NAME = re.compile(r"[A-Za-z0-9_]+")
+
+
+@dataclass(frozen=True)
+class Resistor:
+    """ohm between nodes a and b."""
+
+    name: str
+    a: str
+    b: str
+    ohm: float
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.a, self.b
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ((self.a, self.b),)
+
+
+@dataclass(frozen=True)
+class Capacitor:
+    """farad between nodes a and b; its state is v(a) - v(b)."""
+
+    name: str
+    a: str
+    b: str
+    farad: float
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.a, self.b
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ((self.a, self.b),)
+
+
+@dataclass(frozen=True)
+class Pot:
+    """A track of track_ohm from top to bottom; dial 0 puts the wiper at the bottom, 1 at the top."""
+
+    name: str
+    top: str
+    wiper: str
+    bottom: str
+    track_ohm: float
+    dial: float
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.top, self.wiper, self.bottom
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return (self.top, self.wiper), (self.wiper, self.bottom)
+
+
+@dataclass(frozen=True)
+class OpAmp:
+    """An op-amp; its state, if the model has one, is the voltage behind the output resistance."""
+
+    name: str
+    plus: str
+    minus: str
+    out: str
+    model: OpAmpModel
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.plus, self.minus, self.out
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        # The inputs draw no current, so they hold no node at a voltage.
+        return ((self.out, GROUND),)
+
+
+@dataclass(frozen=True)
+class VoltageSource:
+    """v(plus) - v(minus): an input of the circuit, or, when dc_v is given, a constant."""
+
+    name: str
+    plus: str
+    minus: str = GROUND
+    dc_v: float | None = None
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.plus, self.minus
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ((self.plus, self.minus),)
+
+
+Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource
+_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource)
+
+_POSITIVE: Mapping[type, str] = {Resistor: "ohm", Capacitor: "farad", Pot: "track_ohm"}
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """A checked netlist.
+
+    Raises CircuitError for duplicate or malformed names, values that are not positive, an element across a single node,
+    and nodes that nothing holds at a voltage; PotError for a dial off its track.
+    """
+
+    elements: tuple[Element, ...]
+
+    def __init__(self, elements: Iterable[Element]) -> None:
+        object.__setattr__(self, "elements", tuple(elements))
+        _check_names(self.elements)
+        for element in self.elements:
+            _check_element(element)
+        _check_nodes(self.elements)
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Every node but ground, in order of appearance."""
+        seen = dict.fromkeys(node for element in self.elements for node in element.nodes)
+        return tuple(node for node in seen if node != GROUND)
+
+    def of(self, kind: type[_E]) -> tuple[_E, ...]:
+        """The elements of one kind, in netlist order."""
+        return tuple(element for element in self.elements if isinstance(element, kind))
+
+    def with_dials(self, dials: Mapping[str, float]) -> Circuit:
+        """The same circuit with the pots named in dials set anew. Raises CircuitError for a pot that is not there."""
+        known = {pot.name for pot in self.of(Pot)}
+        for name in dials:
+            if name not in known:
+                raise CircuitError(f"no pot is called {name!r}; there are {', '.join(sorted(known)) or 'none'}")
+        return Circuit(
+            replace(element, dial=dials[element.name])
+            if isinstance(element, Pot) and element.name in dials
+            else element
+            for element in self.elements
+        )
+
+
+def _check_names(elements: tuple[Element, ...]) -> None:
+    names: set[str] = set()
+    nodes: dict[str, str] = {}
+    for element in elements:
+        if not _NAME.fullmatch(element.name):
+            raise CircuitError(f"element name {element.name!r}: only letters, digits and _ are allowed")
+        if element.name.lower() in names:
+            raise CircuitError(f"two elements are called {element.name!r}")
+        names.add(element.name.lower())
+        for node in element.nodes:
+            if not _NAME.fullmatch(node):
+                raise CircuitError(f"{_label(element)}: node name {node!r}: only letters, digits and _ are allowed")
+            if nodes.setdefault(node.lower(), node) != node:
+                raise CircuitError(f"{_label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+
+
+def _check_element(element: Element) -> None:
+    for a, b in element.bonds:
+        if a == b:
+            raise CircuitError(f"{_label(element)}: both ends are on node {a}")
+    field = _POSITIVE.get(type(element))
+    if field is not None:
+        value = getattr(element, field)
+        if not (math.isfinite(value) and value > 0):
+            raise CircuitError(f"{_label(element)}: {field} must be positive and finite, got {value!r}")
+    if isinstance(element, Pot):
+        checked_dial(element.dial, element.name)
+    if isinstance(element, VoltageSource) and element.dc_v is not None and not math.isfinite(element.dc_v):
+        raise CircuitError(f"{_label(element)}: dc_v must be finite, got {element.dc_v!r}")
+
+
+def _check_nodes(elements: tuple[Element, ...]) -> None:
+    """Every node must have a path to ground that can hold its voltage (found by growing the set of grounded nodes)."""
+    grounded = {GROUND}
+    bonds = [bond for element in elements for bond in element.bonds]
+    while True:
+        reached = {node for bond in bonds if grounded.intersection(bond) for node in bond} - grounded
+        if not reached:
+            break
+        grounded |= reached
+    for element in elements:
+        for node in element.nodes:
+            if node not in grounded:
+                raise CircuitError(f"{_label(element)}: node {node} floats: no path to ground holds its voltage")
+
+
+def _label(element: Element) -> str:
+    return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"

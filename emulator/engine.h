@@ -1,0 +1,90 @@
+/* The circuit engine: exact stepping of a piecewise-linear circuit between events.
+ *
+ *     dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e,   y = L x + M u + n
+ *
+ * phi acts on each element of w by itself; it is continuous and has three linear pieces ("kinks"). A vector of pieces,
+ * one per kink, is a mode; within a mode the circuit is affine and is stepped with its matrix exponential. Inputs u are
+ * constant between edges.
+ *
+ * Time is counted in ticks of 2^-22 of a sample period. For every mode that occurs the engine keeps exp(A h / 2^k) - I
+ * for k = 22..0 (a ladder), so any whole number of ticks is a product of a few of them, and an event is found by
+ * bisection to the tick.
+ *
+ * Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
+ * Not for interrupts or for the device: it allocates, and it is meant for the host. One engine must not be used by two
+ * threads at once; different engines may. Results depend on the inputs alone, and not on how a run is cut into calls.
+ */
+#ifndef ENGINE_H
+#define ENGINE_H
+
+#include <stdint.h>
+
+#define ENGINE_MAX_STATES 32
+#define ENGINE_MAX_INPUTS 8
+#define ENGINE_MAX_KINKS 64
+#define ENGINE_MAX_OUTPUTS 128
+#define ENGINE_MAX_UNKNOWNS 256
+#define ENGINE_LEVELS 23
+#define ENGINE_TICKS_PER_SAMPLE (INT64_C(1) << (ENGINE_LEVELS - 1))
+
+typedef struct engine engine;
+
+enum engine_status {
+    ENGINE_OK = 0,
+    ENGINE_NO_MEMORY,  /* a ladder could not be allocated */
+    ENGINE_TOO_STIFF,  /* a rate so fast that no ladder of sensible height reaches it */
+    ENGINE_EVENTS,     /* more events within one sample period than allowed */
+    ENGINE_NOT_FINITE, /* the state has left the numbers */
+    ENGINE_EDGE,       /* edges out of order, in the past, beyond the run, or of an input that is not there */
+    ENGINE_NO_SYSTEM   /* engine_set_system has not been called */
+};
+
+/* One kink: phi(w) = slope[p] w + intercept[p], with p = 0 below lower, 1 between, 2 above upper. */
+struct engine_kink {
+    double lower;
+    double upper;
+    double slope[3];
+    double intercept[3];
+};
+
+struct engine_counts {
+    int64_t samples;     /* recorded so far */
+    int64_t events;      /* changes of mode at an instant the engine had to find */
+    int64_t steps;       /* products tried, accepted or not */
+    int64_t modes_built; /* ladders computed; more than there are modes when the store is too small */
+};
+
+/* A new engine at rest: x = 0, u = 0, before its first sample. NULL iff a size is out of range or memory is short. */
+engine *engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
+
+/* Frees the engine; NULL is allowed. */
+void engine_free(engine *self);
+
+/* Sets or replaces the circuit: abc (states rows), g (states x kinks), cde (kinks rows), lmn (outputs rows), kinks.
+ * x and u stay as they are; a circuit equal to the one before, bit for bit, changes nothing at all. Cost: a copy, then
+ * a ladder for each mode that occurs (about 32 n^2 (n + m + 1) multiplications). Call it before engine_run. */
+enum engine_status engine_set_system(
+    engine *self, const double *abc, const double *g, const double *cde, const double *lmn,
+    const struct engine_kink *kinks);
+
+/* Copies the state x out and in. Setting it looks for events anew. */
+void engine_get_state(const engine *self, double *x);
+enum engine_status engine_set_state(engine *self, const double *x);
+
+/* Advances to each of the next `samples` sample instants (the first one of an engine's life is tick 0) and records y
+ * there, after the edges that fall on that very instant. y is samples x outputs, row-major. edges: at tick[i] (counted
+ * from sample 0) input[i] becomes level[i]; ticks must not decrease, must come after the last recorded instant, and
+ * must not pass the last instant of this run. Afterwards the engine stands at the last instant recorded. On failure it
+ * stands where it failed and only engine_free is sensible. */
+enum engine_status engine_run(
+    engine *self, int64_t samples, int64_t edges, const int64_t *tick, const int32_t *input, const double *level,
+    double *y);
+
+void engine_get_counts(const engine *self, struct engine_counts *counts);
+
+/* Solves a x = b in place by Gaussian elimination with partial pivoting (a: n x n, b: n x columns, row-major; both
+ * overwritten, b by x). Returns -1, or the index of the unknown for which no pivot was left (ENGINE_MAX_UNKNOWNS when n
+ * exceeds that). Here and not in LAPACK: the same bits on every machine. */
+int engine_solve(int n, int columns, double *a, double *b);
+
+#endif

@@ -1,0 +1,157 @@
+"""The engine: a piecewise-linear circuit, stepped exactly from sample to sample (engine.c, which explains how)."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import library
+from .errors import EngineError
+from .excitation import TICKS_PER_SAMPLE, Edges
+from .nodal import Kink, PiecewiseLinear
+
+__all__ = ["Engine", "EngineCounts"]
+
+_REASONS = {
+    1: "out of memory",
+    2: "the circuit is too stiff: it has a time constant below a femtosecond",
+    3: "more events within one sample than events_per_sample allows: does an amplifier oscillate?",
+    4: "the state is no longer finite: the circuit is unstable",
+    5: "the edges are out of order, not after the last sample recorded, or beyond the last sample of the run",
+    6: "no circuit was set",
+}
+
+
+@dataclass(frozen=True)
+class EngineCounts:
+    """What an engine has done so far.
+
+    samples: recorded; events: changes of mode found between edges; steps: matrix products; modes_built: ladders.
+    """
+
+    samples: int
+    events: int
+    steps: int
+    modes_built: int
+
+
+class Engine:
+    """Runs a circuit. It starts at rest (x = 0, u = 0), before its first sample.
+
+    system: the circuit; outputs: the nodes whose voltages are recorded; sample_rate_hz: the card's; events_per_sample:
+    bound on the mode changes within one sample period, beyond which EngineError is raised.
+    """
+
+    def __init__(
+        self,
+        system: PiecewiseLinear,
+        outputs: Sequence[str],
+        sample_rate_hz: float = 20e3,
+        events_per_sample: int = 10_000,
+    ) -> None:
+        self._outputs = tuple(outputs)
+        self._names = (system.states, system.inputs)
+        self._library = library.load()
+        if not sample_rate_hz > 0:
+            raise EngineError(f"sample_rate_hz must be positive, got {sample_rate_hz!r}")
+        sizes = (len(system.states), len(system.inputs), len(system.kinks), len(self._outputs))
+        self._handle = self._library.engine_new(*sizes, 1.0 / sample_rate_hz, events_per_sample)
+        if not self._handle:
+            raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
+        weakref.finalize(self, self._library.engine_free, self._handle)
+        self._recorded = 0
+        self.set_system(system)
+
+    @property
+    def recorded(self) -> int:
+        """Samples recorded so far; the engine stands at the instant of the last of them, index recorded - 1."""
+        return self._recorded
+
+    @property
+    def counts(self) -> EngineCounts:
+        """Events, steps and modes so far."""
+        counts = library.Counts()
+        self._library.engine_get_counts(self._handle, ctypes.byref(counts))
+        return EngineCounts(counts.samples, counts.events, counts.steps, counts.modes_built)
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """The voltages of PiecewiseLinear.states, (n,) in V."""
+        state = np.empty(len(self._names[0]))
+        self._library.engine_get_state(self._handle, state.ctypes.data)
+        return state
+
+    @state.setter
+    def state(self, volts: NDArray[np.float64]) -> None:
+        state = np.ascontiguousarray(volts, np.float64)
+        if state.shape != (len(self._names[0]),):
+            raise EngineError(f"the state has shape ({len(self._names[0])},), got {state.shape}")
+        self._check(self._library.engine_set_state(self._handle, state.ctypes.data))
+
+    def set_system(self, system: PiecewiseLinear) -> None:
+        """Replaces the circuit by another of the same states, inputs and kinks, at the last instant recorded.
+
+        That sample is still the old circuit's, the next is the first of the new. Voltages of capacitors and op-amps
+        carry over. An equal circuit changes nothing, to the bit. Raises EngineError.
+        """
+        if (system.states, system.inputs) != self._names:
+            raise EngineError(
+                f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
+            )
+        arrays = (system.abc, system.g, system.cde, system.readings(self._outputs), _kink_table(system.kinks))
+        # The list keeps the arrays alive during the call.
+        blocks = [np.ascontiguousarray(array, np.float64) for array in arrays]
+        self._check(self._library.engine_set_system(self._handle, *(block.ctypes.data for block in blocks)))
+
+    def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
+        """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
+
+        edges: by input; every edge after the last instant recorded and up to the last of this run (window() says which
+        ticks). Cutting a run into several calls gives the same bits. Raises EngineError; the engine is then of no
+        further use.
+        """
+        volts = np.empty((samples, len(self._outputs)))
+        ticks, inputs, levels_v = self._merge(edges or {})
+        arguments = (ticks.ctypes.data, inputs.ctypes.data, levels_v.ctypes.data, volts.ctypes.data)
+        self._check(self._library.engine_run(self._handle, samples, ticks.size, *arguments))
+        self._recorded += samples
+        return volts
+
+    def window(self, samples: int) -> tuple[int, int]:
+        """The ticks (start, stop) of the edges that run(samples) takes next: start <= tick < stop."""
+        start = (self._recorded - 1) * TICKS_PER_SAMPLE + 1 if self._recorded else 0
+        return start, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
+
+    def _merge(self, edges: Mapping[str, Edges]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+        """All edges in order of time; at the same tick in order of input."""
+        for name, train in edges.items():
+            if name not in self._names[1]:
+                raise EngineError(f"no input is called {name!r}; there are {', '.join(self._names[1]) or 'none'}")
+            if train.ticks.shape != train.levels_v.shape or not np.isfinite(train.levels_v).all():
+                raise EngineError(f"the edges of {name} need as many finite levels as ticks")
+        trains = [(self._names[1].index(name), train) for name, train in edges.items()]
+        ticks = np.concatenate([np.empty(0, np.int64), *(train.ticks for _, train in trains)])
+        inputs = np.concatenate(
+            [np.empty(0, np.int32), *(np.full(train.ticks.size, i, np.int32) for i, train in trains)]
+        )
+        levels_v = np.concatenate([np.empty(0), *(train.levels_v for _, train in trains)])
+        if len(trains) > 1:
+            order = np.lexsort((inputs, ticks))
+            ticks, inputs, levels_v = ticks[order], inputs[order], levels_v[order]
+        return np.ascontiguousarray(ticks), np.ascontiguousarray(inputs), np.ascontiguousarray(levels_v)
+
+    def _check(self, status: int) -> None:
+        if status:
+            raise EngineError(f"after {self.counts.samples} samples: {_REASONS.get(status, f'status {status}')}")
+
+
+@functools.lru_cache(maxsize=64)
+def _kink_table(kinks: tuple[Kink, ...]) -> NDArray[np.float64]:
+    """One struct engine_kink a row: (kinks, 8)."""
+    return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)

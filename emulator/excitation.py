@@ -1,0 +1,177 @@
+"""The signal generator: a two-level waveform, and the exact instants of its edges.
+
+Time is counted in ticks of a sample period / 2^22 (12 ps at 20 kHz) from sample 0, the same clock as the engine's.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ExcitationError
+
+__all__ = ["TICKS_PER_SAMPLE", "Edges", "Excitation"]
+
+TICKS_PER_SAMPLE = 1 << 22
+
+SHAPES = ("square", "pulse", "prbs")
+CLOCKS = ("card", "free")
+
+_TAPS = {
+    2: (2, 1),
+    3: (3, 2),
+    4: (4, 3),
+    5: (5, 3),
+    6: (6, 5),
+    7: (7, 6),
+    8: (8, 6, 5, 4),
+    9: (9, 5),
+    10: (10, 7),
+    11: (11, 9),
+    12: (12, 6, 4, 1),
+    13: (13, 4, 3, 1),
+    14: (14, 5, 3, 1),
+    15: (15, 14),
+    16: (16, 15, 13, 4),
+    17: (17, 14),
+    18: (18, 11),
+    19: (19, 6, 2, 1),
+    20: (20, 17),
+}
+"""Feedback taps of maximal-length shift registers (Xilinx XAPP 052, table 3)."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Changes of one input: from tick ticks[i] on it is levels_v[i].
+
+    ticks: int64 (n,), not decreasing; levels_v: float64 (n,).
+    """
+
+    ticks: NDArray[np.int64]
+    levels_v: NDArray[np.float64]
+
+    @classmethod
+    def none(cls) -> Edges:
+        """No edges at all."""
+        return cls(np.empty(0, np.int64), np.empty(0))
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A generator that switches between low_v and high_v; it is switched on, at whatever level it then has, at tick 0.
+
+    shape: "square" and "pulse" are high for the first `duty` of each period (a square has duty 0.5); "prbs" takes a
+    level for each period from a maximal-length sequence of register_length bits that starts at seed.
+    frequency_hz: periods (bits, for prbs) per second of machine time.
+    phase: how far into a period the generator is at tick 0, in periods, 0 <= phase < 1.
+    clock: "card": the generator runs on the card's clock, and an edge comes at the first sample instant at or after its
+    ideal instant; "free": it has a clock of its own, edges come at any instant, and it runs drift_ppm fast (slow when
+    negative).
+
+    Raises ExcitationError naming the field.
+    """
+
+    shape: str = "square"
+    low_v: float = 0.0
+    high_v: float = 10.0
+    frequency_hz: float = 200.0
+    phase: float = 0.0
+    duty: float = 0.5
+    clock: str = "card"
+    drift_ppm: float = 0.0
+    register_length: int = 9
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self._require("shape", self.shape in SHAPES, f"must be one of {', '.join(SHAPES)}")
+        self._require("clock", self.clock in CLOCKS, f"must be one of {', '.join(CLOCKS)}")
+        self._require("low_v", math.isfinite(self.low_v), "must be finite")
+        self._require(
+            "high_v", math.isfinite(self.high_v) and self.high_v >= self.low_v, "must be finite and not below low_v"
+        )
+        self._require(
+            "frequency_hz", math.isfinite(self.frequency_hz) and self.frequency_hz > 0, "must be positive and finite"
+        )
+        self._require("phase", 0 <= self.phase < 1, "must be at least 0 and less than 1 period")
+        self._require("duty", 0 < self.duty < 1, "must be between 0 and 1, exclusive")
+        self._require("duty", self.shape == "pulse" or self.duty == 0.5, "is for the shape pulse")
+        self._require("drift_ppm", abs(self.drift_ppm) <= 10_000, "must be within +-10000 ppm")
+        self._require(
+            "drift_ppm",
+            self.clock == "free" or self.drift_ppm == 0,
+            "is for the clock free: the card's clock is the reference",
+        )
+        self._require("register_length", self.register_length in _TAPS, f"must be {min(_TAPS)} to {max(_TAPS)}")
+        self._require("seed", isinstance(self.seed, int), "must be an integer")
+
+    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
+        """The edges at ticks start_tick <= t < stop_tick, t >= 0; the one at tick 0 is the switching on.
+
+        Any way of cutting a range into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
+        hours at 20 kHz).
+        Raises ExcitationError for a frequency above half the sample rate.
+        """
+        if self.frequency_hz > 0.5 * sample_rate_hz:
+            raise ExcitationError(
+                f"excitation: frequency_hz {self.frequency_hz!r} exceeds half the sample rate of {sample_rate_hz!r} Hz"
+            )
+        period = TICKS_PER_SAMPLE * sample_rate_hz / (self.frequency_hz * (1.0 + 1e-6 * self.drift_ppm))
+        # An edge on the card's clock may be up to a sample later than its ideal instant: begin a period early.
+        first = math.floor(start_tick / period) - 1
+        last = math.ceil(stop_tick / period) + 1
+        if start_tick <= 0:
+            first = -2
+        ticks, levels_v = self._prbs(first, last, period) if self.shape == "prbs" else self._cycle(first, last, period)
+        return _between(max(start_tick, 0), stop_tick, ticks, levels_v)
+
+    def _cycle(self, first: int, last: int, period: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        starts: NDArray[np.float64] = np.arange(first, last + 1, dtype=np.float64) - self.phase
+        ticks = self._instants(np.stack((starts, starts + self.duty), axis=1).ravel(), period)
+        return ticks, np.tile((self.high_v, self.low_v), last + 1 - first)
+
+    def _prbs(self, first: int, last: int, period: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        bits = _sequence(self.register_length)
+        index = np.arange(first, last + 1)
+        high = bits[(index + self.seed) % bits.size]
+        return self._instants(index.astype(np.float64) - self.phase, period), np.where(high, self.high_v, self.low_v)
+
+    def _instants(self, periods: NDArray[np.float64], period: float) -> NDArray[np.int64]:
+        ticks = np.rint(periods * period).astype(np.int64)
+        if self.clock == "card":
+            ticks = -(-ticks // TICKS_PER_SAMPLE) * TICKS_PER_SAMPLE
+        return ticks
+
+    def _require(self, field: str, holds: object, what: str) -> None:
+        if not holds:
+            raise ExcitationError(f"excitation: {field} {getattr(self, field)!r} {what}")
+
+
+def _between(start_tick: int, stop_tick: int, ticks: NDArray[np.int64], levels_v: NDArray[np.float64]) -> Edges:
+    """Those edges that change the level, within the range.
+
+    All that happened before tick 0 becomes one edge at tick 0.
+    """
+    ticks = np.maximum(ticks, 0)
+    lasts = np.append(ticks[1:] != ticks[:-1], True)
+    ticks, levels_v = ticks[lasts], levels_v[lasts]
+    changes = np.append(True, levels_v[1:] != levels_v[:-1])
+    kept = changes & (ticks >= start_tick) & (ticks < stop_tick)
+    return Edges(ticks[kept], levels_v[kept])
+
+
+@functools.lru_cache(maxsize=4)
+def _sequence(length: int) -> NDArray[np.bool_]:
+    """One period, 2^length - 1 bits, of the maximal-length sequence that a register of ones gives."""
+    register = [1] * length
+    taps = [tap - 1 for tap in _TAPS[length]]
+    bits = np.empty((1 << length) - 1, np.bool_)
+    for i in range(bits.size):
+        bits[i] = register[-1]
+        register = [sum(register[tap] for tap in taps) % 2, *register[:-1]]
+    bits.setflags(write=False)
+    return bits

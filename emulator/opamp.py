@@ -1,0 +1,104 @@
+"""Op-amps by their datasheet numbers.
+
+The law of every op-amp here, with v the voltage behind the output resistance (SI units throughout):
+
+    dv/dt = clip(2 pi GBW (v+ - v- + Vos) - v / tau, -SR, +SR) - CLAMP_RATE deadzone(v; swing),   tau = Avol / (2 pi
+    GBW)
+
+The clamp is a spring and not a wall: overdriven at full slew rate, v settles SR / CLAMP_RATE beyond the swing (13 mV
+for a TL07x). That keeps the field continuous, so the mode of an amplifier follows from the state alone and there is
+nothing to slide on. Inputs draw no current; the supply is not modelled beyond the swing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from .errors import CircuitError
+
+__all__ = ["CLAMP_RATE", "IDEAL", "PRESETS", "OpAmpModel", "preset"]
+
+CLAMP_RATE = 1e9
+"""Rate in 1/s at which an output beyond its swing is pulled back."""
+
+
+@dataclass(frozen=True)
+class OpAmpModel:
+    """One type of op-amp. The defaults are the ideal one (v+ = v-, no state); every non-ideality is off on its own.
+
+    avol: open-loop gain at DC (V/V); gbw_hz: gain-bandwidth product; slew_v_per_s: slew rate; swing_v: (lowest,
+    highest) output in V;
+    rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-.
+
+    Raises CircuitError naming the field. Slew and swing need a finite gbw_hz, for they act on the state that it brings.
+    """
+
+    avol: float = math.inf
+    gbw_hz: float = math.inf
+    slew_v_per_s: float = math.inf
+    swing_v: tuple[float, float] = (-math.inf, math.inf)
+    rout_ohm: float = 0.0
+    vos_v: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in ("avol", "gbw_hz", "slew_v_per_s"):
+            value = getattr(self, field)
+            if not value > 0:
+                raise CircuitError(f"op-amp: {field} must be positive, got {value!r}")
+        if not (math.isfinite(self.rout_ohm) and self.rout_ohm >= 0):
+            raise CircuitError(f"op-amp: rout_ohm must be finite and not negative, got {self.rout_ohm!r}")
+        if not math.isfinite(self.vos_v):
+            raise CircuitError(f"op-amp: vos_v must be finite, got {self.vos_v!r}")
+        low, high = self.swing_v
+        if not low < 0 < high:
+            raise CircuitError(f"op-amp: swing_v must lie on both sides of 0 V, got {self.swing_v!r}")
+        if not self.has_state and (self.slews or self.clamps):
+            raise CircuitError("op-amp: slew_v_per_s and swing_v need a finite gbw_hz")
+
+    @property
+    def has_state(self) -> bool:
+        """Whether the amplifier has a pole, and so a state."""
+        return math.isfinite(self.gbw_hz)
+
+    @property
+    def slews(self) -> bool:
+        """Whether the slew rate is finite."""
+        return math.isfinite(self.slew_v_per_s)
+
+    @property
+    def clamps(self) -> bool:
+        """Whether the output swing is finite on either side."""
+        return any(math.isfinite(limit) for limit in self.swing_v)
+
+    @property
+    def gain_rate(self) -> float:
+        """2 pi GBW, in 1/s."""
+        return 2.0 * math.pi * self.gbw_hz
+
+    @property
+    def leak_rate(self) -> float:
+        """1 / tau = 2 pi GBW / Avol, in 1/s; 0 for an infinite gain."""
+        return self.gain_rate / self.avol
+
+
+IDEAL = OpAmpModel()
+
+PRESETS: Mapping[str, OpAmpModel] = MappingProxyType(
+    {
+        "ideal": IDEAL,
+        "tl07x": OpAmpModel(avol=2e5, gbw_hz=3e6, slew_v_per_s=13e6, swing_v=(-13.5, 13.5), rout_ohm=100.0),
+        "741": OpAmpModel(avol=2e5, gbw_hz=1e6, slew_v_per_s=0.5e6, swing_v=(-13.5, 13.5), rout_ohm=75.0),
+    }
+)
+"""Typical values on +-15 V, from the datasheets of the TL071 family and of the uA741."""
+
+
+def preset(name: str) -> OpAmpModel:
+    """The preset of that name (any case); raises CircuitError listing what there is."""
+    try:
+        return PRESETS[name.lower()]
+    except KeyError:
+        raise CircuitError(f"unknown op-amp {name!r}; there are {', '.join(PRESETS)}") from None
