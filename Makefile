@@ -92,7 +92,7 @@ $(VENV)/.requirements: requirements.lock
 
 $(VENV)/.installed: $(VENV)/.requirements pyproject.toml setup.py
 	@echo "installing analogrig into $(VENV)"
-	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
 # All products come from one command, whichever is out of date.
