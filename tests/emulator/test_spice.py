@@ -1,0 +1,100 @@
+"""The emulator against ngspice on the exported circuit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emulator import (
+    TICKS_PER_SAMPLE,
+    CircuitError,
+    Engine,
+    Excitation,
+    SuspensionComputer,
+    SuspensionParts,
+    piecewise_linear,
+    to_spice,
+)
+
+NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
+Volts = NDArray[np.float64]
+
+LSB_V = 10.0 / 4096
+SAMPLE_RATE_HZ = 20e3
+THESIS_TWEAKS = (
+    (200, {"K_n_per_m": 18000.0}),
+    (400, {"B_n_s_per_m": 3453.0}),
+    (500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    (600, {"M_kg": 30.0}),
+)
+AMPLIFIERS = ("u1", "u2", "u3", "u4", "u5")
+
+
+def deck_of(
+    computer: SuspensionComputer,
+    excitation: Excitation,
+    samples: int,
+    tweaks: Sequence[tuple[int, Mapping[str, float]]] = (),
+) -> str:
+    return to_spice(
+        computer.circuit,
+        samples=samples,
+        edges={"F": excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)},
+        turns=[(sample, computer.dials_for(**settings)) for sample, settings in tweaks],
+    )
+
+
+def every_amplifier(computer: SuspensionComputer, excitation: Excitation, samples: int) -> Volts:
+    engine = Engine(piecewise_linear(computer.circuit), AMPLIFIERS)
+    return engine.run(samples, {"F": excitation.edges(*engine.window(samples), SAMPLE_RATE_HZ)})
+
+
+@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("front", ()), ("shock", ())])
+def test_displacement_and_velocity_agree_with_ngspice_at_every_sample(
+    ngspice: NgSpice, program: str, tweaks: Sequence[tuple[int, Mapping[str, float]]]
+) -> None:
+    computer = SuspensionComputer(program)
+    reference = ngspice(deck_of(computer, Excitation(), 800, tweaks), ("u5", "u2"), 800)
+    volts = np.concatenate(list(computer.play(Excitation(), 800, tweaks)))
+    assert np.abs(volts[:, 1:3] - reference).max() < 0.05 * LSB_V
+
+
+def test_a_generator_with_a_clock_of_its_own_agrees_with_ngspice_at_every_amplifier(ngspice: NgSpice) -> None:
+    computer = SuspensionComputer("front", rng=np.random.default_rng(1), offset_v=3e-3)
+    excitation = Excitation(clock="free", drift_ppm=200.0, phase=0.637, frequency_hz=317.0)
+    reference = ngspice(deck_of(computer, excitation, 400), AMPLIFIERS, 400)
+    assert np.abs(every_amplifier(computer, excitation, 400) - reference).max() < 0.05 * LSB_V
+
+
+def test_slewing_and_clamping_amplifiers_agree_with_ngspice(ngspice: NgSpice) -> None:
+    # 741s slew for 40 us at each edge of this drive, and twice the summer's gain drives U1 into its clamp.
+    computer = SuspensionComputer("front", opamp="741", parts=SuspensionParts(rfb_ohm=200e3))
+    excitation = Excitation(low_v=-10.0, high_v=10.0, frequency_hz=400.0, clock="free", phase=0.237)
+    reference = ngspice(deck_of(computer, excitation, 300), AMPLIFIERS, 300)
+    volts = every_amplifier(computer, excitation, 300)
+    assert np.abs(volts[:, 0]).max() > 13.3
+    assert np.abs(volts - reference).max() < 0.05 * LSB_V
+
+
+def test_ideal_amplifiers_can_be_exported(ngspice: NgSpice) -> None:
+    computer = SuspensionComputer("shock", opamp="ideal")
+    excitation = Excitation()
+    reference = ngspice(deck_of(computer, excitation, 120), ("u5", "u2"), 120)
+    volts = np.concatenate(list(computer.play(excitation, 120)))
+    assert np.abs(volts[:, 1:3] - reference).max() < 0.05 * LSB_V
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"nodes": ["nowhere"]}, "no node is called 'nowhere'"),
+        ({"edges": {"G": Excitation().edges(0, 1, SAMPLE_RATE_HZ)}}, "no input is called 'G'; there are F"),
+        ({"turns": [(3, {"Q": 0.5})]}, "no pot is called 'Q'; there are B, K, M"),
+    ],
+)
+def test_what_the_circuit_does_not_have_is_refused_by_name(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(CircuitError, match=message):
+        to_spice(SuspensionComputer().circuit, samples=10, **arguments)  # type: ignore[arg-type]
