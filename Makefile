@@ -40,7 +40,7 @@ test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
 check: lint strict ## linters, types, and the C with every warning an error
 
 lint: $(PRODUCTS)
-	@$(BIN)/ruff check --quiet $(PYTHON_SOURCES)
+	@$(BIN)/ruff check --quiet --output-format concise $(PYTHON_SOURCES)
 	@$(BIN)/ruff format --quiet --check $(PYTHON_SOURCES) || { echo "some files are not formatted: make format"; exit 1; }
 	@$(BIN)/mypy --no-error-summary
 
