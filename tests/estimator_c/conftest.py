@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from est_driver import Estimator, compile_driver
+from tests.estimator_c.est_driver import Estimator, compile_driver
 
 
 @pytest.fixture(scope="session")

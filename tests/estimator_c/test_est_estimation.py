@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from est_driver import MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.est_driver import MISSING, NONE, REFUSED, UPDATED, Estimator
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
+from tests.estimator_c.est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
 from numpy.typing import NDArray
 from scipy.linalg import expm
 

@@ -1,0 +1,228 @@
+"""The command ``analogrig``.
+
+Everything heavy is imported inside the command that needs it, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from harness.bench import Progress
+    from harness.dut import Dut
+    from harness.rig import Rig
+    from harness.run import Run
+    from harness.scenario import Scenario
+    from harness.verdict import Verdict
+
+PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
+"""Exit statuses."""
+
+_STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE}
+
+DEFAULT_SEED = 1995
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status. Every failure is one line on standard error."""
+    arguments = _parser().parse_args(argv)
+    from emulator.errors import EmulatorError
+    from harness.errors import AnalogrigError
+
+    try:
+        return int(arguments.command(arguments))
+    except (AnalogrigError, EmulatorError) as error:
+        print(f"analogrig: {error}", file=sys.stderr)
+        return USAGE
+    except KeyboardInterrupt:
+        print("analogrig: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PASSED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="analogrig",
+        description="Hardware in the loop for embedded parameter estimators: an analogue computer, a link, a device, a verdict.",
+        epilog="Exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted.",
+    )
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_run(commands)
+    _add_replay(commands)
+    _add_emulate(commands)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Asks the installed distribution, and only when asked."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, help="show the version and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(f"analogrig {version('analogrig')}")
+        parser.exit()
+
+
+def _add_run(commands: Any) -> None:
+    command = commands.add_parser("run", help="play a scenario on a rig, through a device, and judge what it says")
+    _add_what_to_play(command)
+    _add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
+    _add_output(command)
+    command.set_defaults(command=_run)
+
+
+def _add_replay(commands: Any) -> None:
+    command = commands.add_parser("replay", help="play a recorded run through a device again, and judge it")
+    command.add_argument("file", type=Path, metavar="FILE", help="a recording (run.npz)")
+    _add_dut(command, default=None)
+    _add_output(command, default=Path("build/replay"))
+    command.set_defaults(command=_replay)
+
+
+def _add_emulate(commands: Any) -> None:
+    command = commands.add_parser("emulate", help="the rig alone: write volts and codes to a file")
+    _add_what_to_play(command)
+    command.add_argument(
+        "--out", type=Path, default=Path("build/emulate.csv"), metavar="FILE", help=".csv or .npz (default: %(default)s)"
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    command.set_defaults(command=_emulate)
+
+
+def _add_what_to_play(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--scenario", default="thesis", metavar="NAME", help="shipped name or .toml file (default: thesis)")
+    command.add_argument(
+        "--rig",
+        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
+        metavar="NAME",
+        help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG or emulator)",
+    )
+    command.add_argument("--seed", type=_seed, default=DEFAULT_SEED, metavar="N", help="of everything random (default: %(default)s)")
+
+
+def _seed(text: str) -> int:
+    if text.isdecimal() and int(text) < 2**63:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text!r}")
+
+
+def _add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
+    shown = "$ANALOGRIG_DUT or host" if default is not None else "that of the recording"
+    command.add_argument(
+        "--dut", default=default, metavar="NAME", help=f"shipped name, .toml file, or serial:URL (default: {shown})"
+    )
+
+
+def _add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
+    command.add_argument(
+        "--out", type=Path, default=default, metavar="DIR", help="where run.npz and report.html go (default: %(default)s)"
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from harness.dut import open_dut
+    from harness.rig import open_rig
+    from harness.scenario import Scenario
+
+    scenario = Scenario.load(arguments.scenario)
+    with open_rig(arguments.rig) as rig, open_dut(arguments.dut) as dut:
+        return _play(rig, dut, scenario, arguments.seed, arguments)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from harness.dut import open_dut, reopen_dut
+    from harness.rig import RecordingRig
+
+    rig = RecordingRig.open(arguments.file)
+    with open_dut(arguments.dut) if arguments.dut else reopen_dut(rig.run.conditions.dut) as dut:
+        return _play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments)
+
+
+def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace) -> int:
+    from harness.bench import INTERRUPTED_BY_USER, Bench
+    from harness.errors import RecordingError
+    from harness.report import write_report
+    from harness.verdict import judge
+
+    run = Bench(rig, dut, progress=_progress_line()).play(scenario, seed)
+    verdict = judge(run)
+    try:
+        run.save(arguments.out / "run.npz")
+        write_report(run, verdict, arguments.out / "report.html")
+    except RecordingError as error:
+        print(f"analogrig: INCONCLUSIVE: {error}", file=sys.stderr)
+        return INCONCLUSIVE
+    if arguments.json:
+        print(json.dumps(_as_json(run, verdict, arguments.out)))
+    else:
+        from harness.summary import summary
+
+        print(summary(run, verdict))
+        print(f"report: {arguments.out / 'report.html'}\nrun:    {arguments.out / 'run.npz'}")
+    for fault in run.conditions.faults:
+        print(f"analogrig: INCONCLUSIVE: {fault}", file=sys.stderr)
+    return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else _STATUS[verdict.outcome]
+
+
+def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
+    from harness.verdict import as_json
+
+    conditions = run.conditions
+    return {
+        "scenario": conditions.scenario["name"],
+        "rig": conditions.rig["name"],
+        "dut": dict(conditions.dut),
+        "link": conditions.link,
+        "seed": conditions.seed,
+        "samples": run.samples,
+        "counters": dict(conditions.counters),
+        **as_json(verdict),
+        "report": str(out / "report.html"),
+        "run": str(out / "run.npz"),
+    }
+
+
+def _emulate(arguments: argparse.Namespace) -> int:
+    from harness.emulate import write_signals
+    from harness.rig import open_rig
+    from harness.scenario import Scenario
+
+    scenario = Scenario.load(arguments.scenario)
+    with open_rig(arguments.rig) as rig:
+        written = write_signals(rig, scenario, arguments.seed, arguments.out, progress=_progress_line())
+    if arguments.json:
+        print(json.dumps({"file": str(arguments.out), "seed": arguments.seed, **written}))
+    else:
+        print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
+    return PASSED
+
+
+def _progress_line() -> Progress | None:
+    """Percent on standard error, at most once a second and only from the second second on; None when nobody watches."""
+    if not sys.stderr.isatty():
+        return None
+    import time
+
+    next_s = time.monotonic() + 1.0
+
+    def show(done: int, asked: int) -> None:
+        nonlocal next_s
+        now_s = time.monotonic()
+        if now_s >= next_s:
+            next_s = now_s + 1.0
+            print(f"\r{done} of {asked} samples ({done / asked:.0%})", end="\n" if done == asked else "", file=sys.stderr, flush=True)
+
+    return show

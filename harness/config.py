@@ -1,0 +1,148 @@
+"""Typed configuration: TOML files into frozen dataclasses, and the places where the named ones live.
+
+Every key is checked against the dataclass: an unknown key, a wrong type or a value out of range is one line that names
+the file, the table and the key. Nothing read from a file is ever executed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from emulator.errors import EmulatorError
+from harness.errors import ConfigurationError
+
+T = TypeVar("T")
+
+Kind = Literal["scenarios", "rigs", "devices"]
+
+MAX_FILE_BYTES = 1_000_000
+
+
+def fixtures() -> Path:
+    """The folder of the shipped scenarios, rigs and devices: inside the installed package, or that of the checkout."""
+    installed = Path(__file__).parent / "fixtures"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "fixtures"
+
+
+def locate(kind: Kind, name: str) -> Path:
+    """The TOML file of a shipped ``name``, or of a user's own path.
+
+    :raises ConfigurationError: there is no such file.
+    """
+    if name.endswith(".toml") or "/" in name:
+        path = Path(name)
+        if path.is_file():
+            return path
+        raise ConfigurationError(f"{name}: no such file")
+    path = fixtures() / kind / f"{name}.toml"
+    if path.is_file():
+        return path
+    raise ConfigurationError(f"no {kind[:-1]} is called {name!r}: there are {', '.join(names(kind))}, or give a .toml file")
+
+
+def names(kind: Kind) -> list[str]:
+    """The shipped names of a kind, sorted."""
+    return sorted(path.stem for path in (fixtures() / kind).glob("*.toml"))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as plain values.
+
+    :raises ConfigurationError: it cannot be read, is too large, or is not TOML.
+    """
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ConfigurationError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+
+
+def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """``table`` as an instance of the dataclass ``cls``; ``where`` (file and table) leads every error.
+
+    Field types may be bool, int, float, str, Literal, a dataclass, Mapping[str, X], tuple[X, ...], and unions of these.
+
+    :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
+    """
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
+    hints = typing.get_type_hints(cls)
+    for key in table:
+        if key not in fields:
+            raise ConfigurationError(f"{where}: unknown key {key!r} (known: {', '.join(fields)})")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in table:
+            raise ConfigurationError(f"{where}: the key {name!r} is lacking")
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    try:
+        return cls(**values)
+    except (ValueError, EmulatorError) as error:
+        raise ConfigurationError(f"{where}: {error}") from error
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(arguments, value, where)
+    if origin is Literal:
+        if value in arguments:
+            return value
+        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {value!r}")
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
+    if origin is tuple:
+        return _convert_tuple(arguments, value, where)
+    if origin in (Mapping, dict):
+        table = _expect(dict, value, "a table", where)
+        return {key: _convert(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
+    problems = []
+    for argument in arguments:
+        if argument is types.NoneType:
+            continue
+        try:
+            return _convert(argument, value, where)
+        except ConfigurationError as error:
+            problems.append(str(error).removeprefix(f"{where}: "))
+    raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    items = _expect(list, value, "an array", where)
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+    if len(items) != len(arguments):
+        raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
+    return tuple(_convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True)))
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is Any:
+        return value
+    if hint is float:
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+        raise ConfigurationError(f"{where}: must be a finite number, not {value!r}")
+    if hint is int and isinstance(value, bool):
+        raise ConfigurationError(f"{where}: must be a whole number, not {value!r}")
+    words = {int: "a whole number", bool: "true or false", str: "a text"}
+    return _expect(hint, value, words[hint], where)
+
+
+def _expect(kind: type[T], value: Any, words: str, where: str) -> T:
+    if isinstance(value, kind):
+        return value
+    raise ConfigurationError(f"{where}: must be {words}, not {value!r}")

@@ -1,0 +1,57 @@
+"""What can go wrong, as one tree; every message is one line that names the cause and the place.
+
+AnalogrigError
+├── ConfigurationError          a file, key, value or command-line argument is wrong
+├── RecordingError              a recording cannot be read or written
+├── RigError                    the rig failed
+├── LinkError                   the link failed
+│   ├── LinkTimeout             nothing came in time
+│   └── LinkClosed              the other end is gone
+└── DeviceError                 the device answers, but not as it should
+    ├── CatalogueMismatch       it was built from another message catalogue
+    └── DeviceRefused           it refused a command or a value
+
+Errors of the operating system and of libraries are wrapped once, where they appear; the cause is kept.
+"""
+
+from __future__ import annotations
+
+
+class AnalogrigError(Exception):
+    """The root: catch this to catch everything that the harness raises on purpose."""
+
+
+class ConfigurationError(AnalogrigError):
+    """A file, a key, a value or a command-line argument is wrong."""
+
+
+class RecordingError(AnalogrigError):
+    """A recording cannot be read or written."""
+
+
+class RigError(AnalogrigError):
+    """The rig failed."""
+
+
+class LinkError(AnalogrigError):
+    """The link failed: nothing can be said about the device."""
+
+
+class LinkTimeout(LinkError):  # noqa: N818 - the word of the field
+    """Nothing came in time."""
+
+
+class LinkClosed(LinkError):  # noqa: N818 - the word of the field
+    """The other end is gone."""
+
+
+class DeviceError(AnalogrigError):
+    """The device answers, but not as it should."""
+
+
+class CatalogueMismatch(DeviceError):  # noqa: N818 - the word of the field
+    """The device was built from another message catalogue."""
+
+
+class DeviceRefused(DeviceError):  # noqa: N818 - the word of the field
+    """The device refused a command or a value."""

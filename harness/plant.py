@@ -1,0 +1,110 @@
+"""The plant: a mass, a damper and a spring, in continuous time and as the device sees it, sample by sample.
+
+This is the harness's own model of what the rig computes: it is used to say how much a change of the plant can be seen
+(``information``) and what an estimate theta means in kilograms, never to produce the samples of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+PARAMETERS = ("M", "B", "K")
+"""Names and order of the physical parameters wherever they stand in one array."""
+
+
+@dataclass(frozen=True)
+class Plant:
+    """M x'' + B x' + K x = F (thesis Equ 2.3)."""
+
+    mass_kg: float
+    damping_n_s_per_m: float
+    stiffness_n_per_m: float
+
+    def parameters(self) -> dict[str, float]:
+        """The values under their short names ``M``, ``B``, ``K``."""
+        return dict(zip(PARAMETERS, (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m), strict=True))
+
+    def changes_to(self, other: Plant) -> dict[str, tuple[float, float]]:
+        """``{name: (before, after)}`` of the parameters in which ``other`` differs."""
+        pairs = zip(PARAMETERS, self.parameters().values(), other.parameters().values(), strict=True)
+        return {name: (before, after) for name, before, after in pairs if before != after}
+
+
+State = tuple[float, float]
+"""Displacement [m] and velocity [m/s]."""
+
+AT_REST: State = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class SampledPlant:
+    """One sample period of a plant whose force is held. Zero-order hold, exact.
+
+    Plain floats, since a 2 x 2 product takes numpy ten times as long.
+    """
+
+    transition: tuple[float, float, float, float]
+    """Row by row: x from x, x from v, v from x, v from v."""
+    response: tuple[float, float]
+    """x and v per newton."""
+
+    @classmethod
+    def of(cls, plant: Plant, period_s: float) -> SampledPlant:
+        """Sample ``plant`` every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
+        m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+        generator = np.array([[0.0, 1.0, 0.0], [-k / m, -b / m, 1.0 / m], [0.0, 0.0, 0.0]])
+        (xx, xv, xf), (vx, vv, vf), _ = _exponential(generator * period_s).tolist()
+        return cls(transition=(xx, xv, vx, vv), response=(xf, vf))
+
+    def next(self, state: State, force_n: float) -> State:
+        """The state one sample later."""
+        x, v = state
+        xx, xv, vx, vv = self.transition
+        xf, vf = self.response
+        return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
+
+
+def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """exp(matrix) by scaling, a Taylor series, and squaring; relative error near 1e-15 for the small norms used here."""
+    squarings = max(0, int(np.ceil(np.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300)))) + 4)
+    scaled = matrix / 2.0**squarings
+    term = result = np.eye(len(matrix))
+    for order in range(1, 13):
+        term = term @ scaled / order
+        result = result + term
+    for _ in range(squarings):
+        result = result @ result
+    return np.asarray(result)
+
+
+def physical_parameters(
+    theta: NDArray[np.float32], estimator: Mapping[str, object], n_per_code: float, m_per_code: float, period_s: float
+) -> NDArray[np.float64]:
+    """Estimates (n, p) in codes to M, B, K (n, 3); NaN where a row describes no mass, damper and spring.
+
+    The poles of A give B/M and K/M, the static gain gives K; neither needs to know when inside the interval an edge came.
+
+    :param estimator: at least ``na`` and ``nb``, which say what the columns of theta are; all NaN unless ``na`` is 2.
+    :param n_per_code: newtons per code of force.
+    :param m_per_code: metres per code of displacement.
+    :param period_s: problem time between samples.
+    """
+    na, nb = int(str(estimator["na"])), int(str(estimator["nb"]))
+    if na != 2:
+        return np.full((len(theta), 3), np.nan)
+    a1, a2 = (theta[:, i].astype(np.float64) for i in range(2))
+    with np.errstate(all="ignore"):
+        gain = theta[:, 2 : 2 + nb].sum(axis=1, dtype=np.float64) / (1.0 + a1 + a2)
+        stiffness = n_per_code / (gain * m_per_code)
+        poles = np.sqrt((a1 * a1 - 4.0 * a2).astype(np.complex128))
+        logs = [np.log((-a1 + sign * poles) / 2.0) / period_s for sign in (1.0, -1.0)]
+        stiffness_over_mass = (logs[0] * logs[1]).real
+        damping_over_mass = -(logs[0] + logs[1]).real
+        mass = stiffness / stiffness_over_mass
+        out = np.stack([mass, damping_over_mass * mass, stiffness], axis=1)
+    out[~(np.isfinite(out) & (out > 0.0)).all(axis=1)] = np.nan
+    return out

@@ -1,0 +1,220 @@
+"""A Run: everything that one play of a scenario yielded, and the one file it is kept in.
+
+The file is an uncompressed ``.npz``: the arrays under their own names and ``header``, a JSON text. Nothing in it is ever
+executed (``allow_pickle=False``); a verdict can be computed from it alone, today or in ten years.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import RecordingError
+from harness.plant import Plant
+from harness.storage import replacing
+
+FORMAT = "analogrig-run"
+FORMAT_VERSION = 1
+
+CHANNELS = ("force", "displacement", "velocity", "net_force")
+"""Order of the columns of ``Run.codes`` and ``Run.clipped``."""
+
+_ARRAYS: dict[str, tuple[str, int]] = {
+    "codes": ("uint16", 2),
+    "clipped": ("bool", 2),
+    "theta": ("float32", 2),
+    "innovation": ("float32", 1),
+    "statistic": ("float32", 1),
+    "flags": ("uint8", 1),
+    "alarm_index": ("int64", 1),
+    "alarm_kind": ("uint8", 1),
+    "alarm_statistic": ("float32", 1),
+}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """How the codes of one channel translate: volts = low_v + code * lsb_v, physical = volts * unit_per_v."""
+
+    low_v: float
+    lsb_v: float
+    unit: str
+    unit_per_v: float
+    noise_lsb: float
+    """rms of the noise before quantisation, as far as the rig knows it."""
+
+    def physical(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """Codes of any shape to ``unit`` (float64, same shape)."""
+        return self.volts(codes) * self.unit_per_v
+
+    def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """Codes of any shape to volts at the rig (float64, same shape)."""
+        return self.low_v + codes.astype(np.float64) * self.lsb_v
+
+    @property
+    def lsb(self) -> float:
+        """One code in ``unit``."""
+        return self.lsb_v * self.unit_per_v
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The plant from ``start`` (sample index) until the next segment."""
+
+    start: int
+    plant: Plant
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What was true when the run was made; the header of the file."""
+
+    seed: int
+    samples_asked: int
+    sample_period_s: float
+    """Machine time between samples."""
+    time_scale: float
+    """Problem time per machine time (200: the computer runs 200 times faster than the motorcycle)."""
+    channels: Mapping[str, Channel]
+    segments: tuple[Segment, ...]
+    """The truth, which the device never saw; empty if the rig does not know it."""
+    scenario: Mapping[str, Any]
+    """The scenario's TOML, with its name."""
+    rig: Mapping[str, Any]
+    """The rig's description, with its name."""
+    dut: Mapping[str, Any]
+    """Device: name, kind, estimator settings, identity (firmware, catalogue hash, boot nonce)."""
+    link: str
+    counters: Mapping[str, int] = field(default_factory=dict)
+    """The device's own counters at the end."""
+    faults: tuple[str, ...] = ()
+    """Why the run is not valid; empty if it is."""
+
+    @property
+    def sample_period_problem_s(self) -> float:
+        """Problem time between samples."""
+        return self.sample_period_s * self.time_scale
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Codes, estimates and alarms of one play. n samples, p parameters; n may be less than ``samples_asked``."""
+
+    conditions: Conditions
+    codes: NDArray[np.uint16]
+    """(n, 4), columns as ``CHANNELS``."""
+    clipped: NDArray[np.bool_]
+    """(n, 4): the code is the limit of the range, not a measurement."""
+    theta: NDArray[np.float32]
+    """(n, p): the estimate after each sample, in codes per code; order of est.h."""
+    innovation: NDArray[np.float32]
+    """(n,) codes."""
+    statistic: NDArray[np.float32]
+    """(n,): the trigger's statistic."""
+    flags: NDArray[np.uint8]
+    """(n,): the device's flags (missing, refused, restarted)."""
+    alarm_index: NDArray[np.int64]
+    """(a,): sample index of each alarm."""
+    alarm_kind: NDArray[np.uint8]
+    alarm_statistic: NDArray[np.float32]
+
+    @property
+    def samples(self) -> int:
+        return len(self.codes)
+
+    @property
+    def missing(self) -> NDArray[np.bool_]:
+        """(n,): the device could not use this sample, since force or displacement was clipped."""
+        used = [CHANNELS.index("force"), CHANNELS.index("displacement")]
+        return np.asarray(self.clipped[:, used].any(axis=1))
+
+    def channel(self, name: str) -> NDArray[np.float64]:
+        """One channel in its physical unit, (n,) float64."""
+        return self.conditions.channels[name].physical(self.codes[:, CHANNELS.index(name)])
+
+    @property
+    def segments(self) -> tuple[tuple[int, int, Plant], ...]:
+        """The stretches (start, end, plant) of the samples start <= k < end that were played, in order."""
+        played = [s for s in self.conditions.segments if s.start < self.samples]
+        ends = [*(s.start for s in played[1:]), self.samples]
+        return tuple((s.start, end, s.plant) for s, end in zip(played, ends[: len(played)], strict=True))
+
+    def theta_hash(self) -> str:
+        """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
+        return hashlib.sha256(np.ascontiguousarray(self.theta, dtype="<f4").tobytes()).hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Write atomically: the file is either the whole run or not there.
+
+        :raises RecordingError: the file cannot be written.
+        """
+        header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        with replacing(path) as file:
+            np.savez(file, allow_pickle=False, header=np.array(header), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Run:
+        """Read a recording.
+
+        :raises RecordingError: the file is absent, truncated, or not a recording of this format.
+        """
+        try:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+                header = json.loads(str(file["header"]))
+                arrays = {name: _checked(name, file[name]) for name in _ARRAYS}
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
+        except (KeyError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+            raise RecordingError(f"{path}: truncated, or not a recording of analogrig: {error}") from error
+        try:
+            if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
+                raise RecordingError(f"{path}: format {header['format']} {header['version']}, expected {FORMAT} {FORMAT_VERSION}")
+            run = cls(conditions=_from_json(header["conditions"]), **arrays)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(f"{path}: the header of the recording is damaged: {error!r}") from error
+        run._check_shapes(path)
+        return run
+
+    def with_faults(self, *faults: str) -> Run:
+        """The same run, marked as not valid for these further reasons."""
+        return replace(self, conditions=replace(self.conditions, faults=(*self.conditions.faults, *faults)))
+
+    def _check_shapes(self, path: Path) -> None:
+        n = self.samples
+        rows = {name: len(getattr(self, name)) for name in ("clipped", "theta", "innovation", "statistic", "flags")}
+        wrong = [f"{name} has {count} rows" for name, count in rows.items() if count != n]
+        if self.codes.shape[1:] != (len(CHANNELS),) or self.clipped.shape[1:] != (len(CHANNELS),):
+            wrong.append(f"codes have the shape {self.codes.shape}")
+        if wrong:
+            raise RecordingError(f"{path}: damaged recording of {n} samples: {', '.join(wrong)}")
+
+
+def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    dtype, dimensions = _ARRAYS[name]
+    if array.dtype != np.dtype(dtype) or array.ndim != dimensions:
+        raise ValueError(f"array {name} is {array.dtype} with {array.ndim} dimensions")
+    return array
+
+
+def _to_json(conditions: Conditions) -> dict[str, Any]:
+    out = dict(vars(conditions))
+    out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
+    out["segments"] = [{"start": s.start, "plant": vars(s.plant)} for s in conditions.segments]
+    return out
+
+
+def _from_json(header: Mapping[str, Any]) -> Conditions:
+    values = dict(header)
+    values["channels"] = {name: Channel(**channel) for name, channel in header["channels"].items()}
+    values["segments"] = tuple(Segment(s["start"], Plant(**s["plant"])) for s in header["segments"])
+    values["faults"] = tuple(header["faults"])
+    return Conditions(**values)

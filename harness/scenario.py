@@ -1,0 +1,148 @@
+"""A scenario: what is played to the plant, and when its pots are tweaked. The device never sees the tweaks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from emulator.excitation import Excitation
+from emulator.suspension import PROGRAMS
+from harness import config
+from harness.plant import Plant
+from harness.run import Segment
+from harness.verdict import Expectations
+
+PLANTS = {
+    name: Plant(program.M_kg, program.B_n_s_per_m, program.K_n_per_m) for name, program in PROGRAMS.items()
+}
+"""The parameters with which each program of the computer starts."""
+
+MAX_SAMPLES = 100_000_000
+
+
+@dataclass(frozen=True)
+class PlantChoice:
+    """The program on the computer and where its pots stand at the start."""
+
+    set: Literal["front", "shock"] = "front"
+    mass_kg: float | None = None
+    damping_n_s_per_m: float | None = None
+    stiffness_n_per_m: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(self)
+
+    def given(self) -> dict[str, float]:
+        """The parameters that do not stand where the set has them, under their names in Plant."""
+        return _given(self)
+
+    def plant(self) -> Plant:
+        return _changed(PLANTS[self.set], self)
+
+
+@dataclass(frozen=True)
+class Tweak:
+    """Pots that jump at the instant of one sample; the next sample is the first that can tell."""
+
+    sample: int
+    mass_kg: float | None = None
+    damping_n_s_per_m: float | None = None
+    stiffness_n_per_m: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(self)
+        if self.sample < 1:
+            raise ValueError(f"sample must be at least 1, not {self.sample}")
+        if not _given(self):
+            raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
+
+    def given(self) -> dict[str, float]:
+        """The parameters it sets, under their names in Plant."""
+        return _given(self)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """``fixtures/scenarios/*.toml``, or a user's own file."""
+
+    samples: int
+    excitation: Excitation
+    plant: PlantChoice = field(default_factory=PlantChoice)
+    tweaks: tuple[Tweak, ...] = ()
+    expect: Expectations = field(default_factory=Expectations)
+    random_phase: bool = False
+    """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
+    description: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.samples <= MAX_SAMPLES:
+            raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
+        instants = [tweak.sample for tweak in self.tweaks]
+        if instants != sorted(set(instants)):
+            raise ValueError(f"tweaks must come in the order of their samples, each sample once, not {instants}")
+        if instants and instants[-1] >= self.samples:
+            raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {self.samples} samples")
+
+    @classmethod
+    def load(cls, name: str) -> Scenario:
+        """A shipped scenario by name, or a user's .toml file.
+
+        :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
+        """
+        path = config.locate("scenarios", name)
+        return cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:
+        """From TOML values; ``where`` leads every error."""
+        return config.build(cls, {"name": default_name, **table}, where)
+
+    def as_table(self) -> dict[str, Any]:
+        """The same as plain values, so that ``from_table`` gives an equal scenario again."""
+        return _without_none(dataclasses.asdict(self))
+
+    def excitation_drawn(self, rng: np.random.Generator) -> Excitation:
+        """The excitation of one run: its phase drawn if the scenario asks for it."""
+        if not self.random_phase:
+            return self.excitation
+        return dataclasses.replace(self.excitation, phase=float(rng.uniform()))
+
+    def segments(self) -> tuple[Segment, ...]:
+        """The truth: the plant from the start and after each tweak."""
+        out = [Segment(0, self.plant.plant())]
+        for tweak in self.tweaks:
+            changed = _changed(out[-1].plant, tweak)
+            if changed == out[-1].plant:
+                continue  # a pot set to where it stood changes nothing, and nothing can be detected
+            out.append(Segment(tweak.sample, changed))
+        return tuple(out)
+
+
+def _given(change: PlantChoice | Tweak) -> dict[str, float]:
+    values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _changed(plant: Plant, change: PlantChoice | Tweak) -> Plant:
+    return dataclasses.replace(plant, **_given(change))
+
+
+def _check_positive(change: PlantChoice | Tweak) -> None:
+    for name, value in _given(change).items():
+        if not value > 0.0:
+            raise ValueError(f"{name} must be more than 0, not {value:g}")
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(item) for item in value]
+    return value
+

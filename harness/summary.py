@@ -1,0 +1,49 @@
+"""A run and its verdict as a table for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from harness.run import Run
+from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
+
+UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
+
+
+def summary(run: Run, verdict: Verdict) -> str:
+    """Several lines, without a final newline."""
+    conditions = run.conditions
+    head = (
+        f"{conditions.scenario['name']} on {conditions.rig['name']}, device {conditions.dut['name']}"
+        f" over {conditions.link}, seed {conditions.seed}: {verdict.outcome.upper()}"
+    )
+    lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
+    if verdict.tweaks:
+        lines += ["  sample  change                                       latency  bound  (samples)"]
+        lines += [_tweak_line(tweak) for tweak in verdict.tweaks]
+    false_alarms = ", ".join(map(str, verdict.false_alarms[:10])) + (", ..." if len(verdict.false_alarms) > 10 else "")
+    lines += ["", f"  false alarms: {len(verdict.false_alarms)}{f' (at {false_alarms})' if false_alarms else ''} in {run.samples} samples"]
+    if verdict.missing_n:
+        lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
+    lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
+    lines += [_segment_line(segment) for segment in verdict.estimates]
+    lines += ["", f"  theta hash {verdict.theta_hash}"]
+    return "\n".join(lines)
+
+
+def _tweak_line(tweak: TweakVerdict) -> str:
+    latency = "missed" if tweak.missed else "-" if tweak.latency_n is None else str(tweak.latency_n)
+    bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
+    return f"  {tweak.sample:6}  {_change(tweak.before, tweak.after):43}  {latency:>7}  {bound:>5}"
+
+
+def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {before[name]:g} -> {after[name]:g} {UNITS[name]}" for name in before)
+
+
+def _segment_line(segment: SegmentEstimate) -> str:
+    cells = [
+        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.4g'):>8}  {segment.truth[name]:<9.5g}"
+        for name in UNITS
+    ]
+    return f"  {segment.start:5}-{segment.end - 1:<6}" + "  ".join(cells)

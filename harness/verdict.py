@@ -1,0 +1,250 @@
+"""The verdict on a Run, computed from the Run alone, so that a recording can be judged again.
+
+An alarm belongs to the change in whose segment it falls; the first one there is its detection, every other alarm is a
+false alarm. The device is late when the information that had accumulated by its alarm was many times what is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import information
+from harness.plant import PARAMETERS, physical_parameters
+from harness.run import Run
+
+Outcome = Literal["passed", "failed", "inconclusive"]
+
+
+@dataclass(frozen=True)
+class Expectations:
+    """What a scenario asks of the device; its ``[expect]`` table."""
+
+    missed: int = 0
+    """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
+    false_alarms: int = 0
+    """At most so many in the whole run."""
+    arl0: float = 1e5
+    """Mean samples between false alarms for which the bound is computed when the device's trigger has none of its own."""
+    late_information_ratio: float = 4.0
+    """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
+    late_slack_n: int = 10
+    """... so many samples ago."""
+    max_missing_fraction: float = 0.25
+    """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
+
+    def __post_init__(self) -> None:
+        if not self.arl0 > 1.0:
+            raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
+        if not self.late_information_ratio >= 1.0:
+            raise ValueError(f"late_information_ratio must be at least 1, not {self.late_information_ratio:g}")
+        if not 0.0 <= self.max_missing_fraction <= 1.0:
+            raise ValueError(f"max_missing_fraction must be in 0 .. 1, not {self.max_missing_fraction:g}")
+        for name in ("missed", "false_alarms", "late_slack_n"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative")
+
+
+@dataclass(frozen=True)
+class TweakVerdict:
+    """One change of the plant and how it was noticed. Latencies are samples from the change to the alarm."""
+
+    sample: int
+    what: str
+    """Names of the parameters that changed, such as ``B, K``."""
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    latency_n: int | None
+    """None: no alarm before the next change or the end."""
+    bound_n: int | None
+    """The information bound of this very change; None: it could not be seen before the next change or the end."""
+    deadline_n: int | None
+    """A later alarm is late."""
+
+    @property
+    def missed(self) -> bool:
+        """It could be seen, and was not."""
+        return self.latency_n is None and self.bound_n is not None
+
+    @property
+    def late(self) -> bool:
+        return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
+
+
+@dataclass(frozen=True)
+class SegmentEstimate:
+    """M, B, K at the end of a stretch in which the plant did not change, samples ``start`` <= k < ``end``."""
+
+    start: int
+    end: int
+    truth: Mapping[str, float]
+    estimate: Mapping[str, float] | None
+    """None: the estimate describes no mass, damper and spring."""
+
+    @property
+    def error(self) -> Mapping[str, float]:
+        """Relative errors, by name; empty without an estimate."""
+        if self.estimate is None:
+            return {}
+        return {name: self.estimate[name] / truth - 1.0 for name, truth in self.truth.items()}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    outcome: Outcome
+    reasons: tuple[str, ...]
+    """Why it is not ``passed``; empty if it is."""
+    tweaks: tuple[TweakVerdict, ...]
+    false_alarms: tuple[int, ...]
+    """Sample indices."""
+    estimates: tuple[SegmentEstimate, ...]
+    arl0: float
+    """The mean time between false alarms that the bounds assume."""
+    ceiling: float | None
+    """Of the trigger's statistic; None without a trigger."""
+    missing_n: int
+    theta_hash: str
+
+    @property
+    def valid(self) -> bool:
+        return self.outcome != "inconclusive"
+
+
+def judge(run: Run) -> Verdict:
+    """Judge ``run`` by the expectations of the scenario it carries."""
+    expect = Expectations(**run.conditions.scenario.get("expect", {}))
+    trigger = run.conditions.dut["estimator"]
+    arl0 = math.exp(trigger["ceiling"]) if trigger["trigger"] == "cusum" else expect.arl0
+    tweaks, false_alarms = _attribute_alarms(run, expect, math.log(arl0))
+    invalid = _invalidities(run, expect)
+    failures = _failures(tweaks, false_alarms, expect)
+    outcome: Outcome = "inconclusive" if invalid else "failed" if failures else "passed"
+    return Verdict(
+        outcome=outcome,
+        reasons=(*invalid, *failures),
+        tweaks=tweaks,
+        false_alarms=false_alarms,
+        estimates=_segment_estimates(run),
+        arl0=arl0,
+        ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
+        missing_n=int(run.missing.sum()),
+        theta_hash=run.theta_hash(),
+    )
+
+
+def trajectory(run: Run) -> NDArray[np.float64]:
+    """M, B, K after every sample: (n, 3), NaN where theta describes no mass, damper and spring."""
+    channels = run.conditions.channels
+    return physical_parameters(
+        run.theta,
+        run.conditions.dut["estimator"],
+        n_per_code=channels["force"].lsb,
+        m_per_code=channels["displacement"].lsb,
+        period_s=run.conditions.sample_period_problem_s,
+    )
+
+
+def as_json(verdict: Verdict) -> dict[str, Any]:
+    """The verdict in plain JSON types; latencies and bounds in samples."""
+    return {
+        "outcome": verdict.outcome,
+        "valid": verdict.valid,
+        "reasons": list(verdict.reasons),
+        "tweaks": [
+            {
+                "sample": tweak.sample,
+                "what": tweak.what,
+                "from": dict(tweak.before),
+                "to": dict(tweak.after),
+                "latency": tweak.latency_n,
+                "bound": tweak.bound_n,
+                "deadline": tweak.deadline_n,
+                "missed": tweak.missed,
+            }
+            for tweak in verdict.tweaks
+        ],
+        "false_alarms": list(verdict.false_alarms),
+        "estimates": [
+            {
+                "start": segment.start,
+                "end": segment.end,
+                "truth": dict(segment.truth),
+                "estimate": None if segment.estimate is None else dict(segment.estimate),
+            }
+            for segment in verdict.estimates
+        ],
+        "arl0": verdict.arl0,
+        "missing": verdict.missing_n,
+        "theta_hash": verdict.theta_hash,
+    }
+
+
+def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tuple[TweakVerdict, ...], tuple[int, ...]]:
+    alarms = run.alarm_index.tolist()
+    detected = set()
+    tweaks = []
+    for (_, _, before), (start, end, after), gathered in zip(
+        run.segments, run.segments[1:], information.changes(run), strict=False
+    ):
+        # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
+        detection = next((index for index in alarms if start < index <= end), None)
+        detected.add(detection)
+        changed = before.changes_to(after)
+        late = information.first_reaching(gathered, expect.late_information_ratio * level)
+        tweaks.append(
+            TweakVerdict(
+                sample=start,
+                what=", ".join(changed),
+                before={name: old for name, (old, _) in changed.items()},
+                after={name: new for name, (_, new) in changed.items()},
+                latency_n=None if detection is None else detection - start,
+                bound_n=information.first_reaching(gathered, level),
+                deadline_n=None if late is None else late + expect.late_slack_n,
+            )
+        )
+    return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+
+
+def _invalidities(run: Run, expect: Expectations) -> list[str]:
+    reasons = list(run.conditions.faults)
+    if run.samples < run.conditions.samples_asked:
+        reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
+    missing = int(run.missing.sum())
+    if run.samples and missing > expect.max_missing_fraction * run.samples:
+        reasons.append(
+            f"{missing} of {run.samples} samples were clipped and missing for the device,"
+            f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
+        )
+    return reasons
+
+
+def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations) -> list[str]:
+    reasons = []
+    missed = [tweak for tweak in tweaks if tweak.missed]
+    if len(missed) > expect.missed:
+        names = "; ".join(f"{tweak.what} at {tweak.sample}" for tweak in missed)
+        reasons.append(f"missed {len(missed)} of {len(tweaks)} changes ({names}), at most {expect.missed} expected")
+    for tweak in tweaks:
+        if tweak.late:
+            reasons.append(
+                f"{tweak.what} at {tweak.sample} was noticed after {tweak.latency_n} samples,"
+                f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
+            )
+    if len(false_alarms) > expect.false_alarms:
+        reasons.append(f"{len(false_alarms)} false alarms, at most {expect.false_alarms} expected")
+    return reasons
+
+
+def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
+    values = trajectory(run)
+    out = []
+    for start, end, plant in run.segments:
+        last = values[end - 1]
+        estimate = None if np.isnan(last).any() else dict(zip(PARAMETERS, last.tolist(), strict=True))
+        out.append(SegmentEstimate(start, end, plant.parameters(), estimate))
+    return tuple(out)

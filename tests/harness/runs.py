@@ -1,0 +1,68 @@
+"""Runs made by hand, for tests of what reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.plant import Plant
+from harness.run import CHANNELS, Channel, Conditions, Run, Segment
+
+N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
+
+ESTIMATOR = {"na": 2, "nb": 3, "nk": 0, "offset": True, "trigger": "cusum", "ceiling": 11.512925}
+
+
+def made_run(
+    force_n: NDArray[np.float64],
+    plants: Sequence[tuple[int, Plant]],
+    noise_lsb: float = 1.0,
+    clipped: NDArray[np.bool_] | None = None,
+    alarms: Sequence[int] = (),
+    expect: dict[str, float] | None = None,
+    faults: tuple[str, ...] = (),
+    samples_asked: int | None = None,
+    theta: NDArray[np.float32] | None = None,
+    estimator: dict[str, object] | None = None,
+) -> Run:
+    """A run of the given force; ``clipped`` is the displacement's. Without ``theta`` all estimates are zero."""
+    n = len(force_n)
+    channels = {
+        "force": Channel(0.0, 10.0 / 4096, "N", 294.0, noise_lsb),
+        "displacement": Channel(0.0, 10.0 / 4096, "m", 0.01996, noise_lsb),
+        "velocity": Channel(-10.0, 20.0 / 4096, "m/s", 0.2, noise_lsb),
+        "net_force": Channel(-12.5, 25.0 / 4096, "N", 294.0, noise_lsb),
+    }
+    codes = np.zeros((n, 4), np.uint16)
+    codes[:, 0] = np.round(force_n / N_PER_CODE)
+    flags = np.zeros((n, 4), bool)
+    if clipped is not None:
+        flags[:, CHANNELS.index("displacement")] = clipped
+    conditions = Conditions(
+        seed=1,
+        samples_asked=n if samples_asked is None else samples_asked,
+        sample_period_s=5e-5,
+        time_scale=200.0,
+        channels=channels,
+        segments=tuple(Segment(start, plant) for start, plant in plants),
+        scenario={"name": "made", "expect": expect or {}},
+        rig={"name": "by hand"},
+        dut={"name": "nobody", "estimator": estimator or ESTIMATOR},
+        link="none",
+        faults=faults,
+    )
+    count = len(alarms)
+    return Run(
+        conditions=conditions,
+        codes=codes,
+        clipped=flags,
+        theta=np.zeros((n, 6), np.float32) if theta is None else theta,
+        innovation=np.zeros(n, np.float32),
+        statistic=np.zeros(n, np.float32),
+        flags=np.zeros(n, np.uint8),
+        alarm_index=np.array(alarms, np.int64),
+        alarm_kind=np.full(count, 3, np.uint8),
+        alarm_statistic=np.full(count, 12.0, np.float32),
+    )

@@ -1,0 +1,135 @@
+"""Configuration files: every mistake is one line that names the file, the table and the key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from harness import config
+from harness.errors import ConfigurationError
+from harness.rig import open_rig
+from harness.scenario import Scenario
+
+SCENARIO = """
+samples = 100
+[excitation]
+shape = "square"
+[[tweaks]]
+sample = 50
+mass_kg = 30.0
+"""
+
+
+@dataclass(frozen=True)
+class Inner:
+    gain: float
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int
+    mode: Literal["a", "b"] = "a"
+    inner: Inner | None = None
+    pairs: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError("count must not be negative")
+
+
+def test_values_become_the_declared_types() -> None:
+    table = {"count": 3, "mode": "b", "inner": {"gain": 2}, "pairs": {"x": [0, 1.5]}}
+    assert config.build(Outer, table, "f") == Outer(3, "b", Inner(2.0), {"x": (0.0, 1.5)})
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({}, "f: the key 'count' is lacking"),
+        ({"count": 1, "cuont": 2}, "f: unknown key 'cuont' (known: count, mode, inner, pairs)"),
+        ({"count": True}, "f: count: must be a whole number, not True"),
+        ({"count": 1.0}, "f: count: must be a whole number, not 1.0"),
+        ({"count": -1}, "f: count must not be negative"),
+        ({"count": 1, "mode": "c"}, "f: mode: must be one of 'a', 'b', not 'c'"),
+        ({"count": 1, "inner": {"gain": float("nan")}}, "f: inner: gain: must be a finite number, not nan"),
+        ({"count": 1, "inner": {"gain": 1, "loss": 2}}, "f: inner: unknown key 'loss' (known: gain)"),
+        ({"count": 1, "pairs": {"x": [1]}}, "f: pairs.x: must have 2 elements, not 1"),
+        ({"count": 1, "pairs": {"x": "12"}}, "f: pairs.x: must be an array, not '12'"),
+    ],
+)
+def test_mistake_is_named_with_its_place(table: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        config.build(Outer, table, "f")
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("samples = 100", "samples = 100\nsampels = 3", "unknown key 'sampels'"),
+        ("samples = 100", "samples = 0", "samples must be in 1 .. 100000000, not 0"),
+        ("sample = 50", "sample = 100", "the tweak at sample 100 is beyond the last of 100 samples"),
+        ("mass_kg = 30.0", "mass_kg = -30.0", "tweaks[0]: mass_kg must be more than 0, not -30"),
+        ("mass_kg = 30.0", "", "tweaks[0]: a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m"),
+        ('shape = "square"', 'shape = "sine"', "excitation: excitation: shape must be one of square, pulse, prbs"),
+        ('shape = "square"', "shape = 'square'\nphase = 1.5", "phase must be at least 0 and less than 1 period"),
+        ("[excitation]", "[exitation]", "unknown key 'exitation'"),
+        ("samples = 100", "samples = ", "not valid TOML"),
+    ],
+)
+def test_scenario_file_with_a_mistake_names_it(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(SCENARIO.replace(old, new))
+    with pytest.raises(ConfigurationError) as caught:
+        Scenario.load(str(path))
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="nowhere/mine.toml: no such file"):
+        Scenario.load("nowhere/mine.toml")
+
+
+def test_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigurationError, match="no scenario is called 'thesys': there are .*thesis"):
+        Scenario.load("thesys")
+
+
+def test_enormous_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "huge.toml"
+    path.write_bytes(b"#" * (config.MAX_FILE_BYTES + 1))
+    with pytest.raises(ConfigurationError, match="larger than"):
+        config.read_toml(path)
+
+
+@pytest.mark.parametrize("kind", ["scenarios", "rigs", "devices"])
+def test_shipped_files_are_valid(kind: config.Kind) -> None:
+    names = config.names(kind)
+    assert names
+    for name in names:
+        assert config.read_toml(config.locate(kind, name))
+
+
+def test_every_shipped_scenario_loads_and_survives_a_round_trip() -> None:
+    for name in config.names("scenarios"):
+        scenario = Scenario.load(name)
+        assert Scenario.from_table(scenario.as_table(), name) == scenario
+
+
+def test_every_shipped_rig_opens() -> None:
+    for name in config.names("rigs"):
+        with open_rig(name) as rig:
+            assert rig.description()["name"] == name
+
+
+def test_rig_without_a_channel_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text("[card.range_v]\nforce = [0.0, 10.0]\n")
+    with pytest.raises(ConfigurationError, match=r"card: range_v must give the channels force, displacement, velocity, net_force"):
+        open_rig(str(path))

@@ -1,0 +1,87 @@
+"""The harness's own plant and the information bound, against scipy and closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from tests.harness.runs import made_run
+from scipy.linalg import expm
+from scipy.signal import cont2discrete
+
+from harness import information
+from harness.plant import AT_REST, Plant, SampledPlant, physical_parameters
+
+FRONT = Plant(115.0, 3021.0, 24500.0)
+SOFT = Plant(115.0, 3021.0, 18000.0)
+
+
+@pytest.mark.parametrize("plant", [FRONT, Plant(2.0, 900.0, 12250.0), Plant(30.0, 2123.0, 20000.0)], ids=str)
+def test_sampled_plant_is_the_exact_zero_order_hold(plant: Plant) -> None:
+    m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+    exact = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)
+    sampled = SampledPlant.of(plant, 0.01)
+    assert np.reshape(sampled.transition, (2, 2)) == pytest.approx(exact[:2, :2], rel=1e-12)
+    assert np.array(sampled.response) == pytest.approx(exact[:2, 2], rel=1e-12)
+    assert sampled.next(AT_REST, 100.0) == pytest.approx(tuple(100.0 * exact[:2, 2]), rel=1e-12)
+
+
+@pytest.mark.parametrize("plant", [FRONT, Plant(2.0, 900.0, 12250.0), Plant(30.0, 2123.0, 20000.0)], ids=str)
+def test_theta_of_the_exact_discretisation_reads_as_the_plant(plant: Plant) -> None:
+    """Thesis Equ 4.3, 4.8 as recomputed; scipy discretises, we read back."""
+    m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+    (numerator,), denominator, _ = cont2discrete(([1.0], [m, b, k]), 0.01, "zoh")
+    n_per_code, m_per_code = 0.7, 5e-5
+    gains = numerator * n_per_code / m_per_code
+    theta = np.array([[*denominator[1:], *gains, 3.0]], dtype=np.float64)
+    read = physical_parameters(theta, {"na": 2, "nb": 3}, n_per_code, m_per_code, 0.01)
+    assert read[0] == pytest.approx([m, b, k], rel=1e-6)
+
+
+@pytest.mark.parametrize("theta", [[0.0] * 6, [-1.7, -0.1, 0.1, 0.1, 0.1, 0.0], [-1.75, 0.77, -0.1, -0.1, 0.0, 0.0], [np.nan] * 6])
+def test_theta_that_is_no_suspension_reads_as_nan(theta: list[float]) -> None:
+    assert np.isnan(physical_parameters(np.array([theta], np.float32), {"na": 2, "nb": 3}, 1.0, 1e-4, 0.01)).all()
+
+
+def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
+    """From rest at x0 = F / K the step to K' is the step response of the changed plant: closed form of an underdamped
+    second-order system, (x0' - x0)(1 - exp(-s t)(cos w t + s / w sin w t))."""
+    force_n, noise_lsb = 2940.0, 1.0
+    run = made_run(force_n=np.full(600, force_n), plants=[(0, FRONT), (400, SOFT)], noise_lsb=noise_lsb)
+    (gathered,) = information.changes(run)
+    lsb_m = run.conditions.channels["displacement"].lsb
+    s = SOFT.damping_n_s_per_m / (2.0 * SOFT.mass_kg)
+    w = math.sqrt(SOFT.stiffness_n_per_m / SOFT.mass_kg - s * s + 0j).real if SOFT.stiffness_n_per_m / SOFT.mass_kg > s * s else None
+    t = 0.01 * np.arange(1, 51)
+    amplitude = force_n / SOFT.stiffness_n_per_m - force_n / FRONT.stiffness_n_per_m
+    if w is None:
+        r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
+        step = 1.0 - np.exp(-s * t) * (np.cosh(r * t) + s / r * np.sinh(r * t))
+    else:
+        step = 1.0 - np.exp(-s * t) * (np.cos(w * t) + s / w * np.sin(w * t))
+    expected = np.cumsum((amplitude * step / lsb_m) ** 2) / (2.0 * (noise_lsb**2 + 1.0 / 12.0))
+    assert gathered[:50] == pytest.approx(expected, rel=1e-3)
+
+
+def test_clipped_samples_carry_no_information() -> None:
+    clipped = np.zeros(600, bool)
+    clipped[401:410] = True
+    force = np.full(600, 2940.0)
+    whole = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)])
+    holed = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)], clipped=clipped)
+    (all_of_it,), (rest,) = information.changes(whole), information.changes(holed)
+    assert (rest[:9] == 0.0).all()
+    assert rest[20] == pytest.approx(all_of_it[20] - all_of_it[8])
+
+
+def test_change_of_an_unloaded_suspension_cannot_be_seen() -> None:
+    run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
+    (gathered,) = information.changes(run)
+    assert information.first_reaching(gathered, math.log(1e5)) is None
+
+
+def test_first_reaching_counts_from_one() -> None:
+    assert information.first_reaching([0.0, 5.0, 5.0, 12.0], 5.0) == 2
+    assert information.first_reaching([6.0], 5.0) == 1
+    assert information.first_reaching([], 5.0) is None

@@ -1,0 +1,112 @@
+"""The verdict, on runs made by hand."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+from tests.harness.runs import ESTIMATOR, made_run
+
+from harness.plant import Plant
+from harness.verdict import as_json, judge
+
+FRONT = Plant(115.0, 3021.0, 24500.0)
+SOFT = Plant(115.0, 3021.0, 18000.0)
+LOADED = np.full(800, 2900.0)
+CHANGE = [(0, FRONT), (400, SOFT)]
+
+
+def test_quiet_run_without_changes_passes() -> None:
+    verdict = judge(made_run(LOADED, [(0, FRONT)]))
+    assert (verdict.outcome, verdict.reasons, verdict.false_alarms) == ("passed", (), ())
+
+
+def test_alarm_after_the_change_is_its_detection() -> None:
+    verdict = judge(made_run(LOADED, CHANGE, alarms=[404]))
+    (tweak,) = verdict.tweaks
+    assert (tweak.sample, tweak.what, tweak.latency_n) == (400, "K", 4)
+    assert (tweak.before, tweak.after) == ({"K": 24500.0}, {"K": 18000.0})
+    assert verdict.outcome == "passed"
+
+
+def test_alarm_at_the_instant_of_the_change_is_a_false_one() -> None:
+    """The sample at which a pot jumps was taken before the jump could act."""
+    verdict = judge(made_run(LOADED, CHANGE, alarms=[400, 404]))
+    assert verdict.false_alarms == (400,)
+    assert verdict.tweaks[0].latency_n == 4
+    assert verdict.outcome == "failed"
+
+
+def test_second_alarm_after_a_change_is_a_false_one() -> None:
+    verdict = judge(made_run(LOADED, CHANGE, alarms=[404, 405, 700]))
+    assert verdict.false_alarms == (405, 700)
+
+
+def test_change_that_could_be_seen_and_was_not_is_missed() -> None:
+    verdict = judge(made_run(LOADED, CHANGE))
+    assert verdict.tweaks[0].missed
+    assert verdict.outcome == "failed"
+    assert verdict.reasons == ("missed 1 of 1 changes (K at 400), at most 0 expected",)
+
+
+def test_change_without_information_is_not_held_against_the_device() -> None:
+    verdict = judge(made_run(np.zeros(800), CHANGE))
+    assert verdict.tweaks[0].bound_n is None
+    assert not verdict.tweaks[0].missed
+    assert verdict.outcome == "passed"
+
+
+def test_late_alarm_fails_and_names_its_deadline() -> None:
+    verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
+    assert verdict.tweaks[0].late
+    assert verdict.outcome == "failed"
+    assert "K at 400 was noticed after 100 samples, later than" in verdict.reasons[0]
+
+
+def test_expectations_of_the_scenario_count() -> None:
+    expect = {"missed": 1, "false_alarms": 2}
+    assert judge(made_run(LOADED, CHANGE, alarms=[10, 20], expect=expect)).outcome == "passed"
+
+
+def test_bound_is_that_of_the_triggers_own_arl0() -> None:
+    strict = judge(made_run(LOADED, CHANGE, estimator={**ESTIMATOR, "ceiling": math.log(1e12)}))
+    usual = judge(made_run(LOADED, CHANGE))
+    assert strict.tweaks[0].bound_n is not None and usual.tweaks[0].bound_n is not None
+    assert strict.tweaks[0].bound_n > usual.tweaks[0].bound_n
+    assert usual.arl0 == pytest.approx(1e5, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"faults": ("device host: gone",)}, "device host: gone"),
+        ({"samples_asked": 900}, "the run ended after 800 of 900 samples"),
+        ({"clipped": np.arange(800) % 3 == 0}, "267 of 800 samples were clipped"),
+    ],
+    ids=["fault", "short", "clipped"],
+)
+def test_run_that_was_not_valid_is_inconclusive_however_good_it_looks(changes: dict[str, object], reason: str) -> None:
+    verdict = judge(made_run(LOADED, CHANGE, alarms=[404], **changes))  # type: ignore[arg-type]
+    assert verdict.outcome == "inconclusive"
+    assert not verdict.valid
+    assert reason in verdict.reasons[0]
+
+
+def test_tweak_after_the_end_of_a_short_run_is_not_judged() -> None:
+    verdict = judge(made_run(LOADED[:300], CHANGE, samples_asked=800))
+    assert verdict.tweaks == ()
+    assert verdict.outcome == "inconclusive"
+
+
+def test_theta_hash_is_sha256_of_the_float32_bits() -> None:
+    theta = np.arange(12, dtype=np.float32).reshape(2, 6) / 7
+    expected = hashlib.sha256(theta.astype("<f4").tobytes()).hexdigest()
+    assert judge(made_run(LOADED[:2], [(0, FRONT)], theta=theta)).theta_hash == expected
+
+
+def test_json_carries_what_the_documentation_promises() -> None:
+    out = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))
+    assert out["tweaks"][0].items() >= {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}.items()
+    assert {"outcome", "valid", "false_alarms", "estimates", "theta_hash", "arl0"} <= out.keys()
