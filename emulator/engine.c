@@ -471,15 +471,21 @@ enum engine_status engine_set_state(engine *self, const double *x)
     return enter_mode(self);
 }
 
-static enum engine_status apply_edge(engine *self, int32_t input, double level)
+/* Goes to the instant of an edge and applies it. An edge to the present level is none: it must not change how the steps
+ * are cut. */
+static enum engine_status take_edge(engine *self, int64_t tick, int32_t input, double level)
 {
-    if (input < 0 || input >= self->inputs) {
+    if (tick < self->now || input < 0 || input >= self->inputs) {
         return ENGINE_EDGE;
     }
     const int column = self->states + (int)input;
     const double before = self->here->z[column];
     if (before >= level && before <= level) {
-        return ENGINE_OK; /* no edge at all: it must not change how the steps are cut */
+        return ENGINE_OK;
+    }
+    const enum engine_status status = advance(self, tick);
+    if (status != ENGINE_OK) {
+        return status;
     }
     for (int i = 0; i < 3; i++) {
         self->points[i].z[column] = level;
@@ -515,10 +521,7 @@ enum engine_status engine_run(
         self->has_started = true;
         self->events_left = self->events_per_sample;
         while (status == ENGINE_OK && edge < edges && tick[edge] <= instant) {
-            status = tick[edge] >= self->now ? advance(self, tick[edge]) : ENGINE_EDGE;
-            if (status == ENGINE_OK) {
-                status = apply_edge(self, input[edge], level[edge]);
-            }
+            status = take_edge(self, tick[edge], input[edge], level[edge]);
             edge++;
         }
         if (status == ENGINE_OK) {

@@ -88,13 +88,13 @@ class SuspensionParts:
 class Scales:
     """What 10 V stand for on the force, velocity and displacement channels.
 
-    time_scale: how much faster the machine runs than what it models. displacement_m = time_scale velocity R2 C2.
+    time: how much faster the machine runs than what it models. displacement_m = time velocity R2 C2.
     """
 
     force_n: float
     velocity_m_per_s: float = 2.0
     displacement_m: float = 0.1996
-    time_scale: float = 200.0
+    time: float = 200.0
 
     def volts(self, channel: str) -> float:
         """Volts per unit (N, m, m/s) of a channel."""
@@ -128,7 +128,7 @@ class Program:
         scales, parts = self.scales, self.parts
         if pot == "M":
             return (
-                scales.time_scale * scales.force_n * parts.r1_ohm * parts.c1_farad / (value * scales.velocity_m_per_s)
+                scales.time * scales.force_n * parts.r1_ohm * parts.c1_farad / (value * scales.velocity_m_per_s)
             )
         if pot == "B":
             return (value * scales.velocity_m_per_s / scales.force_n) * (parts.rb_ohm / parts.rfb_ohm)

@@ -33,7 +33,9 @@ def ngspice(tmp_path: Path) -> NgSpice:
         rows = _nearest(table[:, 0], instants_s)
         # Sample 0 is ngspice's first time point, 10 ps late; all others have a time point of their own.
         assert np.abs(table[rows, 0] - instants_s).max() < 2e-11, log
-        return table[np.ix_(rows, [names.index(f"v({node})") for node in nodes])]
+        columns = np.array([names.index(f"v({node})") for node in nodes])
+        volts: NDArray[np.float64] = table[np.ix_(rows, columns)]
+        return volts
 
     return run
 

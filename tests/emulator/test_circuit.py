@@ -1,0 +1,71 @@
+"""What a netlist must be, and how it says what is wrong."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from emulator import IDEAL, Capacitor, Circuit, CircuitError, OpAmp, OpAmpModel, Pot, PotError, Resistor, VoltageSource
+from emulator.circuit import Element
+from emulator.opamp import preset
+
+SOURCE = VoltageSource("V1", "in")
+
+
+@pytest.mark.parametrize(
+    ("elements", "message"),
+    [
+        ([SOURCE, Resistor("R1", "in", "0", 1e3), Resistor("r1", "in", "0", 1e3)], "two elements are called 'r1'"),
+        ([SOURCE, Resistor("R1", "in", "0", -1.0)], r"Resistor R1 \(in 0\): ohm must be positive and finite, got -1.0"),
+        ([SOURCE, Resistor("R1", "in", "0", math.nan)], "Resistor R1 .* got nan"),
+        ([SOURCE, Capacitor("C1", "in", "0", 0.0)], r"Capacitor C1 \(in 0\): farad must be positive"),
+        ([SOURCE, Resistor("R1", "in", "in", 1e3)], r"Resistor R1 \(in in\): both ends are on node in"),
+        ([SOURCE, Resistor("R1", "a", "b", 1e3)], r"Resistor R1 \(a b\): node a floats"),
+        ([SOURCE, OpAmp("U1", "in", "x", "out", IDEAL)], r"OpAmp U1 \(in x out\): node x floats"),
+        ([SOURCE, Resistor("R1", "in", "IN", 1e3)], "nodes 'in' and 'IN' differ in case only"),
+        ([SOURCE, Resistor("R 1", "in", "0", 1e3)], "element name 'R 1'"),
+        ([SOURCE, Resistor("R1", "in", "a;b", 1e3)], "node name 'a;b'"),
+        ([SOURCE, VoltageSource("V2", "a", dc_v=math.inf)], r"VoltageSource V2 \(a 0\): dc_v must be finite"),
+    ],
+)
+def test_a_wrong_netlist_is_refused_naming_element_and_node(elements: list[Element], message: str) -> None:
+    with pytest.raises(CircuitError, match=message):
+        Circuit(elements)
+
+
+@pytest.mark.parametrize("dial", [-0.001, 1.001, math.nan])
+def test_a_dial_off_the_track_is_refused_naming_the_pot(dial: float) -> None:
+    with pytest.raises(PotError, match="pot P1: dial .* is beyond the track"):
+        Circuit([SOURCE, Pot("P1", "in", "w", "0", 10e3, dial)])
+
+
+def test_turning_a_pot_that_is_not_there_names_those_that_are() -> None:
+    with pytest.raises(CircuitError, match="no pot is called 'P2'; there are P1"):
+        Circuit([SOURCE, Pot("P1", "in", "w", "0", 10e3, 0.5)]).with_dials({"P2": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("avol", 0.0),
+        ("gbw_hz", -1.0),
+        ("slew_v_per_s", math.nan),
+        ("rout_ohm", -1.0),
+        ("vos_v", math.nan),
+        ("swing_v", (1.0, 2.0)),
+    ],
+)
+def test_an_impossible_op_amp_is_refused_naming_the_field(field: str, value: float) -> None:
+    with pytest.raises(CircuitError, match=f"op-amp: {field}"):
+        OpAmpModel(**{"gbw_hz": 1e6, field: value})  # type: ignore[arg-type]
+
+
+def test_limits_on_an_op_amp_without_a_pole_are_refused() -> None:
+    with pytest.raises(CircuitError, match="need a finite gbw_hz"):
+        OpAmpModel(slew_v_per_s=1e6)
+
+
+def test_an_unknown_op_amp_lists_the_known_ones() -> None:
+    with pytest.raises(CircuitError, match="unknown op-amp 'op07'; there are ideal, tl07x, 741"):
+        preset("op07")

@@ -1,0 +1,129 @@
+"""Nodal analysis against circuits solved by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from emulator import (
+    IDEAL,
+    Capacitor,
+    Circuit,
+    CircuitError,
+    OpAmp,
+    OpAmpModel,
+    Pot,
+    Resistor,
+    VoltageSource,
+    piecewise_linear,
+)
+from emulator.nodal import Nodal
+from emulator.opamp import CLAMP_RATE
+
+SOURCE = VoltageSource("V1", "in")
+
+
+def inverter(model: OpAmpModel, gain: float = 10.0) -> Circuit:
+    return Circuit(
+        [
+            SOURCE,
+            Resistor("R1", "in", "n", 1e3),
+            Resistor("R2", "n", "out", gain * 1e3),
+            OpAmp("U1", "0", "n", "out", model),
+        ]
+    )
+
+
+def test_a_low_pass_has_its_time_constant() -> None:
+    system = piecewise_linear(Circuit([SOURCE, Resistor("R1", "in", "out", 2e3), Capacitor("C1", "out", "0", 3e-9)]))
+    assert system.states == ("C1",)
+    assert system.inputs == ("V1",)
+    np.testing.assert_allclose(system.abc, [[-1 / 6e-6, 1 / 6e-6, 0.0]], rtol=1e-14)
+    np.testing.assert_allclose(system.readings(["out", "in"]), [[1, 0, 0], [0, 1, 0]], atol=1e-15)
+
+
+def test_a_loaded_pot_divides_as_by_hand() -> None:
+    circuit = Circuit([SOURCE, Pot("P1", "in", "w", "0", 10e3, 0.6), Resistor("RL", "w", "0", 6e3)])
+    # 6 k parallel to 6 k is 3 k, below 4 k.
+    np.testing.assert_allclose(piecewise_linear(circuit).readings(["w"]), [[3.0 / 7.0, 0.0]], rtol=1e-14)
+
+
+def test_turning_a_pot_gives_the_system_of_the_circuit_built_so() -> None:
+    elements = (
+        SOURCE,
+        Pot("P1", "in", "w", "0", 10e3, 0.6),
+        Resistor("R1", "w", "o", 1e3),
+        Capacitor("C1", "o", "0", 1e-9),
+    )
+    turned = Nodal(Circuit(elements)).at({"P1": 0.25})
+    built = piecewise_linear(Circuit(elements).with_dials({"P1": 0.25}))
+    assert np.array_equal(turned.abc, built.abc)
+    assert np.array_equal(turned.lmn, built.lmn)
+
+
+def test_a_constant_source_enters_the_constant_column() -> None:
+    circuit = Circuit(
+        [VoltageSource("REF", "ref", dc_v=-10.0), Resistor("R1", "ref", "o", 1e3), Resistor("R2", "o", "0", 3e3)]
+    )
+    system = piecewise_linear(circuit)
+    assert system.inputs == ()
+    np.testing.assert_allclose(system.readings(["o"]), [[-7.5]], rtol=1e-14)
+
+
+def test_an_ideal_inverter_has_its_gain_and_amplifies_its_offset() -> None:
+    system = piecewise_linear(inverter(replace(IDEAL, vos_v=1e-3)))
+    np.testing.assert_allclose(system.readings(["out"]), [[-10.0, 11e-3]], rtol=1e-13)
+
+
+def test_a_finite_gain_without_pole_gives_the_textbook_error() -> None:
+    # Gain -10 with Avol = 1000: -10 / (1 + 11/1000).
+    system = piecewise_linear(inverter(OpAmpModel(avol=1000.0)))
+    np.testing.assert_allclose(system.readings(["out"]), [[-10.0 / 1.011, 0.0]], rtol=1e-13)
+
+
+def test_a_pole_gives_the_closed_loop_bandwidth_and_the_static_gain() -> None:
+    system = piecewise_linear(inverter(OpAmpModel(avol=1000.0, gbw_hz=1e6)))
+    [[slope, drive, _]] = system.abc
+    assert -slope == pytest.approx(2 * math.pi * 1e6 * (1 / 11 + 1 / 1000), rel=1e-13)
+    assert drive / -slope == pytest.approx(-10.0 / 1.011, rel=1e-13)
+
+
+def test_output_resistance_divides_with_the_load() -> None:
+    follower = OpAmp("U1", "in", "out", "out", OpAmpModel(avol=1e5, gbw_hz=1e6, rout_ohm=100.0))
+    system = piecewise_linear(Circuit([SOURCE, follower, Resistor("RL", "out", "0", 300.0)]))
+    np.testing.assert_allclose(system.readings(["out"]), [[0.75, 0.0, 0.0]], rtol=1e-14)
+
+
+def test_slew_and_clamp_are_kinks_with_the_law_of_the_op_amp() -> None:
+    model = OpAmpModel(avol=1e5, gbw_hz=1e6, slew_v_per_s=5e5, swing_v=(-12.0, 13.0), vos_v=2e-3)
+    system = piecewise_linear(Circuit([SOURCE, OpAmp("U1", "in", "out", "out", model)]))
+    slew, clamp = system.kinks
+    assert (slew.lower, slew.upper, slew.slopes) == (-5e5, 5e5, (0.0, 1.0, 0.0))
+    assert (clamp.lower, clamp.upper, clamp.slopes) == (-12.0, 13.0, (1.0, 0.0, 1.0))
+    assert clamp.intercepts == (12.0, 0.0, -13.0)
+    np.testing.assert_array_equal(system.abc, [[0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(system.g, [[1.0, -CLAMP_RATE]])
+    rate = 2 * math.pi * 1e6
+    np.testing.assert_allclose(system.cde, [[-rate - rate / 1e5, rate, rate * 2e-3], [1.0, 0.0, 0.0]], rtol=1e-14)
+
+
+def test_capacitors_in_a_loop_are_refused_naming_one() -> None:
+    circuit = Circuit([SOURCE, Capacitor("C1", "in", "0", 1e-9)])
+    with pytest.raises(CircuitError, match="singular: nothing determines the current of"):
+        piecewise_linear(circuit)
+
+
+def test_an_ideal_op_amp_that_drives_nothing_back_is_refused_naming_the_node() -> None:
+    circuit = Circuit([SOURCE, OpAmp("U1", "0", "in", "out", IDEAL)])
+    with pytest.raises(CircuitError, match="singular: nothing determines the node out"):
+        piecewise_linear(circuit)
+
+
+def test_more_than_the_engine_takes_is_refused_with_the_number() -> None:
+    ladder = [Capacitor(f"C{i}", f"n{i}", "0", 1e-9) for i in range(33)]
+    links = [Resistor(f"R{i}", f"n{i}", "0", 1e3) for i in range(33)]
+    with pytest.raises(CircuitError, match="33 states; the engine takes at most 32"):
+        piecewise_linear(Circuit([*ladder, *links]))
