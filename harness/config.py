@@ -87,7 +87,8 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     try:
         return cls(**values)
     except (ValueError, EmulatorError) as error:
-        raise ConfigurationError(f"{where}: {error}") from error
+        table_name = where.rpartition(": ")[2]
+        raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
