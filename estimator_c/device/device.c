@@ -1,0 +1,551 @@
+#include "device.h"
+
+#include "analogrig_codec.h"
+
+#ifndef DEVICE_ASSERT
+#include <assert.h>
+#define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
+
+#if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
+#error "the mask of missing samples has 16 bits"
+#endif
+
+#define PAYLOAD_MAX 8U  ///< of an answer; all fit classic CAN
+
+#define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
+#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE
+
+/// Where the answers of one step of work go.
+typedef struct {
+    uint8_t* bytes;
+    size_t   n;
+} answer_t;
+
+static void add(uint32_t* const counter, const uint32_t n) {
+    *counter = (*counter < (UINT32_MAX - n)) ? (*counter + n) : UINT32_MAX;
+}
+
+static uint16_t word(const uint8_t* const bytes) { return (uint16_t)(bytes[0] | ((uint32_t)bytes[1] << 8U)); }
+
+// ---------------------------------------------        ANSWERS         ---------------------------------------------
+
+static void put(device_t* const self, answer_t* const answer, const uint8_t id, const uint8_t* const payload) {
+    answer->n += frame_encode(self->identity.catalogue_hash, id, payload, &answer->bytes[answer->n]);
+    self->seq++;
+}
+
+static void put_hello(device_t* const self, answer_t* const answer, const uint8_t answers) {
+    const struct analogrig_hello_t message = { .seq            = self->seq,
+                                               .theta_max      = EST_THETA_MAX,
+                                               .answers        = answers,
+                                               .catalogue_hash = self->identity.catalogue_hash };
+    uint8_t                        payload[PAYLOAD_MAX];
+    (void)analogrig_hello_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_HELLO_FRAME_ID, payload);
+}
+
+static void put_firmware(device_t* const self, answer_t* const answer, const uint8_t answers) {
+    const struct analogrig_firmware_t message = { .seq         = self->seq,
+                                                  .firmware_id = self->identity.firmware_id,
+                                                  .answers     = answers,
+                                                  .boot_nonce  = self->identity.boot_nonce };
+    uint8_t                           payload[PAYLOAD_MAX];
+    (void)analogrig_firmware_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_FIRMWARE_FRAME_ID, payload);
+}
+
+static void put_estimate(device_t* const self, answer_t* const answer, const uint8_t element, const float value) {
+    const struct analogrig_estimate_t message = {
+        .seq = self->seq, .element = element, .index = self->next_index, .value = value
+    };
+    uint8_t payload[PAYLOAD_MAX];
+    (void)analogrig_estimate_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_ESTIMATE_FRAME_ID, payload);
+}
+
+static void put_alarm(device_t* const self, answer_t* const answer, const float statistic) {
+    const struct analogrig_alarm_t message = { .seq       = self->seq,
+                                               .trigger   = (uint8_t)self->config.trigger.kind,
+                                               .index     = self->next_index,
+                                               .statistic = statistic };
+    uint8_t                        payload[PAYLOAD_MAX];
+    (void)analogrig_alarm_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_ALARM_FRAME_ID, payload);
+}
+
+static void put_stepped(device_t* const self, answer_t* const answer, const est_step_t* step, const bool restarted) {
+    const struct analogrig_stepped_t message = { .seq       = self->seq,
+                                                 .missing   = (step->status == EST_MISSING) ? 1U : 0U,
+                                                 .refused   = (step->status == EST_REFUSED) ? 1U : 0U,
+                                                 .restarted = restarted ? 1U : 0U,
+                                                 .index     = self->next_index,
+                                                 .statistic = step->statistic };
+    uint8_t                          payload[PAYLOAD_MAX];
+    (void)analogrig_stepped_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_STEPPED_FRAME_ID, payload);
+}
+
+// ---------------------------------------------        SAMPLES         ---------------------------------------------
+
+static void enter_gap(device_t* const self, const uint16_t lost_n) {
+    const est_sample_t missing = { .u = 0.0F, .y = 0.0F, .valid = false };
+    for (uint16_t i = 0U; (i < lost_n) && (i < DEVICE_GAP_MAX); i++) {
+        (void)est_step(&self->estimator, missing);
+    }
+    add(&self->counters.samples_lost, lost_n);
+    self->next_index   = (uint16_t)(self->next_index + lost_n);
+    self->unreported_n = (uint16_t)(((uint32_t)self->unreported_n + lost_n) % self->report_interval_n);
+}
+
+static void report(device_t* const self, answer_t* const answer, const float innovation) {
+    self->unreported_n++;
+    if (self->unreported_n < self->report_interval_n) {
+        return;
+    }
+    self->unreported_n = 0U;
+    for (uint8_t i = 0U; i < est_theta_count(&self->estimator); i++) {
+        put_estimate(self, answer, i, est_theta(&self->estimator, i));
+    }
+    put_estimate(self, answer, ANALOGRIG_ESTIMATE_ELEMENT_INNOVATION_CHOICE, innovation);
+}
+
+static void
+enter_sample(device_t* const self, answer_t* const answer, const uint16_t index, const est_sample_t sample) {
+    const uint16_t ahead = (uint16_t)(index - self->next_index);
+    if (ahead > (UINT16_MAX / 2U)) {
+        add(&self->counters.samples_ignored, 1U);
+        return;
+    }
+    if (ahead > 0U) {
+        enter_gap(self, ahead);
+    }
+    const uint32_t   restarts = est_counters(&self->estimator).restarts;
+    const est_step_t step     = est_step(&self->estimator, sample);
+    if (step.alarm) {
+        put_alarm(self, answer, step.statistic);
+    }
+    report(self, answer, step.innovation);
+    put_stepped(self, answer, &step, est_counters(&self->estimator).restarts != restarts);
+    self->next_index++;
+}
+
+static void on_sample(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+    struct analogrig_sample_t message;
+    (void)analogrig_sample_unpack(&message, payload, ANALOGRIG_SAMPLE_LENGTH);
+    if (!self->running) {
+        add(&self->counters.messages_refused, 1U);
+        return;
+    }
+    const est_sample_t sample = { .u     = (float)message.force,
+                                  .y     = (float)message.displacement,
+                                  .valid = message.missing == 0U };
+    enter_sample(self, answer, message.index, sample);
+}
+
+static void on_sample_block(device_t* const self, const uint8_t* const payload) {
+    struct analogrig_sample_block_t block;
+    (void)analogrig_sample_block_unpack(&block, payload, ANALOGRIG_SAMPLE_BLOCK_LENGTH);
+    if (!self->running || (block.count < 1U) || (block.count > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
+        add(&self->counters.messages_refused, 1U);
+        return;
+    }
+    self->job         = DEVICE_STEPPING;
+    self->job_next    = 0U;
+    self->job_count   = block.count;
+    self->job_index   = block.index;
+    self->job_missing = block.missing;
+}
+
+/// The next sample of the block that still lies in the decoder. The codec has a name for each of its codes, no array.
+static void step_block(device_t* const self, answer_t* const answer) {
+    const uint8_t* const payload = frame_payload(&self->decoder);
+    const uint8_t        i       = self->job_next;
+    const uint8_t* const force =
+        &payload[ANALOGRIG_SAMPLE_BLOCK_FORCE_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_FORCE_STRIDE)];
+    const uint8_t* const displacement =
+        &payload[ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_STRIDE)];
+    const est_sample_t sample = { .u     = (float)word(force),
+                                  .y     = (float)word(displacement),
+                                  .valid = (((uint32_t)self->job_missing >> i) & 1U) == 0U };
+    enter_sample(self, answer, (uint16_t)(self->job_index + i), sample);
+    self->job_next++;
+    if (self->job_next == self->job_count) {
+        self->job = DEVICE_IDLE;
+    }
+}
+
+// ---------------------------------------------     CONFIGURATION      ---------------------------------------------
+
+/// A float that is a whole number in [0, limit]. False for NaN too.
+static bool whole(const float value, const uint16_t limit, uint16_t* const out) {
+    if (!((value >= 0.0F) && (value <= (float)limit))) {
+        return false;
+    }
+    *out = (uint16_t)value;
+    return !((value - (float)*out) > 0.0F);
+}
+
+/// The field that a key of floating-point type stands for; null for any other key.
+static float* float_field(est_config_t* const config, const uint8_t key) {
+    if ((key >= ANALOGRIG_CONFIGURE_KEY_C1_CHOICE) && (key < (ANALOGRIG_CONFIGURE_KEY_C1_CHOICE + EST_NA_MAX))) {
+        return &config->c[key - ANALOGRIG_CONFIGURE_KEY_C1_CHOICE];
+    }
+    switch (key) {
+    case ANALOGRIG_CONFIGURE_KEY_FORGETTING_CHOICE:
+        return &config->forgetting;
+    case ANALOGRIG_CONFIGURE_KEY_P0_CHOICE:
+        return &config->p0;
+    case ANALOGRIG_CONFIGURE_KEY_P0_OFFSET_CHOICE:
+        return &config->p0_offset;
+    case ANALOGRIG_CONFIGURE_KEY_NOISE_VARIANCE_CHOICE:
+        return &config->noise_variance;
+    case ANALOGRIG_CONFIGURE_KEY_EDGE_CODES_CHOICE:
+        return &config->edge_codes;
+    case ANALOGRIG_CONFIGURE_KEY_CEILING_CHOICE:
+        return &config->trigger.ceiling;
+    default:
+        return 0;
+    }
+}
+
+/// The largest value of a key of whole numbers; 0 for any other key. est_init() knows the true ranges of the orders.
+static uint16_t limit_of(const uint8_t key) {
+    switch (key) {
+    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
+    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
+    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
+        return UINT8_MAX;
+    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
+    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
+        return 1U;
+    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
+    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
+        return UINT16_MAX;
+    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
+        return (uint16_t)EST_TRIGGER_CUSUM;
+    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
+        return (uint16_t)EST_RESET_ALL;
+    default:
+        return 0U;
+    }
+}
+
+static void set_whole(est_config_t* const config, const uint8_t key, const uint16_t value) {
+    switch (key) {
+    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
+        config->na = (uint8_t)value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
+        config->nb = (uint8_t)value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
+        config->nk = (uint8_t)value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
+        config->offset = value != 0U;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
+        config->trigger.absolute = value != 0U;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
+        config->trigger.hold_off_n = value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
+        config->trigger.warm_up_n = value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
+        config->trigger.kind = (est_trigger_kind_t)value;
+        break;
+    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
+        config->trigger.reset = (est_reset_t)value;
+        break;
+    default:
+        break;
+    }
+}
+
+static uint16_t whole_value(const est_config_t* const config, const uint8_t key) {
+    switch (key) {
+    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
+        return config->na;
+    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
+        return config->nb;
+    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
+        return config->nk;
+    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
+        return config->offset ? 1U : 0U;
+    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
+        return config->trigger.absolute ? 1U : 0U;
+    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
+        return config->trigger.hold_off_n;
+    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
+        return config->trigger.warm_up_n;
+    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
+        return (uint16_t)config->trigger.kind;
+    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
+        return (uint16_t)config->trigger.reset;
+    default:
+        return 0U;
+    }
+}
+
+/// Only est_init() knows what it accepts, and the estimator is idle: it tries the candidate.
+static uint8_t configure(device_t* const self, const uint8_t key, const float value) {
+    est_config_t candidate = self->config;
+    float* const field     = float_field(&candidate, key);
+    if ((field == 0) && (limit_of(key) == 0U)) {
+        return ANALOGRIG_CONFIGURED_RESULT_UNKNOWN_CHOICE;
+    }
+    if (self->running) {
+        return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
+    }
+    if (field != 0) {
+        *field = value;
+    } else {
+        uint16_t number = 0U;
+        if (!whole(value, limit_of(key), &number)) {
+            return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
+        }
+        set_whole(&candidate, key, number);
+    }
+    if (!est_init(&self->estimator, &candidate)) {
+        return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
+    }
+    self->config = candidate;
+    return ANALOGRIG_CONFIGURED_RESULT_APPLIED_CHOICE;
+}
+
+static void on_configure(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+    struct analogrig_configure_t message;
+    (void)analogrig_configure_unpack(&message, payload, ANALOGRIG_CONFIGURE_LENGTH);
+    const uint8_t                       result  = configure(self, message.key, message.value);
+    const float* const                  field   = float_field(&self->config, message.key);
+    const struct analogrig_configured_t applied = {
+        .seq     = self->seq,
+        .key     = message.key,
+        .answers = message.seq,
+        .result  = result,
+        .value   = (field != 0) ? *field : (float)whole_value(&self->config, message.key),
+    };
+    uint8_t out[PAYLOAD_MAX];
+    (void)analogrig_configured_pack(out, &applied, sizeof(out));
+    put(self, answer, ANALOGRIG_CONFIGURED_FRAME_ID, out);
+}
+
+// ---------------------------------------------        CONTROL         ---------------------------------------------
+
+/// As after device_init(), except for the identity, the input and the sequence numbers.
+static void reset(device_t* const self) {
+    self->decoder.dropped   = 0U;
+    self->counters          = (device_counters_t){ 0 };
+    self->stopped           = (est_counters_t){ 0 };
+    self->config            = est_config_default();
+    self->running           = false;
+    self->report_interval_n = 1U;
+    (void)est_init(&self->estimator, &self->config);
+}
+
+static uint8_t start(device_t* const self, const uint32_t first_index) {
+    if (self->running) {
+        return ANALOGRIG_CONTROLLED_RESULT_RUNNING_CHOICE;
+    }
+    if ((first_index > UINT16_MAX) || !est_init(&self->estimator, &self->config)) {
+        return ANALOGRIG_CONTROLLED_RESULT_OUT_OF_RANGE_CHOICE;
+    }
+    self->running      = true;
+    self->next_index   = (uint16_t)first_index;
+    self->unreported_n = 0U;
+    return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
+}
+
+static void stop(device_t* const self) {
+    if (self->running) {
+        self->stopped = est_counters(&self->estimator);
+        self->running = false;
+    }
+}
+
+static uint8_t set_report_interval(device_t* const self, const uint32_t interval_n) {
+    if ((interval_n < 1U) || (interval_n > UINT16_MAX)) {
+        return ANALOGRIG_CONTROLLED_RESULT_OUT_OF_RANGE_CHOICE;
+    }
+    self->report_interval_n = (uint16_t)interval_n;
+    self->unreported_n      = 0U;
+    return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
+}
+
+static uint8_t control(device_t* const self, const uint8_t command, const uint32_t argument) {
+    switch (command) {
+    case ANALOGRIG_CONTROL_COMMAND_START_CHOICE:
+        return start(self, argument);
+    case ANALOGRIG_CONTROL_COMMAND_STOP_CHOICE:
+        stop(self);
+        return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
+    case ANALOGRIG_CONTROL_COMMAND_RESET_CHOICE:
+        reset(self);
+        return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
+    case ANALOGRIG_CONTROL_COMMAND_REPORT_INTERVAL_CHOICE:
+        return set_report_interval(self, argument);
+    default:
+        return ANALOGRIG_CONTROLLED_RESULT_UNKNOWN_CHOICE;
+    }
+}
+
+static void on_control(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+    struct analogrig_control_t message;
+    (void)analogrig_control_unpack(&message, payload, ANALOGRIG_CONTROL_LENGTH);
+    if (message.command == ANALOGRIG_CONTROL_COMMAND_STATUS_CHOICE) {
+        self->job         = DEVICE_COUNTING;
+        self->job_next    = COUNTER_FIRST;
+        self->job_answers = message.seq;
+        return;
+    }
+    const uint8_t                       result = control(self, message.command, message.argument);
+    const struct analogrig_controlled_t done   = { .seq      = self->seq,
+                                                   .command  = message.command,
+                                                   .answers  = message.seq,
+                                                   .result   = result,
+                                                   .argument = message.argument };
+    uint8_t                             out[PAYLOAD_MAX];
+    (void)analogrig_controlled_pack(out, &done, sizeof(out));
+    put(self, answer, ANALOGRIG_CONTROLLED_FRAME_ID, out);
+}
+
+static uint32_t counter_value(const device_t* const self, const uint8_t counter) {
+    const est_counters_t estimator = self->running ? est_counters(&self->estimator) : self->stopped;
+    switch (counter) {
+    case ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE:
+        return estimator.updated;
+    case ANALOGRIG_STATUS_COUNTER_MISSING_CHOICE:
+        return estimator.missing;
+    case ANALOGRIG_STATUS_COUNTER_REFUSED_CHOICE:
+        return estimator.refused;
+    case ANALOGRIG_STATUS_COUNTER_ALARMS_CHOICE:
+        return estimator.alarms;
+    case ANALOGRIG_STATUS_COUNTER_RESTARTS_CHOICE:
+        return estimator.restarts;
+    case ANALOGRIG_STATUS_COUNTER_SLIPS_CHOICE:
+        return estimator.slips;
+    case ANALOGRIG_STATUS_COUNTER_FRAMES_DROPPED_CHOICE:
+        return frame_dropped(&self->decoder);
+    case ANALOGRIG_STATUS_COUNTER_SEQUENCE_GAPS_CHOICE:
+        return self->counters.sequence_gaps;
+    case ANALOGRIG_STATUS_COUNTER_MESSAGES_REPEATED_CHOICE:
+        return self->counters.messages_repeated;
+    case ANALOGRIG_STATUS_COUNTER_MESSAGES_REFUSED_CHOICE:
+        return self->counters.messages_refused;
+    case ANALOGRIG_STATUS_COUNTER_SAMPLES_LOST_CHOICE:
+        return self->counters.samples_lost;
+    case ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE:
+        return self->counters.samples_ignored;
+    default:
+        return 0U;
+    }
+}
+
+static void put_counter(device_t* const self, answer_t* const answer) {
+    const struct analogrig_status_t message = { .seq     = self->seq,
+                                                .counter = self->job_next,
+                                                .answers = self->job_answers,
+                                                .value   = counter_value(self, self->job_next) };
+    uint8_t                         payload[PAYLOAD_MAX];
+    (void)analogrig_status_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_STATUS_FRAME_ID, payload);
+    if (self->job_next == COUNTER_LAST) {
+        self->job = DEVICE_IDLE;
+    }
+    self->job_next++;
+}
+
+// ---------------------------------------------        MESSAGES        ---------------------------------------------
+
+/// Every message is numbered. One with the number of the last is a repetition, which must not be obeyed twice; false for
+/// that. Identify begins a conversation, so its number is any.
+static bool sequence_allows(device_t* const self, const uint8_t id, const uint8_t seq) {
+    const bool begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
+    if (!begins && (seq == (uint8_t)(self->seq_expected - 1U))) {
+        add(&self->counters.messages_repeated, 1U);
+        return false;
+    }
+    if (!begins && (seq != self->seq_expected)) {
+        add(&self->counters.sequence_gaps, 1U);
+    }
+    self->seq_known    = true;
+    self->seq_expected = (uint8_t)(seq + 1U);
+    return true;
+}
+
+static void on_message(device_t* const self, answer_t* const answer) {
+    const uint8_t        id      = frame_id(&self->decoder);
+    const uint8_t* const payload = frame_payload(&self->decoder);
+    if (!analogrig_is_from_harness(id)) {
+        add(&self->counters.messages_refused, 1U);
+        return;
+    }
+    if (!sequence_allows(self, id, payload[0])) {
+        return;
+    }
+    switch (id) {
+    case ANALOGRIG_IDENTIFY_FRAME_ID:
+        put_hello(self, answer, payload[0]);
+        put_firmware(self, answer, payload[0]);
+        break;
+    case ANALOGRIG_CONTROL_FRAME_ID:
+        on_control(self, answer, payload);
+        break;
+    case ANALOGRIG_CONFIGURE_FRAME_ID:
+        on_configure(self, answer, payload);
+        break;
+    case ANALOGRIG_SAMPLE_FRAME_ID:
+        on_sample(self, answer, payload);
+        break;
+    case ANALOGRIG_SAMPLE_BLOCK_FRAME_ID:
+        on_sample_block(self, payload);
+        break;
+    default:
+        add(&self->counters.messages_refused, 1U);
+        break;
+    }
+}
+
+static void continue_job(device_t* const self, answer_t* const answer) {
+    if (self->job == DEVICE_STEPPING) {
+        step_block(self, answer);
+    } else {
+        put_counter(self, answer);
+    }
+}
+
+void device_init(device_t* const self, const device_identity_t* const identity) {
+    DEVICE_ASSERT((self != 0) && (identity != 0));
+    *self          = (device_t){ 0 };
+    self->identity = *identity;
+    frame_decoder_init(&self->decoder, identity->catalogue_hash);
+    reset(self);
+}
+
+device_progress_t
+device_run(device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
+    DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
+    device_progress_t progress = { .taken = 0U, .given = 0U };
+    while ((out_n - progress.given) >= DEVICE_ANSWER_MAX) {
+        answer_t answer = { .bytes = &out[progress.given], .n = 0U };
+        if (device_is_busy(self)) {
+            continue_job(self, &answer);
+        } else if (progress.taken == in_n) {
+            break;
+        } else if (frame_decoder_enter(&self->decoder, in[progress.taken++])) {
+            on_message(self, &answer);
+        }
+        progress.given += answer.n;
+    }
+    return progress;
+}
+
+bool device_is_busy(const device_t* const self) {
+    DEVICE_ASSERT(self != 0);
+    return self->job != DEVICE_IDLE;
+}
+
+size_t device_size(void) { return sizeof(device_t); }
