@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.dut import Dut, Replies
 from harness.errors import DeviceError, LinkError, RigError
@@ -14,8 +16,12 @@ from harness.rig import Block, Rig
 from harness.run import CHANNELS, Conditions, Run
 from harness.scenario import Scenario
 
+T = TypeVar("T", bound=np.generic)
+
 Progress = Callable[[int, int], None]
 """Called after each block with the samples done and the samples asked."""
+
+INTERRUPTED_BY_USER = "interrupted by the user"
 
 _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
@@ -47,7 +53,7 @@ class _Collected:
         )
 
 
-def _stacked(parts: list, empty_shape: tuple[int, ...], dtype: type) -> np.ndarray:  # type: ignore[type-arg]
+def _stacked(parts: Sequence[NDArray[T]], empty_shape: tuple[int, ...], dtype: type[T]) -> NDArray[T]:
     return np.concatenate(parts) if parts else np.zeros(empty_shape, dtype=dtype)
 
 
@@ -87,6 +93,8 @@ class Bench:
             conditions = dataclasses.replace(conditions, counters=self.dut.stop())
         except (DeviceError, LinkError, RigError) as error:
             conditions = dataclasses.replace(conditions, faults=(str(error),))
+        except KeyboardInterrupt:
+            conditions = dataclasses.replace(conditions, faults=(INTERRUPTED_BY_USER,))
         return collected.run(conditions, self.dut.parameters)
 
     def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:

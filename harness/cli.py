@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="analogrig",
-        description="Hardware in the loop for embedded parameter estimators: an analogue computer, a link, a device, a verdict.",
+        description="Hardware in the loop for embedded parameter estimators: a rig, a link, a device, a verdict.",
         epilog="Exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted.",
     )
     parser.add_argument("--version", action=_Version)
@@ -95,21 +95,29 @@ def _add_emulate(commands: Any) -> None:
     command = commands.add_parser("emulate", help="the rig alone: write volts and codes to a file")
     _add_what_to_play(command)
     command.add_argument(
-        "--out", type=Path, default=Path("build/emulate.csv"), metavar="FILE", help=".csv or .npz (default: %(default)s)"
+        "--out",
+        type=Path,
+        default=Path("build/signals.csv"),
+        metavar="FILE",
+        help=".csv or .npz (default: %(default)s)",
     )
     command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     command.set_defaults(command=_emulate)
 
 
 def _add_what_to_play(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--scenario", default="thesis", metavar="NAME", help="shipped name or .toml file (default: thesis)")
+    command.add_argument(
+        "--scenario", default="thesis", metavar="NAME", help="a shipped name or a .toml file (%(default)s)"
+    )
     command.add_argument(
         "--rig",
         default=os.environ.get("ANALOGRIG_RIG", "emulator"),
         metavar="NAME",
         help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG or emulator)",
     )
-    command.add_argument("--seed", type=_seed, default=DEFAULT_SEED, metavar="N", help="of everything random (default: %(default)s)")
+    command.add_argument(
+        "--seed", type=_seed, default=DEFAULT_SEED, metavar="N", help="of all that is random (%(default)s)"
+    )
 
 
 def _seed(text: str) -> int:
@@ -127,7 +135,11 @@ def _add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
 
 def _add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
     command.add_argument(
-        "--out", type=Path, default=default, metavar="DIR", help="where run.npz and report.html go (default: %(default)s)"
+        "--out",
+        type=Path,
+        default=default,
+        metavar="DIR",
+        help="where run.npz and report.html go (default: %(default)s)",
     )
     command.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
 
@@ -223,6 +235,7 @@ def _progress_line() -> Progress | None:
         now_s = time.monotonic()
         if now_s >= next_s:
             next_s = now_s + 1.0
-            print(f"\r{done} of {asked} samples ({done / asked:.0%})", end="\n" if done == asked else "", file=sys.stderr, flush=True)
+            end = "\n" if done == asked else ""
+            print(f"\r{done} of {asked} samples ({done / asked:.0%})", end=end, file=sys.stderr, flush=True)
 
     return show

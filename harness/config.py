@@ -44,7 +44,8 @@ def locate(kind: Kind, name: str) -> Path:
     path = fixtures() / kind / f"{name}.toml"
     if path.is_file():
         return path
-    raise ConfigurationError(f"no {kind[:-1]} is called {name!r}: there are {', '.join(names(kind))}, or give a .toml file")
+    known = ", ".join(names(kind))
+    raise ConfigurationError(f"no {kind[:-1]} is called {name!r}: there are {known}, or give a .toml file")
 
 
 def names(kind: Kind) -> list[str]:
@@ -127,7 +128,9 @@ def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[
         return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
     if len(items) != len(arguments):
         raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
-    return tuple(_convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True)))
+    return tuple(
+        _convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
+    )
 
 
 def _convert_scalar(hint: Any, value: Any, where: str) -> Any:

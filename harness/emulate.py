@@ -18,7 +18,9 @@ from harness.scenario import Scenario
 from harness.storage import replacing
 
 
-def write_signals(rig: Rig, scenario: Scenario, seed: int, path: Path, progress: Progress | None = None) -> dict[str, int]:
+def write_signals(
+    rig: Rig, scenario: Scenario, seed: int, path: Path, progress: Progress | None = None
+) -> dict[str, int]:
     """Play ``scenario`` on ``rig`` and write volts, codes and clipping flags, one row a sample, as .csv or .npz.
 
     :returns: ``samples`` and ``clipped``, the samples in which any channel was clipped.

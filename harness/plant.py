@@ -6,6 +6,7 @@ This is the harness's own model of what the rig computes: it is used to say how 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -54,7 +55,7 @@ class SampledPlant:
 
     @classmethod
     def of(cls, plant: Plant, period_s: float) -> SampledPlant:
-        """Sample ``plant`` every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
+        """Every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
         m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
         generator = np.array([[0.0, 1.0, 0.0], [-k / m, -b / m, 1.0 / m], [0.0, 0.0, 0.0]])
         (xx, xv, xf), (vx, vv, vf), _ = _exponential(generator * period_s).tolist()
@@ -69,8 +70,9 @@ class SampledPlant:
 
 
 def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """exp(matrix) by scaling, a Taylor series, and squaring; relative error near 1e-15 for the small norms used here."""
-    squarings = max(0, int(np.ceil(np.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300)))) + 4)
+    """exp(matrix) by scaling, a Taylor series, and squaring; relative error near 1e-15 for the norms used here."""
+    norm = float(np.abs(matrix).sum(axis=1).max())
+    squarings = max(0, math.frexp(norm)[1] + 4)
     scaled = matrix / 2.0**squarings
     term = result = np.eye(len(matrix))
     for order in range(1, 13):
@@ -82,11 +84,12 @@ def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def physical_parameters(
-    theta: NDArray[np.float32], estimator: Mapping[str, object], n_per_code: float, m_per_code: float, period_s: float
+    theta: NDArray[np.floating], estimator: Mapping[str, object], n_per_code: float, m_per_code: float, period_s: float
 ) -> NDArray[np.float64]:
     """Estimates (n, p) in codes to M, B, K (n, 3); NaN where a row describes no mass, damper and spring.
 
-    The poles of A give B/M and K/M, the static gain gives K; neither needs to know when inside the interval an edge came.
+    The poles of A give B/M and K/M, the static gain gives K; neither needs to know when inside the interval an edge
+    came.
 
     :param estimator: at least ``na`` and ``nb``, which say what the columns of theta are; all NaN unless ``na`` is 2.
     :param n_per_code: newtons per code of force.

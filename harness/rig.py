@@ -1,7 +1,7 @@
 """Rigs: what plays a scenario and yields samples. The emulated analogue computer, and a recording of a run.
 
-A rig is opened by name, performs scenarios, and is closed. Whatever else a bench instrument will be, it is another class
-with these methods; nothing behind this module asks which one it has.
+A rig is opened by name, performs scenarios, and is closed. Whatever else a bench instrument will be, it is another
+class with these methods; nothing behind this module asks which one it has.
 """
 
 from __future__ import annotations
@@ -77,7 +77,9 @@ class Rig(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Leave it safe: outputs off, connections closed."""
 
 
@@ -229,7 +231,7 @@ class RecordingRig:
             tweaks=tuple(tweak for tweak in scenario.tweaks if tweak.sample < self.run.samples),
         )
 
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
+    def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002 - nothing is drawn any more
         if scenario != self.scenario():
             raise ConfigurationError(f"{self._name}: holds the scenario {self.scenario().name!r} and can play no other")
         conditions = self.run.conditions

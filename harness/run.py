@@ -1,7 +1,7 @@
 """A Run: everything that one play of a scenario yielded, and the one file it is kept in.
 
-The file is an uncompressed ``.npz``: the arrays under their own names and ``header``, a JSON text. Nothing in it is ever
-executed (``allow_pickle=False``); a verdict can be computed from it alone, today or in ten years.
+The file is an uncompressed ``.npz``: the arrays under their own names and ``header``, a JSON text. Nothing in it is
+ever executed (``allow_pickle=False``); a verdict can be computed from it alone, today or in ten years.
 """
 
 from __future__ import annotations
@@ -177,7 +177,8 @@ class Run:
             raise RecordingError(f"{path}: truncated, or not a recording of analogrig: {error}") from error
         try:
             if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
-                raise RecordingError(f"{path}: format {header['format']} {header['version']}, expected {FORMAT} {FORMAT_VERSION}")
+                found = f"{header['format']} {header['version']}"
+                raise RecordingError(f"{path}: its format is {found}, expected {FORMAT} {FORMAT_VERSION}")
             run = cls(conditions=_from_json(header["conditions"]), **arrays)
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(f"{path}: the header of the recording is damaged: {error!r}") from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,9 +16,7 @@ from harness.plant import Plant
 from harness.run import Segment
 from harness.verdict import Expectations
 
-PLANTS = {
-    name: Plant(program.M_kg, program.B_n_s_per_m, program.K_n_per_m) for name, program in PROGRAMS.items()
-}
+PLANTS = {name: Plant(program.M_kg, program.B_n_s_per_m, program.K_n_per_m) for name, program in PROGRAMS.items()}
 """The parameters with which each program of the computer starts."""
 
 MAX_SAMPLES = 100_000_000
@@ -105,7 +102,7 @@ class Scenario:
 
     def as_table(self) -> dict[str, Any]:
         """The same as plain values, so that ``from_table`` gives an equal scenario again."""
-        return _without_none(dataclasses.asdict(self))
+        return _plain(dataclasses.asdict(self))
 
     def excitation_drawn(self, rng: np.random.Generator) -> Excitation:
         """The excitation of one run: its phase drawn if the scenario asks for it."""
@@ -139,10 +136,12 @@ def _check_positive(change: PlantChoice | Tweak) -> None:
             raise ValueError(f"{name} must be more than 0, not {value:g}")
 
 
-def _without_none(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _without_none(item) for key, item in value.items() if item is not None}
-    if isinstance(value, list | tuple):
-        return [_without_none(item) for item in value]
-    return value
+def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
+    """As TOML has it: arrays are lists, and what is not given is not there."""
+    return {key: _plain_value(value) for key, value in table.items() if value is not None}
 
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _plain(value)
+    return [_plain_value(item) for item in value] if isinstance(value, list | tuple) else value

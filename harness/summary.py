@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from harness.run import Run
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
 
+SHOWN_ALARMS = 10
+
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
@@ -21,14 +23,21 @@ def summary(run: Run, verdict: Verdict) -> str:
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
         lines += [_tweak_line(tweak) for tweak in verdict.tweaks]
-    false_alarms = ", ".join(map(str, verdict.false_alarms[:10])) + (", ..." if len(verdict.false_alarms) > 10 else "")
-    lines += ["", f"  false alarms: {len(verdict.false_alarms)}{f' (at {false_alarms})' if false_alarms else ''} in {run.samples} samples"]
+    lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
     if verdict.missing_n:
         lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
     lines += ["", f"  theta hash {verdict.theta_hash}"]
     return "\n".join(lines)
+
+
+def _false_alarms(verdict: Verdict) -> str:
+    alarms = verdict.false_alarms
+    if not alarms:
+        return "none"
+    first = ", ".join(map(str, alarms[:SHOWN_ALARMS]))
+    return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
 
 
 def _tweak_line(tweak: TweakVerdict) -> str:

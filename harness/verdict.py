@@ -30,7 +30,7 @@ class Expectations:
     false_alarms: int = 0
     """At most so many in the whole run."""
     arl0: float = 1e5
-    """Mean samples between false alarms for which the bound is computed when the device's trigger has none of its own."""
+    """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
     late_information_ratio: float = 4.0
     """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
     late_slack_n: int = 10
@@ -229,12 +229,12 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
     if len(missed) > expect.missed:
         names = "; ".join(f"{tweak.what} at {tweak.sample}" for tweak in missed)
         reasons.append(f"missed {len(missed)} of {len(tweaks)} changes ({names}), at most {expect.missed} expected")
-    for tweak in tweaks:
-        if tweak.late:
-            reasons.append(
-                f"{tweak.what} at {tweak.sample} was noticed after {tweak.latency_n} samples,"
-                f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
-            )
+    reasons += [
+        f"{tweak.what} at {tweak.sample} was noticed after {tweak.latency_n} samples,"
+        f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
+        for tweak in tweaks
+        if tweak.late
+    ]
     if len(false_alarms) > expect.false_alarms:
         reasons.append(f"{len(false_alarms)} false alarms, at most {expect.false_alarms} expected")
     return reasons

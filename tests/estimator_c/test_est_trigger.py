@@ -2,50 +2,62 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 import pytest
-from tests.estimator_c.est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
 from numpy.typing import NDArray
 from scipy.linalg import expm
+
+from tests.estimator_c.est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01
 N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
-PLAIN = {"na": 2, "nb": 2, "nk": 1, "offset": 0, "c": (0.0, 0.0), "forgetting": 1.0, "edge_codes": 0.0}
+PLAIN: dict[str, float | tuple[float, float]] = {
+    "na": 2,
+    "nb": 2,
+    "nk": 1,
+    "offset": 0,
+    "c": (0.0, 0.0),
+    "forgetting": 1.0,
+    "edge_codes": 0.0,
+}
+
+
+Plant = tuple[float, float, float]
+
+
+@functools.cache
+def propagator(plant: Plant, span: float) -> NDArray[np.float64]:
+    """(x, v, F) to (x, v) after so many samples of constant force."""
+    m, b, k = plant
+    generator = np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]])
+    return np.asarray(expm(generator * PERIOD_S * span)[:2])
 
 
 def suspension(
-    plants: list[tuple[int, tuple[float, float, float]]], edges: NDArray[np.float64], n: int, noise_codes: float, seed: int
+    plants: list[tuple[int, Plant]], edges: NDArray[np.float64], n: int, noise_codes: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Codes of force and displacement of M x'' + B x' + K x = F by exact steps between the edges (at any instants) of a
     force that toggles between 0 and 2900 N; independent of the emulator."""
     rng = np.random.default_rng(seed)
     starts = dict(plants)
-    state, level, pending = np.zeros(2), 0.0, edges.tolist()
-    steps: dict[tuple[tuple[float, float, float], float], NDArray[np.float64]] = {}
-
-    def advance(state: NDArray[np.float64], span: float) -> NDArray[np.float64]:
-        key = (plant, span)
-        if key not in steps:
-            m, b, k = plant
-            steps[key] = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * PERIOD_S * span)
-        return steps[key][:2] @ np.append(state, level)
-
+    plant, state, level, pending = starts[0], np.zeros(2), 0.0, edges.tolist()
     force, displacement = np.zeros(n), np.zeros(n)
     for k in range(n):
-        plant = starts.get(k, plant) if k else starts[0]
+        plant = starts.get(k, plant)
         while pending and pending[0] <= k:
             level = 2900.0 - level
             pending.pop(0)
         force[k], displacement[k] = level, state[0]
         at = float(k)
         while pending and pending[0] < k + 1:
-            state = advance(state, pending[0] - at)
+            state = propagator(plant, pending[0] - at) @ np.append(state, level)
             at = pending.pop(0)
             level = 2900.0 - level
-        state = advance(state, k + 1 - at)
+        state = propagator(plant, k + 1 - at) @ np.append(state, level)
     u, y = force / N_PER_CODE, displacement / M_PER_CODE + 410.0
     return (np.round(u + rng.normal(0.0, noise_codes, n)), np.round(y + rng.normal(0.0, noise_codes, n)))
 

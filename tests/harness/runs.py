@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,11 @@ def made_run(
     noise_lsb: float = 1.0,
     clipped: NDArray[np.bool_] | None = None,
     alarms: Sequence[int] = (),
-    expect: dict[str, float] | None = None,
+    expect: Mapping[str, float] | None = None,
     faults: tuple[str, ...] = (),
     samples_asked: int | None = None,
-    theta: NDArray[np.float32] | None = None,
-    estimator: dict[str, object] | None = None,
+    theta: NDArray[np.floating] | None = None,
+    estimator: Mapping[str, object] | None = None,
 ) -> Run:
     """A run of the given force; ``clipped`` is the displacement's. Without ``theta`` all estimates are zero."""
     n = len(force_n)
@@ -58,7 +58,7 @@ def made_run(
         conditions=conditions,
         codes=codes,
         clipped=flags,
-        theta=np.zeros((n, 6), np.float32) if theta is None else theta,
+        theta=np.zeros((n, 6), np.float32) if theta is None else theta.astype(np.float32),
         innovation=np.zeros(n, np.float32),
         statistic=np.zeros(n, np.float32),
         flags=np.zeros(n, np.uint8),

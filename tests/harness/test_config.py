@@ -76,7 +76,11 @@ def test_mistake_is_named_with_its_place(table: dict[str, object], message: str)
         ("mass_kg = 30.0", "mass_kg = -30.0", "tweaks[0]: mass_kg must be more than 0, not -30"),
         ("mass_kg = 30.0", "", "tweaks[0]: a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m"),
         ('shape = "square"', 'shape = "sine"', "excitation: shape 'sine' must be one of square, pulse, prbs"),
-        ('shape = "square"', "shape = 'square'\nphase = 1.5", "excitation: phase 1.5 must be at least 0 and less than 1 period"),
+        (
+            'shape = "square"',
+            "shape = 'square'\nphase = 1.5",
+            "excitation: phase 1.5 must be at least 0 and less than 1 period",
+        ),
         ("[excitation]", "[exitation]", "unknown key 'exitation'"),
         ("samples = 100", "samples = ", "not valid TOML"),
     ],
@@ -131,5 +135,5 @@ def test_every_shipped_rig_opens() -> None:
 def test_rig_without_a_channel_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text("[card.range_v]\nforce = [0.0, 10.0]\n")
-    with pytest.raises(ConfigurationError, match=r"card: range_v must give the channels force, displacement, velocity, net_force"):
+    with pytest.raises(ConfigurationError, match="card: range_v must give the channels force, displ"):
         open_rig(str(path))

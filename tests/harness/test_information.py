@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from tests.harness.runs import made_run
 from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from harness import information
 from harness.plant import AT_REST, Plant, SampledPlant, physical_parameters
+from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)
 SOFT = Plant(115.0, 3021.0, 18000.0)
@@ -39,27 +39,27 @@ def test_theta_of_the_exact_discretisation_reads_as_the_plant(plant: Plant) -> N
     assert read[0] == pytest.approx([m, b, k], rel=1e-6)
 
 
-@pytest.mark.parametrize("theta", [[0.0] * 6, [-1.7, -0.1, 0.1, 0.1, 0.1, 0.0], [-1.75, 0.77, -0.1, -0.1, 0.0, 0.0], [np.nan] * 6])
+@pytest.mark.parametrize(
+    "theta",
+    [[0.0] * 6, [-1.7, -0.1, 0.1, 0.1, 0.1, 0.0], [-1.75, 0.77, -0.1, -0.1, 0.0, 0.0], [np.nan] * 6],
+    ids=["zero", "unstable", "negative gain", "nan"],
+)
 def test_theta_that_is_no_suspension_reads_as_nan(theta: list[float]) -> None:
     assert np.isnan(physical_parameters(np.array([theta], np.float32), {"na": 2, "nb": 3}, 1.0, 1e-4, 0.01)).all()
 
 
 def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
-    """From rest at x0 = F / K the step to K' is the step response of the changed plant: closed form of an underdamped
-    second-order system, (x0' - x0)(1 - exp(-s t)(cos w t + s / w sin w t))."""
+    """From rest at x0 = F / K the step to K' is the step response of the changed plant: closed form of an overdamped
+    second-order system (zeta = 1.05), (x0' - x0)(1 - exp(-s t)(cosh r t + s / r sinh r t))."""
     force_n, noise_lsb = 2940.0, 1.0
     run = made_run(force_n=np.full(600, force_n), plants=[(0, FRONT), (400, SOFT)], noise_lsb=noise_lsb)
     (gathered,) = information.changes(run)
     lsb_m = run.conditions.channels["displacement"].lsb
     s = SOFT.damping_n_s_per_m / (2.0 * SOFT.mass_kg)
-    w = math.sqrt(SOFT.stiffness_n_per_m / SOFT.mass_kg - s * s + 0j).real if SOFT.stiffness_n_per_m / SOFT.mass_kg > s * s else None
+    r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
     t = 0.01 * np.arange(1, 51)
     amplitude = force_n / SOFT.stiffness_n_per_m - force_n / FRONT.stiffness_n_per_m
-    if w is None:
-        r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
-        step = 1.0 - np.exp(-s * t) * (np.cosh(r * t) + s / r * np.sinh(r * t))
-    else:
-        step = 1.0 - np.exp(-s * t) * (np.cos(w * t) + s / w * np.sin(w * t))
+    step = 1.0 - np.exp(-s * t) * (np.cosh(r * t) + s / r * np.sinh(r * t))
     expected = np.cumsum((amplitude * step / lsb_m) ** 2) / (2.0 * (noise_lsb**2 + 1.0 / 12.0))
     assert gathered[:50] == pytest.approx(expected, rel=1e-3)
 

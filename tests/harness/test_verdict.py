@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from tests.harness.runs import ESTIMATOR, made_run
 
 from harness.plant import Plant
 from harness.verdict import as_json, judge
+from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)
 SOFT = Plant(115.0, 3021.0, 18000.0)
@@ -101,12 +101,13 @@ def test_tweak_after_the_end_of_a_short_run_is_not_judged() -> None:
 
 
 def test_theta_hash_is_sha256_of_the_float32_bits() -> None:
-    theta = np.arange(12, dtype=np.float32).reshape(2, 6) / 7
+    theta = np.linspace(-1.0, 1.0, 12).reshape(2, 6)
     expected = hashlib.sha256(theta.astype("<f4").tobytes()).hexdigest()
     assert judge(made_run(LOADED[:2], [(0, FRONT)], theta=theta)).theta_hash == expected
 
 
 def test_json_carries_what_the_documentation_promises() -> None:
     out = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))
-    assert out["tweaks"][0].items() >= {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}.items()
+    promised = {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}
+    assert out["tweaks"][0].items() >= promised.items()
     assert {"outcome", "valid", "false_alarms", "estimates", "theta_hash", "arl0"} <= out.keys()
