@@ -35,7 +35,7 @@ run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
 test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
-	@$(BIN)/pytest -n $(JOBS) --dist loadgroup $(PYTEST_ARGS)
+	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 check: lint strict ## linters, types, and the C with every warning an error
 
