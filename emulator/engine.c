@@ -7,6 +7,7 @@
 #include <string.h>
 
 #define TOP_LEVEL (ENGINE_LEVELS - 1)
+#define NO_LEVEL (-1)
 #define MAX_COLUMNS (ENGINE_MAX_STATES + ENGINE_MAX_INPUTS + 1)
 
 /* Matrices that are multiplied in the inner loop are cut into panels of four rows; a panel is stored column by column.
@@ -56,8 +57,9 @@ struct engine {
     int64_t now;     /* tick */
     int64_t elapsed; /* ticks since the last event, edge or new circuit; stops counting at one sample period */
     int64_t events_left;
-    struct point points[3];
-    struct point *here, *there, *middle;
+    struct point points[4];
+    struct point *before, *here, *there, *middle;
+    int level_before; /* of the step that led here from before; NO_LEVEL when w has had a kink here */
 
     unsigned char piece[ENGINE_MAX_KINKS];
     double lower[ENGINE_MAX_KINKS], upper[ENGINE_MAX_KINKS]; /* bounds of w in the present pieces */
@@ -254,6 +256,7 @@ static enum engine_status enter_mode(engine *self)
         self->upper[k] = self->piece[k] == 0 ? kink->lower : self->piece[k] == 1 ? kink->upper : (double)INFINITY;
     }
     self->elapsed = 0;
+    self->level_before = NO_LEVEL;
     self->mode = find_mode(self);
     return self->mode != NULL ? ENGINE_OK : make_mode(self);
 }
@@ -279,35 +282,50 @@ static void step(engine *self, int level, struct point *to)
     self->counts.steps++;
 }
 
-/* A step that ends inside all bounds is CLEAR when w could not have left them on the way even if it had strayed from
- * the values at both ends by as much as these differ. */
-static enum judgement judge(const engine *self, const struct point *from, const struct point *to)
+/* By what factor a step of this level is longer than the one before it; 0 when there is none to compare with. */
+static double growth(const engine *self, int level)
 {
+    if (self->level_before == NO_LEVEL) {
+        return 0.0;
+    }
+    return (double)(INT64_C(1) << level) / (double)(INT64_C(1) << self->level_before);
+}
+
+/* A step that ends inside all bounds is CLEAR when w could not have left them on the way even if, beyond the values at
+ * both ends, it had strayed by as much as it changes in this step, or would at the speed of the step before. (Over the
+ * top of a peak the former alone may be nothing.) */
+static enum judgement judge(const engine *self, int level, const struct point *to)
+{
+    const double *before = self->before->w, *here = self->here->w;
+    const double factor = growth(self, level);
     bool near = false;
     for (int k = 0; k < self->kinks; k++) {
-        const double w0 = from->w[k], w1 = to->w[k];
+        const double w0 = here[k], w1 = to->w[k];
         const double lower = self->lower[k], upper = self->upper[k];
         if (!(w1 >= lower && w1 <= upper)) {
             return CROSSED;
         }
-        const double stray = fabs(w1 - w0);
+        const double change = fabs(w1 - w0), change_before = factor * fabs(w0 - before[k]);
+        const double stray = change > change_before ? change : change_before;
         near |= (w0 > w1 ? w0 : w1) + stray > upper || (w0 < w1 ? w0 : w1) - stray < lower;
     }
     return near ? NEAR : CLEAR;
 }
 
-static enum judgement attempt(engine *self, int level)
+static enum judgement attempt(engine *self, int level, struct point *to)
 {
-    step(self, level, self->there);
-    return judge(self, self->here, self->there);
+    step(self, level, to);
+    return judge(self, level, to);
 }
 
 static void accept(engine *self, int level)
 {
     const int64_t ticks = INT64_C(1) << level;
-    struct point *left_behind = self->here;
+    struct point *oldest = self->before;
+    self->before = self->here;
     self->here = self->there;
-    self->there = left_behind;
+    self->there = oldest;
+    self->level_before = level;
     self->now += ticks;
     self->elapsed += ticks;
     if (self->elapsed > ENGINE_TICKS_PER_SAMPLE) {
@@ -335,11 +353,11 @@ static int longest_level(const engine *self, int64_t ticks)
 static enum engine_status cross(engine *self, int level)
 {
     while (--level >= 0) {
-        if (attempt(self, level) != CROSSED) {
+        if (attempt(self, level, self->there) != CROSSED) {
             accept(self, level);
         }
     }
-    const enum judgement last = attempt(self, 0);
+    const enum judgement last = attempt(self, 0, self->there);
     accept(self, 0);
     if (last != CROSSED) {
         return ENGINE_OK;
@@ -352,13 +370,12 @@ static enum engine_status cross(engine *self, int level)
 static enum engine_status stride(engine *self, int64_t ticks)
 {
     int level = longest_level(self, ticks);
-    enum judgement judgement = attempt(self, level);
+    enum judgement judgement = attempt(self, level, self->there);
     while (judgement == NEAR && level > NEAR_LEVEL) {
-        judgement = attempt(self, --level);
+        judgement = attempt(self, --level, self->there);
     }
     if (judgement == NEAR && level > 0) {
-        step(self, level - 1, self->middle);
-        judgement = judge(self, self->here, self->middle);
+        judgement = attempt(self, level - 1, self->middle);
     }
     if (judgement == CROSSED) {
         return cross(self, level);
@@ -404,7 +421,8 @@ engine *engine_new(int states, int inputs, int kinks, int outputs, double sample
     self->here = &self->points[0];
     self->there = &self->points[1];
     self->middle = &self->points[2];
-    for (int i = 0; i < 3; i++) {
+    self->before = &self->points[3];
+    for (int i = 0; i < 4; i++) {
         self->points[i].z[self->columns - 1] = 1.0;
     }
     return self;
@@ -487,7 +505,7 @@ static enum engine_status take_edge(engine *self, int64_t tick, int32_t input, d
     if (status != ENGINE_OK) {
         return status;
     }
-    for (int i = 0; i < 3; i++) {
+    for (int i = 0; i < 4; i++) {
         self->points[i].z[column] = level;
     }
     measure(self, self->here);

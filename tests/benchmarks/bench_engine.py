@@ -37,6 +37,16 @@ def play(excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = ()) -> 
         pass
 
 
+def run_trials(count: int) -> None:
+    for _ in range(count):
+        play(Excitation(), 800, THESIS_TWEAKS)
+
+
+def turn(computer: SuspensionComputer, count: int) -> None:
+    for i in range(count):
+        computer.set(M_kg=100.0 + i)
+
+
 def streams() -> Iterator[tuple[str, Excitation]]:
     yield "quiet", Excitation(low_v=5.0, high_v=5.0)
     yield "square_200_hz", Excitation()
@@ -50,11 +60,10 @@ def main() -> None:
         rate = samples / best_s(functools.partial(play, excitation, samples))
         print(f"emulator_{name} {rate:.3g} samples/s")
     trials = 50
-    trial_s = best_s(lambda: [play(Excitation(), 800, THESIS_TWEAKS) for _ in range(trials)]) / trials
+    trial_s = best_s(functools.partial(run_trials, trials)) / trials
     print(f"emulator_trial_800_samples_4_tweaks {1e3 * trial_s:.3g} ms")
     turns = 200
-    computer = SuspensionComputer("front")
-    turn_s = best_s(lambda: [computer.set(M_kg=100.0 + i) for i in range(turns)]) / turns
+    turn_s = best_s(functools.partial(turn, SuspensionComputer("front"), turns)) / turns
     print(f"emulator_pot_turned {1e6 * turn_s:.3g} us")
 
 

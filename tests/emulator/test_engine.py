@@ -28,7 +28,7 @@ from emulator import (
 from emulator.opamp import CLAMP_RATE
 
 Volts = NDArray[np.float64]
-Slope = Callable[[float, Volts, float], tuple[float, float]]
+Slope = Callable[[float, Volts, float], tuple[float, ...]]
 
 SOURCE = VoltageSource("V1", "in")
 RATE = 2 * math.pi * 1e6
@@ -101,13 +101,13 @@ def test_an_overdriven_output_stands_slew_over_clamp_rate_beyond_its_swing() -> 
     assert volts[2] == pytest.approx(13.5 - 25.0, abs=2e-3)
 
 
-def brute_force(slope: Slope, stretches: list[tuple[float, float]], instants_s: Volts) -> Volts:
-    """(instants, states), from rest: an implicit integrator at tight tolerance, restarted at every (start in s, level).
+def brute_force(slope: Slope, x0: Volts, stretches: list[tuple[float, float]], instants_s: Volts) -> Volts:
+    """(instants, states): an implicit integrator at tight tolerance, restarted at every (start in s, level).
 
     The last stretch ends just after the last instant.
     """
     stops_s = [start_s for start_s, _ in stretches[1:]] + [float(instants_s[-1]) + 1e-9]
-    rows, x = [], np.zeros(2)
+    rows, x = [], x0
     for (start_s, level), stop_s in zip(stretches, stops_s, strict=True):
         wanted = instants_s[(instants_s >= start_s) & (instants_s < stop_s)]
         times_s = np.append(wanted, stop_s)
@@ -132,7 +132,7 @@ def test_an_integrator_driven_into_its_clamp_and_back_agrees_with_brute_force() 
 
     engine = Engine(integrator(), ["out"])
     volts = engine.run(8, steps((0.0, 5.0), (2.37, -5.0), (4.0, 0.0)))[:, 0]
-    expected = brute_force(slope, [(0.0, 5.0), (118.5e-6, -5.0), (200e-6, 0.0)], np.arange(8.0) * 50e-6)
+    expected = brute_force(slope, np.zeros(2), [(0.0, 5.0), (118.5e-6, -5.0), (200e-6, 0.0)], np.arange(8.0) * 50e-6)
     assert expected[:, 1].min() < -13.5
     # Radau itself is good to some 1e-6 V across the kinks; 1e-5 V is 4/1000 LSB of a 12-bit card on 10 V.
     np.testing.assert_allclose(volts, expected[:, 1], atol=1e-5)
@@ -148,9 +148,75 @@ def test_slewing_that_starts_after_the_edge_is_seen() -> None:
     elements = (Resistor("R1", "in", "p", 1e3), Capacitor("C1", "p", "0", 2e-9), OpAmp("U1", "p", "out", "out", OPAMP))
     engine = Engine(piecewise_linear(Circuit([SOURCE, *elements])), ["out"], sample_rate_hz=1e5)
     volts = engine.run(5, steps((0.0, 8.0)))[:, 0]
-    expected = brute_force(slope, [(0.0, 8.0)], np.arange(5.0) * 10e-6)
+    expected = brute_force(slope, np.zeros(2), [(0.0, 8.0)], np.arange(5.0) * 10e-6)
     np.testing.assert_allclose(volts, expected[:, 1], atol=1e-5)
     assert engine.counts.events == 2
+
+
+def test_slewing_that_starts_late_and_ends_before_the_next_sample_is_seen() -> None:
+    """The same at 20 kHz: quiet at both ends of the first interval; a slow low-pass keeps what was between."""
+
+    def slope(_: float, x: Volts, level: float) -> tuple[float, float, float]:
+        fast_v, slow_v, v = x
+        return (level - fast_v) / 2e-6, (v - slow_v) / 100e-6, law(RATE * (fast_v - v), v)
+
+    elements = (
+        *(Resistor("R1", "in", "p", 1e3), Capacitor("C1", "p", "0", 2e-9), OpAmp("U1", "p", "out", "out", OPAMP)),
+        *(Resistor("R2", "out", "slow", 1e3), Capacitor("C2", "slow", "0", 100e-9)),
+    )
+    engine = Engine(piecewise_linear(Circuit([SOURCE, *elements])), ["slow"])
+    volts = engine.run(6, steps((3.0, 4.0)))[:, 0]
+    expected = brute_force(slope, np.zeros(3), [(0.0, 4.0)], np.arange(3.0) * 50e-6)
+    np.testing.assert_allclose(volts[3:], expected[:, 1], atol=1e-5)
+    assert engine.counts.events == 2
+
+
+def test_slewing_for_a_moment_between_two_steps_is_seen() -> None:
+    """A low-pass as slow as the follower: the slope asked for, u a (a t) exp(-a t), peaks at u a / e when a t = 1.
+
+    That is at 159 ns, while steps end 98 and 195 ns after the edge; there it is 0.906 and 0.978 of the peak.
+    """
+    farad = 1 / (RATE * 1e3)
+    elements = (Resistor("R1", "in", "p", 1e3), Capacitor("C1", "p", "0", farad), OpAmp("U1", "p", "o", "o", OPAMP))
+    for excess, events in ((0.99, 0), (1.01, 2)):
+        engine = Engine(piecewise_linear(Circuit([SOURCE, *elements])), ["o"])
+        engine.run(2, steps((0.0, excess * math.e * SLEW / RATE)))
+        assert engine.counts.events == events
+
+
+@pytest.mark.parametrize(("amplitude_v", "peak"), [(13.8, 0.5), (13.6, 0.25)])
+def test_a_peak_that_touches_the_clamp_between_two_samples_is_seen(amplitude_v: float, peak: float) -> None:
+    """An undamped loop of two integrators and an inverter swings at 2 kHz; a follower clips its peaks.
+
+    At 10 samples a period no sample is beyond 13.5 V; the peaks come that part of an interval after a sample.
+    """
+    omega = 2 * math.pi * 2e3
+    phase = -omega * 50e-6 * peak
+    ohm = 1 / (omega * 1e-9)
+    ideal, clamped = OpAmpModel(), OpAmpModel(gbw_hz=1e6, swing_v=(-13.5, 13.5))
+    elements = (
+        *(Resistor("R1", "c", "n1", ohm), Capacitor("C1", "n1", "a", 1e-9), OpAmp("U1", "0", "n1", "a", ideal)),
+        *(Resistor("R2", "a", "n2", ohm), Capacitor("C2", "n2", "b", 1e-9), OpAmp("U2", "0", "n2", "b", ideal)),
+        *(Resistor("R3", "b", "n3", 1e4), Resistor("R4", "n3", "c", 1e4), OpAmp("U3", "0", "n3", "c", ideal)),
+        OpAmp("U4", "a", "out", "out", clamped),
+        *(Resistor("R5", "out", "slow", 1e3), Capacitor("C3", "slow", "0", 100e-9)),
+    )
+
+    def slope(t: float, x: Volts, _: float) -> tuple[float, float]:
+        v, slow_v = x
+        a = amplitude_v * math.cos(omega * t + phase)
+        clamp = CLAMP_RATE * (max(v - 13.5, 0.0) + min(v + 13.5, 0.0))
+        return RATE * (a - v) - clamp, (v - slow_v) / 100e-6
+
+    a, b = amplitude_v * math.cos(phase), amplitude_v * math.sin(phase)
+    engine = Engine(piecewise_linear(Circuit(elements)), ["a", "slow"])
+    # da/dt = -omega c = omega b, so b = -sin; a capacitor's voltage is that of its virtual ground less the output's.
+    engine.state = np.array([-a, b, 0.0, a])
+    volts = engine.run(13)
+    np.testing.assert_allclose(volts[:, 0], amplitude_v * np.cos(omega * np.arange(13) * 50e-6 + phase), atol=1e-9)
+    assert np.abs(volts[:, 0]).max() < 13.45
+    expected = brute_force(slope, np.array([a, 0.0]), [(0.0, 0.0)], np.arange(13.0) * 50e-6)
+    np.testing.assert_allclose(volts[:, 1], expected[:, 1], atol=1e-5)
 
 
 @pytest.mark.parametrize("block", [1, 2, 7, 64])

@@ -94,6 +94,7 @@ def test_the_seed_shifts_the_sequence() -> None:
     [
         Excitation(frequency_hz=300.0, phase=0.123),
         Excitation(shape="pulse", duty=0.003, frequency_hz=777.0),
+        Excitation(shape="pulse", duty=0.997, frequency_hz=777.0),
         Excitation(shape="prbs", frequency_hz=9.9e3, phase=0.5),
         Excitation(clock="free", drift_ppm=-35.0, frequency_hz=1234.5, phase=0.999),
         Excitation(shape="prbs", clock="free", frequency_hz=3333.0, drift_ppm=500.0),
@@ -102,7 +103,7 @@ def test_the_seed_shifts_the_sequence() -> None:
 def test_cutting_the_range_changes_no_edge(excitation: Excitation) -> None:
     whole = edges_of(excitation, 500)
     rng = np.random.default_rng(4)
-    cuts = [0, *sorted(rng.integers(1, 500 * TICKS_PER_SAMPLE, 60).tolist()), 500 * TICKS_PER_SAMPLE]
+    cuts = [0, *sorted(rng.integers(1, 500 * TICKS_PER_SAMPLE, 2000).tolist()), 500 * TICKS_PER_SAMPLE]
     parts = [excitation.edges(start, stop, RATE_HZ) for start, stop in itertools.pairwise(cuts)]
     assert np.array_equal(np.concatenate([part.ticks for part in parts]), whole.ticks)
     assert np.array_equal(np.concatenate([part.levels_v for part in parts]), whole.levels_v)

@@ -84,6 +84,12 @@ def test_a_finite_gain_without_pole_gives_the_textbook_error() -> None:
     np.testing.assert_allclose(system.readings(["out"]), [[-10.0 / 1.011, 0.0]], rtol=1e-13)
 
 
+def test_output_resistance_of_an_op_amp_without_pole_costs_loop_gain() -> None:
+    follower = OpAmp("U1", "in", "out", "out", OpAmpModel(avol=1000.0, rout_ohm=100.0))
+    system = piecewise_linear(Circuit([SOURCE, follower, Resistor("RL", "out", "0", 300.0)]))
+    np.testing.assert_allclose(system.readings(["out"]), [[750.0 / 751.0, 0.0]], rtol=1e-13)
+
+
 def test_a_pole_gives_the_closed_loop_bandwidth_and_the_static_gain() -> None:
     system = piecewise_linear(inverter(OpAmpModel(avol=1000.0, gbw_hz=1e6)))
     [[slope, drive, _]] = system.abc
