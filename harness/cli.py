@@ -239,3 +239,7 @@ def _progress_line() -> Progress | None:
             print(f"\r{done} of {asked} samples ({done / asked:.0%})", end=end, file=sys.stderr, flush=True)
 
     return show
+
+
+if __name__ == "__main__":
+    sys.exit(main())

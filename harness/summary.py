@@ -52,7 +52,7 @@ def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:
 
 def _segment_line(segment: SegmentEstimate) -> str:
     cells = [
-        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.4g'):>8}  {segment.truth[name]:<9.5g}"
+        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.5g'):>8}  {segment.truth[name]:<9.5g}"
         for name in UNITS
     ]
     return f"  {segment.start:5}-{segment.end - 1:<6}" + "  ".join(cells)

@@ -1,0 +1,21 @@
+"""Fixtures of the tests of the harness."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from harness.bench import Bench
+from harness.dut import open_dut
+from harness.rig import open_rig
+from harness.scenario import Scenario
+
+
+@pytest.fixture(scope="session")
+def recorded_thesis(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the thesis profile, recorded."""
+    path = tmp_path_factory.mktemp("recorded") / "run.npz"
+    with open_rig("emulator") as rig, open_dut("host") as dut:
+        Bench(rig, dut).play(Scenario.load("thesis"), seed=3).save(path)
+    return path

@@ -1,0 +1,275 @@
+"""The command as users call it: the real executable behind a real pseudo terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.config import locate
+from harness.host_process import PROGRAM
+from harness.run import Run
+
+TIMEOUT_S = 60.0
+ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith("ANALOGRIG_")}
+
+
+def analogrig(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "harness.cli", *map(str, arguments)]
+    environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+    )
+
+
+def run_json(*arguments: str | Path, cwd: Path, status: int = 0) -> dict[str, Any]:
+    done = analogrig(*arguments, "--json", cwd=cwd)
+    assert done.returncode == status, done.stderr
+    out = json.loads(done.stdout)
+    assert isinstance(out, dict)
+    return out
+
+
+def refusal(*arguments: str | Path, cwd: Path, status: int = 2) -> str:
+    """What the command says when it refuses: one line, no traceback."""
+    done = analogrig(*arguments, cwd=cwd)
+    assert done.returncode == status, done.stdout + done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("analogrig: ")
+    return line
+
+
+@pytest.fixture(scope="module")
+def thesis(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder and the JSON of `analogrig run --seed 3`."""
+    folder = tmp_path_factory.mktemp("thesis")
+    return folder, run_json("run", "--seed", "3", "--out", folder / "run", cwd=folder)
+
+
+def test_run_finds_every_tweak_of_the_thesis(thesis: tuple[Path, dict[str, Any]]) -> None:
+    _, out = thesis
+    assert (out["outcome"], out["valid"], out["seed"], out["samples"]) == ("passed", True, 3, 1800)
+    assert [tweak["sample"] for tweak in out["tweaks"]] == [1200, 1400, 1500, 1600]
+    assert [tweak["what"] for tweak in out["tweaks"]] == ["K", "B", "B, K", "M"]
+    assert out["tweaks"][2]["from"] == {"B": 3453.0, "K": 18000.0}
+    assert out["tweaks"][2]["to"] == {"B": 2123.0, "K": 20000.0}
+    assert all(tweak["latency"] >= 1 and tweak["bound"] >= 1 for tweak in out["tweaks"])
+    assert out["false_alarms"] == []
+    assert out["counters"]["updated"] == 1800
+    assert out["counters"]["alarms"] == 4
+
+
+def test_estimates_are_the_plants_within_two_percent(thesis: tuple[Path, dict[str, Any]]) -> None:
+    for segment in thesis[1]["estimates"]:
+        assert segment["estimate"] == pytest.approx(segment["truth"], rel=0.02)
+
+
+def test_run_leaves_a_report_and_a_recording(thesis: tuple[Path, dict[str, Any]]) -> None:
+    _, out = thesis
+    assert Path(out["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert Run.load(Path(out["run"])).theta_hash() == out["theta_hash"]
+
+
+def test_same_seed_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    _, out = thesis
+    assert run_json("run", "--seed", "3", cwd=tmp_path)["theta_hash"] == out["theta_hash"]
+    assert run_json("run", "--seed", "4", cwd=tmp_path)["theta_hash"] != out["theta_hash"]
+
+
+def test_replay_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    _, out = thesis
+    again = run_json("replay", out["run"], cwd=tmp_path)
+    for key in ("theta_hash", "tweaks", "false_alarms", "outcome", "estimates"):
+        assert again[key] == out[key], key
+
+
+def test_table_names_outcome_latencies_and_report(tmp_path: Path) -> None:
+    done = analogrig("run", "--seed", "3", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "PASSED" in done.stdout
+    assert "K 24500 -> 18000 N/m" in done.stdout
+    assert "build/run/report.html" in done.stdout
+    assert done.stderr == ""
+
+
+def test_emulate_writes_volts_and_codes(tmp_path: Path) -> None:
+    out = run_json("emulate", "--seed", "3", "--out", "signals.csv", cwd=tmp_path)
+    lines = (tmp_path / "signals.csv").read_text().splitlines()
+    assert lines[0].split(",")[:3] == ["sample", "force_v", "displacement_v"]
+    assert len(lines) == 1801 == out["samples"] + 1
+    run_json("emulate", "--seed", "3", "--out", "signals.npz", cwd=tmp_path)
+    with np.load(tmp_path / "signals.npz") as file:
+        volts = np.array([line.split(",")[1:5] for line in lines[1:]], float)
+        assert file["volts"] == pytest.approx(volts, abs=1e-6)
+        assert file["codes"].shape == (1800, 4)
+
+
+def test_own_files_work_like_shipped_ones(tmp_path: Path) -> None:
+    for kind, name in (("scenarios", "thesis"), ("rigs", "emulator"), ("devices", "host")):
+        (tmp_path / f"my-{kind}.toml").write_text(locate(kind, name).read_text())  # type: ignore[arg-type]
+    own = ("--scenario", "my-scenarios.toml", "--rig", "my-rigs.toml", "--dut", "my-devices.toml")
+    assert run_json("run", *own, cwd=tmp_path)["theta_hash"] == run_json("run", cwd=tmp_path)["theta_hash"]
+
+
+def test_failed_verdict_has_status_1(tmp_path: Path) -> None:
+    """A ceiling that nothing reaches misses every change."""
+    text = locate("devices", "prediction-error").read_text().replace("ceiling = 12.0", "ceiling = 1.0e6")
+    (tmp_path / "deaf.toml").write_text(text)
+    out = run_json("run", "--dut", "deaf.toml", cwd=tmp_path, status=1)
+    assert out["outcome"] == "failed"
+    assert [tweak["latency"] for tweak in out["tweaks"]] == [None] * 4
+
+
+# ---- what goes wrong
+
+
+def test_unknown_key_is_named_with_its_file(tmp_path: Path) -> None:
+    text = locate("scenarios", "thesis").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("random_phase", "randam_phase"))
+    assert "mine.toml: unknown key 'randam_phase'" in refusal("run", "--scenario", "mine.toml", cwd=tmp_path)
+
+
+def test_unknown_estimator_setting_is_named(tmp_path: Path) -> None:
+    (tmp_path / "dut.toml").write_text(locate("devices", "host").read_text().replace("forgetting", "forgeting"))
+    assert "dut.toml: estimator: unknown key 'forgeting'" in refusal("run", "--dut", "dut.toml", cwd=tmp_path)
+
+
+def test_setting_that_the_device_refuses_is_named(tmp_path: Path) -> None:
+    text = locate("devices", "host").read_text().replace("forgetting = 0.998", "forgetting = 0.2")
+    (tmp_path / "dut.toml").write_text(text)
+    line = refusal("run", "--dut", "dut.toml", cwd=tmp_path)
+    assert "forgetting" in line
+    assert "0.2" in line
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    assert "none.toml: no such file" in refusal("run", "--scenario", "none.toml", cwd=tmp_path)
+    assert "none.toml: no such file" in refusal("run", "--rig", "none.toml", cwd=tmp_path)
+    assert "none.toml: no such file" in refusal("run", "--dut", "none.toml", cwd=tmp_path)
+    assert "none.npz" in refusal("replay", "none.npz", cwd=tmp_path)
+
+
+def test_pot_beyond_its_track_is_named(tmp_path: Path) -> None:
+    text = locate("scenarios", "thesis").read_text().replace("mass_kg = 30.0", "mass_kg = 20.0")
+    (tmp_path / "mine.toml").write_text(text)
+    line = refusal("run", "--scenario", "mine.toml", cwd=tmp_path)
+    assert "pot M" in line
+    assert "20" in line
+
+
+def test_truncated_recording_is_named(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    whole = Path(thesis[1]["run"]).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    assert "cut.npz: truncated" in refusal("replay", "cut.npz", cwd=tmp_path)
+
+
+def test_dead_device_is_named_within_seconds(tmp_path: Path) -> None:
+    """A line on which nobody answers."""
+    ours, theirs = pty.openpty()
+    try:
+        line = refusal("run", "--dut", f"serial:{os.ttyname(theirs)}", cwd=tmp_path)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert os.path.basename("/dev/pts") in line
+    assert "Hello" in line
+
+
+def test_absent_serial_port_is_named(tmp_path: Path) -> None:
+    assert "/dev/ttyNOWHERE" in refusal("run", "--dut", "serial:/dev/ttyNOWHERE", cwd=tmp_path)
+
+
+@contextmanager
+def device(*arguments: str) -> Iterator[str]:
+    """The executable started by hand, as one would on a bench; yields the path that it prints."""
+    with subprocess.Popen([PROGRAM, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+        process.kill()
+
+
+def test_device_started_by_hand_is_reached_by_its_path(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    with device() as path:
+        out = run_json("run", "--seed", "3", "--dut", f"serial:{path}", cwd=tmp_path)
+    assert out["theta_hash"] == thesis[1]["theta_hash"]
+
+
+def test_device_with_another_catalogue_is_refused_by_name(tmp_path: Path) -> None:
+    with device("--catalogue-hash", "deadbeef") as path:
+        assert "catalogue" in (line := refusal("run", "--dut", f"serial:{path}", cwd=tmp_path))
+    assert "deadbeef" in line.lower()
+
+
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@contextmanager
+def long_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """`analogrig run` in the middle of two million samples, and the pid of its device."""
+    text = locate("scenarios", "healthy").read_text().replace("samples = 20000", "samples = 2000000")
+    (folder / "long.toml").write_text(text)
+    command = [sys.executable, "-m", "harness.cli", "run", "--scenario", "long.toml"]
+    environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
+    with subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while True:
+            assert time.monotonic() < deadline_s
+            pids = children(process.pid)
+            # A quarter of a second of the device's own time: it is well into the samples.
+            if pids and int(Path(f"/proc/{pids[0]}/stat").read_text().split()[13]) >= 2:
+                break
+            time.sleep(0.01)
+        yield process, pids[0]
+        process.kill()
+
+
+def test_device_that_dies_in_the_run_makes_it_inconclusive(tmp_path: Path) -> None:
+    with long_run(tmp_path) as (process, device_pid):
+        os.kill(device_pid, signal.SIGKILL)
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 3
+    (line,) = errors.splitlines()
+    assert line.startswith("analogrig: INCONCLUSIVE: ")
+    assert "-9" in line
+    run = Run.load(tmp_path / "build" / "run" / "run.npz")
+    assert 0 < run.samples < 2_000_000
+    assert run.conditions.faults
+
+
+def test_interrupted_run_keeps_what_it_has(tmp_path: Path) -> None:
+    with long_run(tmp_path) as (process, _):
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 130, errors
+    assert "INCONCLUSIVE" in out
+    assert "Traceback" not in errors
+    assert 0 < Run.load(tmp_path / "build" / "run" / "run.npz").samples < 2_000_000
+
+
+def test_killed_harness_leaves_no_device_behind(tmp_path: Path) -> None:
+    with long_run(tmp_path) as (process, device_pid):
+        process.kill()
+        process.wait()
+        deadline_s = time.monotonic() + 5.0
+        while Path(f"/proc/{device_pid}").exists() and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+        assert not Path(f"/proc/{device_pid}").exists()
+
+
+def test_wrong_option_is_a_usage_error(tmp_path: Path) -> None:
+    for arguments in (["run", "--sede", "3"], ["run", "--seed", "-1"], ["run", "--seed", "x"], [], ["fly"]):
+        assert analogrig(*arguments, cwd=tmp_path).returncode == 2

@@ -1,0 +1,70 @@
+"""Detection over many seeds: the emulated computer and card, the C estimator in this process, the shipped settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.bench import Bench
+from harness.dut import DeviceDescription, connect, open_dut
+from harness.rig import open_rig
+from harness.scenario import Scenario
+from harness.verdict import Verdict, judge
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What came of r runs of a scenario with t tweaks."""
+
+    latencies_n: NDArray[np.float64]
+    """(r, t) samples; NaN where there was no alarm."""
+    bounds_n: NDArray[np.float64]
+    """(r, t) samples; NaN where the change could not be seen."""
+    missed: int
+    false_alarms: int
+    inconclusive: int
+    runs: int
+
+    def ratios(self) -> NDArray[np.float64]:
+        """(t,) mean latency over mean bound, where both exist."""
+        both = np.isfinite(self.latencies_n) & np.isfinite(self.bounds_n)
+        latency, bound = (np.where(both, x, 0.0).sum(axis=0) for x in (self.latencies_n, self.bounds_n))
+        return np.asarray(latency / bound)
+
+    def ratio_errors(self) -> NDArray[np.float64]:
+        """(t,) standard error of each ratio, by the delta method."""
+        means = np.nanmean(self.bounds_n, axis=0)
+        residuals = self.latencies_n - self.ratios() * self.bounds_n
+        return np.asarray(np.nanstd(residuals, axis=0, ddof=1) / np.sqrt(self.runs) / means)
+
+
+def shipped_device_in_process() -> DeviceDescription:
+    """The settings of the device `host`, in this process: the same C and the same messages, without a pseudo terminal."""
+    with open_dut("host") as dut:
+        table = dict(dut.description())
+    with open_dut("inproc") as dut:
+        assert dut.description()["estimator"] == table["estimator"]
+    return DeviceDescription(name="inproc", kind="inproc", exchange="block")
+
+
+def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection:
+    """Play a shipped scenario on a shipped rig once for each seed."""
+    scenario = Scenario.load(scenario_name)
+    with open_rig(rig_name) as rig, connect(shipped_device_in_process()) as dut:
+        bench = Bench(rig, dut)
+        verdicts = [judge(bench.play(scenario, seed)) for seed in seeds]
+    return Detection(
+        latencies_n=_table(verdicts, "latency_n"),
+        bounds_n=_table(verdicts, "bound_n"),
+        missed=sum(tweak.missed for verdict in verdicts for tweak in verdict.tweaks),
+        false_alarms=sum(len(verdict.false_alarms) for verdict in verdicts),
+        inconclusive=sum(not verdict.valid for verdict in verdicts),
+        runs=len(verdicts),
+    )
+
+
+def _table(verdicts: list[Verdict], what: str) -> NDArray[np.float64]:
+    return np.array([[getattr(tweak, what) for tweak in verdict.tweaks] for verdict in verdicts], dtype=np.float64)
