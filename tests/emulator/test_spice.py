@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from emulator import (
+    FRONT,
+    SHOCK,
     TICKS_PER_SAMPLE,
+    Circuit,
     CircuitError,
     Engine,
     Excitation,
+    OpAmpModel,
     SuspensionComputer,
     SuspensionParts,
     piecewise_linear,
@@ -77,6 +82,62 @@ def test_slewing_and_clamping_amplifiers_agree_with_ngspice(ngspice: NgSpice) ->
     volts = every_amplifier(computer, excitation, 300)
     assert np.abs(volts[:, 0]).max() > 13.3
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_machines_agree_with_ngspice_at_every_amplifier(ngspice: NgSpice, seed: int) -> None:
+    """Parts, op-amps, pots turned, edges at any instant: all drawn."""
+    rng = np.random.default_rng(seed)
+    computer = random_machine(rng)
+    excitation = random_excitation(rng)
+    samples = 200
+    instants = np.sort(rng.choice(samples - 10, 3, replace=False)).tolist()
+    turns = [(int(instant), {str(rng.choice(["M", "B", "K"])): rng.uniform(0.1, 1.0)}) for instant in instants]
+    edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)
+    deck = to_spice(computer.circuit, samples=samples, edges={"F": edges}, turns=turns)
+    reference = ngspice(deck, AMPLIFIERS, samples)
+    volts = played_with_turns(computer.circuit, excitation, samples, turns)
+    # At ngspice's first time point, 10 ps late, the fastest of these amplifiers has moved by 0.1 LSB.
+    assert np.abs(volts - reference)[1:].max() < 0.05 * LSB_V
+
+
+def random_machine(rng: np.random.Generator) -> SuspensionComputer:
+    program = (FRONT, SHOCK)[rng.integers(2)]
+    values = {name: value * rng.uniform(0.7, 1.4) for name, value in asdict(program.parts).items()}
+    model = OpAmpModel(
+        avol=10 ** rng.uniform(4, 6),
+        gbw_hz=10 ** rng.uniform(5.7, 7.3),
+        slew_v_per_s=10 ** rng.uniform(5.5, 7.5),
+        swing_v=(-rng.uniform(8, 14), rng.uniform(8, 14)),
+        rout_ohm=rng.uniform(10, 300),
+    )
+    # Pots are set from the program's nominal parts, whatever these are.
+    parts = replace(SuspensionParts(**values), pot_m_ohm=10e3, pot_b_ohm=10e3, pot_k_ohm=10e3)
+    return SuspensionComputer(program, opamp=model, parts=parts, rng=rng, offset_v=5e-3)
+
+
+def random_excitation(rng: np.random.Generator) -> Excitation:
+    return Excitation(
+        shape=str(rng.choice(["square", "prbs"])),
+        low_v=rng.uniform(-10, 0),
+        high_v=rng.uniform(0, 10),
+        frequency_hz=rng.uniform(100, 900),
+        clock="free",
+        phase=rng.uniform(),
+    )
+
+
+def played_with_turns(
+    circuit: Circuit, excitation: Excitation, samples: int, turns: Sequence[tuple[int, Mapping[str, float]]]
+) -> Volts:
+    engine = Engine(piecewise_linear(circuit), AMPLIFIERS)
+    blocks = []
+    for sample, dials in [*turns, (samples - 1, {})]:
+        count = sample + 1 - engine.recorded
+        blocks.append(engine.run(count, {"F": excitation.edges(*engine.window(count), SAMPLE_RATE_HZ)}))
+        circuit = circuit.with_dials(dials)
+        engine.set_system(piecewise_linear(circuit))
+    return np.concatenate(blocks)
 
 
 def test_ideal_amplifiers_can_be_exported(ngspice: NgSpice) -> None:
