@@ -25,8 +25,8 @@ from pathlib import Path
 import cantools
 from cantools.database.can import Database, Message
 from cantools.database.can.c_source import camel_to_snake_case, generate
-from cantools.database.conversion import BaseConversion
 from cantools.database.can.signal import Signal
+from cantools.database.conversion import BaseConversion
 
 CATALOGUE = Path(__file__).with_name("analogrig.dbc")
 NAME = "analogrig"
@@ -90,7 +90,7 @@ def reproducible(generated: str) -> str:
     return text
 
 
-# ---------------------------------------------  the rules of the catalogue  ---------------------------------------------
+# --------------------------------------------  the rules of the catalogue  -------------------------------------------
 
 
 def check(database: Database) -> None:
@@ -201,7 +201,7 @@ def meaning_of(signal: Signal) -> list[object]:
     ]
 
 
-# ---------------------------------------------               C               ---------------------------------------------
+# ----------------------------------------------------  C  ------------------------------------------------------------
 
 
 def c_header(database: Database) -> str:
@@ -310,7 +310,7 @@ def c_cases(messages: Iterable[Message]) -> str:
     return "".join(f"    case 0x{message.frame_id:02x}U:  // {message.name}\n" for message in messages)
 
 
-# ---------------------------------------------            Python            ---------------------------------------------
+# --------------------------------------------------  Python  ---------------------------------------------------------
 
 
 def python_tables(database: Database) -> str:

@@ -57,7 +57,7 @@ static void put_firmware(device_t* const self, answer_t* const answer, const uin
 
 static void put_estimate(device_t* const self, answer_t* const answer, const uint8_t element, const float value) {
     const struct analogrig_estimate_t message = {
-        .seq = self->seq, .element = element, .index = self->next_index, .value = value
+        .seq = self->seq, .element = element, .sample_index = self->next_index, .value = value
     };
     uint8_t payload[PAYLOAD_MAX];
     (void)analogrig_estimate_pack(payload, &message, sizeof(payload));
@@ -65,22 +65,22 @@ static void put_estimate(device_t* const self, answer_t* const answer, const uin
 }
 
 static void put_alarm(device_t* const self, answer_t* const answer, const float statistic) {
-    const struct analogrig_alarm_t message = { .seq       = self->seq,
-                                               .trigger   = (uint8_t)self->config.trigger.kind,
-                                               .index     = self->next_index,
-                                               .statistic = statistic };
+    const struct analogrig_alarm_t message = { .seq          = self->seq,
+                                               .trigger      = (uint8_t)self->config.trigger.kind,
+                                               .sample_index = self->next_index,
+                                               .statistic    = statistic };
     uint8_t                        payload[PAYLOAD_MAX];
     (void)analogrig_alarm_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_ALARM_FRAME_ID, payload);
 }
 
 static void put_stepped(device_t* const self, answer_t* const answer, const est_step_t* step, const bool restarted) {
-    const struct analogrig_stepped_t message = { .seq       = self->seq,
-                                                 .missing   = (step->status == EST_MISSING) ? 1U : 0U,
-                                                 .refused   = (step->status == EST_REFUSED) ? 1U : 0U,
-                                                 .restarted = restarted ? 1U : 0U,
-                                                 .index     = self->next_index,
-                                                 .statistic = step->statistic };
+    const struct analogrig_stepped_t message = { .seq          = self->seq,
+                                                 .missing      = (step->status == EST_MISSING) ? 1U : 0U,
+                                                 .refused      = (step->status == EST_REFUSED) ? 1U : 0U,
+                                                 .restarted    = restarted ? 1U : 0U,
+                                                 .sample_index = self->next_index,
+                                                 .statistic    = step->statistic };
     uint8_t                          payload[PAYLOAD_MAX];
     (void)analogrig_stepped_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_STEPPED_FRAME_ID, payload);
@@ -140,20 +140,20 @@ static void on_sample(device_t* const self, answer_t* const answer, const uint8_
     const est_sample_t sample = { .u     = (float)message.force,
                                   .y     = (float)message.displacement,
                                   .valid = message.missing == 0U };
-    enter_sample(self, answer, message.index, sample);
+    enter_sample(self, answer, message.sample_index, sample);
 }
 
 static void on_sample_block(device_t* const self, const uint8_t* const payload) {
     struct analogrig_sample_block_t block;
     (void)analogrig_sample_block_unpack(&block, payload, ANALOGRIG_SAMPLE_BLOCK_LENGTH);
-    if (!self->running || (block.count < 1U) || (block.count > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
+    if (!self->running || (block.samples < 1U) || (block.samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
         add(&self->counters.messages_refused, 1U);
         return;
     }
     self->job         = DEVICE_STEPPING;
     self->job_next    = 0U;
-    self->job_count   = block.count;
-    self->job_index   = block.index;
+    self->job_count   = block.samples;
+    self->job_index   = block.sample_index;
     self->job_missing = block.missing;
 }
 

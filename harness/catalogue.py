@@ -1,0 +1,251 @@
+"""The messages of the catalogue as types, and how they are packed.
+
+The catalogue itself is estimator_c/catalogue/analogrig.dbc, which says what each message means; its layouts come from
+the generated tables. A *packet* is what any link carries: the byte of the identifier, then the payload.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from struct import Struct
+from typing import Any, NamedTuple, TypeAlias
+
+from harness._catalogue import (
+    CATALOGUE_HASH,
+    LAYOUTS,
+    Command,
+    Counter,
+    Element,
+    FirmwareId,
+    Key,
+    Layout,
+    Result,
+    SampleFlag,
+    SteppedFlag,
+    Trigger,
+)
+
+__all__ = [
+    "BLOCK_SAMPLES",
+    "CATALOGUE_HASH",
+    "LAYOUTS",
+    "Alarm",
+    "Command",
+    "Configure",
+    "Configured",
+    "Control",
+    "Controlled",
+    "Counter",
+    "Element",
+    "Estimate",
+    "Firmware",
+    "FirmwareId",
+    "Hello",
+    "Identify",
+    "Key",
+    "Message",
+    "Result",
+    "Sample",
+    "SampleBlock",
+    "SampleFlag",
+    "Status",
+    "Stepped",
+    "SteppedFlag",
+    "Trigger",
+    "pack",
+    "unpack",
+]
+
+BLOCK_SAMPLES = 14
+"""The most samples of one SampleBlock."""
+
+
+class Identify(NamedTuple):
+    """Harness: asks who is there."""
+
+    seq: int
+
+
+class Hello(NamedTuple):
+    """Device: the catalogue that it speaks."""
+
+    seq: int
+    theta_max: int
+    answers: int
+    catalogue_hash: int
+
+
+class Firmware(NamedTuple):
+    """Device: what it is, and since which boot."""
+
+    seq: int
+    firmware_id: int
+    answers: int
+    boot_nonce: int
+
+
+class Control(NamedTuple):
+    """Harness: a command."""
+
+    seq: int
+    command: int
+    argument: int
+
+
+class Controlled(NamedTuple):
+    """Device: what became of a command."""
+
+    seq: int
+    command: int
+    answers: int
+    result: int
+    argument: int
+
+
+class Configure(NamedTuple):
+    """Harness: set one field of the configuration."""
+
+    seq: int
+    key: int
+    value: float
+
+
+class Configured(NamedTuple):
+    """Device: what is set now."""
+
+    seq: int
+    key: int
+    answers: int
+    result: int
+    value: float
+
+
+class Sample(NamedTuple):
+    """Harness: one pair of codes."""
+
+    seq: int
+    flags: int
+    sample_index: int
+    force: int
+    displacement: int
+
+
+class SampleBlock(NamedTuple):
+    """Harness: up to BLOCK_SAMPLES consecutive pairs of codes."""
+
+    seq: int
+    samples: int
+    sample_index: int
+    missing: int
+    """Bit i: sample i."""
+    codes: tuple[int, ...]
+    """Force and displacement in turn, 2 * BLOCK_SAMPLES of them."""
+
+
+class Estimate(NamedTuple):
+    """Device: one element of the estimate after a sample."""
+
+    seq: int
+    element: int
+    sample_index: int
+    value: float
+
+
+class Stepped(NamedTuple):
+    """Device: the sample has been entered; the last message about it."""
+
+    seq: int
+    flags: int
+    sample_index: int
+    statistic: float
+
+
+class Alarm(NamedTuple):
+    """Device: the plant has changed."""
+
+    seq: int
+    trigger: int
+    sample_index: int
+    statistic: float
+
+
+class Status(NamedTuple):
+    """Device: one counter."""
+
+    seq: int
+    counter: int
+    answers: int
+    value: int
+
+
+Message: TypeAlias = (
+    Identify
+    | Hello
+    | Firmware
+    | Control
+    | Controlled
+    | Configure
+    | Configured
+    | Sample
+    | SampleBlock
+    | Estimate
+    | Stepped
+    | Alarm
+    | Status
+)
+
+
+class _Packing(NamedTuple):
+    """How messages of one type are packed."""
+
+    identifier: bytes
+    length: int
+    pack: Callable[..., bytes]
+    unpack: Callable[[bytes, int], tuple[Any, ...]]
+    make: Callable[[tuple[Any, ...]], Message]
+
+
+def pack(message: Message) -> bytes:
+    """The packet of a message.
+
+    :raises struct.error: a value is out of the range of its field.
+    """
+    packing = _BY_TYPE[type(message)]
+    return packing.identifier + packing.pack(*message)
+
+
+def unpack(packet: bytes) -> Message | None:
+    """The message in a packet; None if the catalogue has no such message of that length."""
+    packing = _BY_IDENTIFIER.get(packet[0]) if packet else None
+    if packing is None or len(packet) != packing.length:
+        return None
+    return packing.make(packing.unpack(packet, 1))
+
+
+def _packing(message_type: Any) -> _Packing:
+    layout = LAYOUTS[message_type.__name__]
+    if message_type is SampleBlock:
+        return _block_packing(layout)
+    if message_type._fields != layout.fields:
+        raise TypeError(f"{message_type.__name__} has the fields {message_type._fields}, the catalogue {layout.fields}")
+    struct = Struct(layout.format)
+    return _Packing(bytes([layout.id]), 1 + layout.length, struct.pack, struct.unpack_from, message_type._make)
+
+
+def _block_packing(layout: Layout) -> _Packing:
+    """As the catalogue has it, except that the codes are one field."""
+    codes = tuple(f"{signal}{i}" for i in range(BLOCK_SAMPLES) for signal in ("force", "displacement"))
+    if layout.fields != (*SampleBlock._fields[:-1], *codes):
+        raise TypeError(f"SampleBlock differs from the catalogue, which has the fields {layout.fields}")
+    struct = Struct(layout.format)
+    return _Packing(
+        identifier=bytes([layout.id]),
+        length=1 + layout.length,
+        pack=lambda *fields: struct.pack(*fields[:4], *fields[4]),
+        unpack=struct.unpack_from,
+        make=lambda values: SampleBlock(values[0], values[1], values[2], values[3], values[4:]),
+    )
+
+
+_BY_TYPE = {message_type: _packing(message_type) for message_type in Message.__args__}
+_BY_IDENTIFIER = {packing.identifier[0]: packing for packing in _BY_TYPE.values()}

@@ -1,0 +1,102 @@
+"""Questions and answers over a link.
+
+Both sides number their messages, so that a message which was lost or repeated on the way does not go unnoticed; and
+each answer says which message it answers.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TypeVar
+
+from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status
+from harness.errors import LinkError, LinkTimeout
+from harness.link import Clock, Link
+
+_SEQ = 256
+"""Sequence numbers are modulo this."""
+
+Answer = TypeVar("Answer", Hello, Firmware, Controlled, Configured, Status)
+
+
+class Conversation:
+    """What the harness and one device say to each other. Errors lead with the device's name."""
+
+    def __init__(self, link: Link, name: str, timeout_s: float, clock: Clock = time.monotonic) -> None:
+        """Over ``link``, with the device ``name``; ``timeout_s`` is for all the answers to one message."""
+        self.link = link
+        self.name = name
+        self.timeout_s = timeout_s
+        self.clock = clock
+        self._seq = 0
+        self._expected: int | None = None
+        self._last: Message | None = None
+
+    @property
+    def last(self) -> str:
+        """The last message of the device, in a word or two."""
+        return "none" if self._last is None else _brief(self._last)
+
+    def begin(self) -> None:
+        """Whatever number the device's next message has, it is the right one."""
+        self._expected = None
+
+    def next_seq(self) -> int:
+        """The number of the next message to the device."""
+        seq = self._seq
+        self._seq = (seq + 1) % _SEQ
+        return seq
+
+    def send(self, message: Message) -> float:
+        """Send, and return when the last of the answers is due, on the clock."""
+        self.link.send([message])
+        return self.clock() + self.timeout_s
+
+    def receive(self, deadline_s: float) -> Message | None:
+        """The next message of the device, or None if none comes in time. One that is repeated is passed over.
+
+        :raises LinkError: messages before it were lost.
+        """
+        while True:
+            message = self.link.receive(deadline_s - self.clock())
+            if message is None:
+                return None
+            expected = self._expected
+            self._expected = (message.seq + 1) % _SEQ
+            if expected is None or message.seq == expected:
+                self._last = message
+                return message
+            if message.seq != (expected - 1) % _SEQ:
+                lost = (message.seq - expected) % _SEQ
+                raise LinkError(
+                    f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
+                    f" ({self.link.dropped} frames were damaged)"
+                )
+
+    def ask(self, request: Message, kind: type[Answer]) -> Answer:
+        """Send ``request`` and return its answer.
+
+        :raises LinkTimeout: none came in time.
+        """
+        return self.answer(request, kind, self.send(request))
+
+    def answer(self, request: Message, kind: type[Answer], deadline_s: float) -> Answer:
+        """The next answer to ``request``. What an earlier run that ended badly has left in the line is passed over.
+
+        :raises LinkTimeout: none came in time.
+        """
+        while True:
+            message = self.receive(deadline_s)
+            if message is None:
+                raise LinkTimeout(
+                    f"device {self.name}: no {kind.__name__} in answer to {type(request).__name__}"
+                    f" within {self.timeout_s:g} s (last message: {self.last})"
+                )
+            if isinstance(message, kind) and message.answers == request.seq:
+                return message
+
+
+def _brief(message: Message) -> str:
+    """The type of a message, and its sample if it is about one."""
+    index = getattr(message, "sample_index", None)
+    return type(message).__name__ if not isinstance(index, int) else f"{type(message).__name__} {index}"

@@ -1,0 +1,97 @@
+"""The settings of the estimator in the device: est_config_t of estimator_c/core/est.h, as a user writes them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from harness.catalogue import Key, Trigger
+
+TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
+ResetName = Literal["covariance", "all"]
+
+_RESETS: tuple[ResetName, ...] = ("covariance", "all")
+"""In the order of est_reset_t."""
+
+DEFAULT_ARL0 = 1e5
+
+_FLOAT32_MAX = 3.4e38
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """What is fixed before a run; the defaults are those of est_config_default().
+
+    P is in units of the noise variance. The device itself has the last word on what is in range.
+    """
+
+    na: int = 2
+    nb: int = 3
+    nk: int = 0
+    offset: bool = True
+    forgetting: float = 0.998
+    p0: float = 10.0
+    p0_offset: float = 1.0e6
+    """codes^2"""
+    noise_variance: float = 1.2
+    """codes^2"""
+    c: tuple[float, ...] = (-1.6, 0.64)
+    """Prefilter C = 1 + c[0] z^-1 + ...; what is not given is zero."""
+    edge_codes: float = 64.0
+    trigger: TriggerName = "cusum"
+    ceiling: float | None = None
+    """Codes; ln(ARL0) for ``cusum``, where ``arl0`` may be given instead."""
+    arl0: float | None = None
+    """Mean samples between false alarms; for ``cusum``."""
+    hold_off_n: int = 0
+    warm_up_n: int = 0
+    absolute: bool = False
+    reset: ResetName = "covariance"
+
+    def __post_init__(self) -> None:
+        if len(self.c) > self.na:
+            raise ValueError(f"c must have at most na = {self.na} elements, not {len(self.c)}")
+        if self.arl0 is not None and (self.trigger != "cusum" or self.ceiling is not None):
+            raise ValueError("arl0 goes with the trigger 'cusum' and without a ceiling")
+        if self.arl0 is not None and not self.arl0 > 1.0:
+            raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
+        if self.ceiling is None and self.trigger in ("prediction-error", "mean-between-faults"):
+            raise ValueError(f"the trigger {self.trigger!r} needs a ceiling")
+        if self.ceiling is not None and self.trigger == "none":
+            raise ValueError("the trigger 'none' has no ceiling")
+        for key, value in self.settings():
+            if not abs(value) <= _FLOAT32_MAX:
+                raise ValueError(f"{key.name.lower()} must be a number that float32 can hold, not {value:g}")
+
+    @property
+    def parameters(self) -> int:
+        """The number of elements of theta."""
+        return self.na + self.nb + self.offset
+
+    @property
+    def statistic_ceiling(self) -> float | None:
+        """Where the trigger's statistic raises an alarm; None without a trigger."""
+        if self.trigger == "cusum" and self.ceiling is None:
+            return math.log(DEFAULT_ARL0 if self.arl0 is None else self.arl0)
+        return self.ceiling
+
+    def settings(self) -> Iterator[tuple[Key, float]]:
+        """Every key of the device with its value, in an order in which each is in range if all are."""
+        for name in ("na", "nb", "nk", "offset", "forgetting", "p0", "p0_offset", "noise_variance", "edge_codes"):
+            yield Key[name.upper()], float(getattr(self, name))
+        for i in range(self.na):
+            yield Key[f"C{i + 1}"], self.c[i] if i < len(self.c) else 0.0
+        yield Key.TRIGGER, float(Trigger[self.trigger.replace("-", "_").upper()])
+        if self.statistic_ceiling is not None:
+            yield Key.CEILING, self.statistic_ceiling
+        for name in ("hold_off_n", "warm_up_n", "absolute"):
+            yield Key[name.upper()], float(getattr(self, name))
+        yield Key.RESET, float(_RESETS.index(self.reset))
+
+    def as_table(self) -> dict[str, Any]:
+        """In plain values, from which the same can be made; the ceiling instead of arl0."""
+        table = dataclasses.asdict(self) | {"c": list(self.c), "ceiling": self.statistic_ceiling, "arl0": None}
+        return {key: value for key, value in table.items() if value is not None}

@@ -1,0 +1,91 @@
+"""The device as a process of this computer, behind a pseudo-terminal: a link that owns its other end."""
+
+from __future__ import annotations
+
+import select
+import subprocess
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from harness.catalogue import Message
+from harness.errors import LinkClosed, LinkError
+from harness.link import SerialLink
+
+PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
+
+START_TIMEOUT_S = 5.0
+END_TIMEOUT_S = 2.0
+
+
+class HostProcess:
+    """Starts the host port and links to it. The process ends with the link, and when this process dies."""
+
+    name = "pty"
+
+    def __init__(self, arguments: Sequence[str] = (), *, program: Path = PROGRAM) -> None:
+        """Start it.
+
+        :raises LinkError: it cannot be started, or does not say where it listens.
+        """
+        try:
+            self._process = subprocess.Popen(
+                [str(program), *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
+            )
+        except OSError as error:
+            raise LinkError(f"cannot start {program}: {error.strerror}; run `make setup`") from error
+        try:
+            self._link = SerialLink(self._terminal(), name=self.name)
+        except BaseException:
+            self._end()
+            raise
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def dropped(self) -> int:
+        return self._link.dropped
+
+    def send(self, messages: Iterable[Message]) -> None:
+        try:
+            self._link.send(messages)
+        except LinkClosed as error:
+            raise LinkClosed(self._obituary()) from error
+
+    def receive(self, timeout_s: float) -> Message | None:
+        try:
+            return self._link.receive(timeout_s)
+        except LinkClosed as error:
+            raise LinkClosed(self._obituary()) from error
+
+    def close(self) -> None:
+        self._link.close()
+        self._end()
+
+    def _terminal(self) -> str:
+        """The path that the process prints first."""
+        stdout = self._process.stdout
+        if stdout is None or not select.select([stdout], [], [], START_TIMEOUT_S)[0]:
+            raise LinkError(f"the device process said nothing within {START_TIMEOUT_S} s of its start")
+        path = stdout.readline().decode(errors="replace").strip()
+        if not path:
+            raise LinkClosed(self._obituary())
+        return path
+
+    def _obituary(self) -> str:
+        try:
+            return f"the device process ended with status {self._process.wait(END_TIMEOUT_S)}"
+        except subprocess.TimeoutExpired:
+            return f"the device process {self.pid} closed its terminal"
+
+    def _end(self) -> None:
+        """The end of its input is the end of the process; if it does not see it, it is killed."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        try:
+            self._process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
