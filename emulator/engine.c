@@ -76,11 +76,11 @@ enum judgement { CLEAR, NEAR, CROSSED };
 /* ---- matrices
  * ---------------------------------------------------------------------------------------------------------------- */
 
-static void to_panels(int rows, int columns, const double *matrix, double *panels)
+static void to_panels(int rows, int columns, int stride, const double *matrix, double *panels)
 {
     for (int i = 0; i < PADDED(rows); i++) {
         for (int j = 0; j < columns; j++) {
-            panels[((i / PANEL) * columns + j) * PANEL + i % PANEL] = i < rows ? matrix[i * columns + j] : 0.0;
+            panels[((i / PANEL) * columns + j) * PANEL + i % PANEL] = i < rows ? matrix[i * stride + j] : 0.0;
         }
     }
 }
@@ -105,43 +105,52 @@ static void product(int rows, int columns, const double *panels, const double *z
     }
 }
 
-/* out = left[:, :n] right, with left and right n x columns: the product of two affine maps without their constant rows.
- * */
-static void compose(int n, int columns, const double *left, const double *right, double *out)
+/* While a ladder is built, its matrices are row-major with rows padded by zeros to whole panels. */
+#define MAX_STRIDE PADDED(MAX_COLUMNS)
+#define MAX_ELEMENTS (ENGINE_MAX_STATES * MAX_STRIDE)
+
+/* out = left[:, :n] right, with left and right n x stride: the product of two affine maps without their constant rows. */
+static void compose(int n, int stride, const double *left, const double *right, double *out)
 {
     for (int i = 0; i < n; i++) {
-        double row[MAX_COLUMNS] = {0.0};
-        for (int k = 0; k < n; k++) {
-            const double factor = left[i * columns + k];
-            for (int j = 0; j < columns; j++) {
-                row[j] += factor * right[k * columns + j];
+        for (int j = 0; j < stride; j += PANEL) {
+            double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0;
+            for (int k = 0; k < n; k++) {
+                const double factor = left[i * stride + k];
+                const double *element = &right[k * stride + j];
+                s0 += factor * element[0];
+                s1 += factor * element[1];
+                s2 += factor * element[2];
+                s3 += factor * element[3];
             }
+            out[i * stride + j] = s0;
+            out[i * stride + j + 1] = s1;
+            out[i * stride + j + 2] = s2;
+            out[i * stride + j + 3] = s3;
         }
-        memcpy(&out[i * columns], row, (size_t)columns * sizeof row[0]);
     }
 }
 
-/* f <- exp(2 t) - I from f = exp(t) - I: 2 f + f f. Kept as a difference from I, slow states lose no digits at short
- * steps. */
-static void square(int n, int columns, double *f)
+/* f <- exp(2 t) - I from f = exp(t) - I: 2 f + f f. Kept as a difference from I, slow states lose no digits. */
+static void square(int n, int stride, double *f)
 {
-    double ff[ENGINE_MAX_STATES * MAX_COLUMNS];
-    compose(n, columns, f, f, ff);
-    for (int i = 0; i < n * columns; i++) {
+    double ff[MAX_ELEMENTS];
+    compose(n, stride, f, f, ff);
+    for (int i = 0; i < n * stride; i++) {
         f[i] = 2.0 * f[i] + ff[i];
     }
 }
 
 /* f = exp(a) - I for small a, by its Taylor series. */
-static void taylor(int n, int columns, const double *a, double *f)
+static void taylor(int n, int stride, const double *a, double *f)
 {
-    double term[ENGINE_MAX_STATES * MAX_COLUMNS];
-    double next[ENGINE_MAX_STATES * MAX_COLUMNS];
-    memcpy(term, a, (size_t)(n * columns) * sizeof term[0]);
-    memcpy(f, a, (size_t)(n * columns) * sizeof f[0]);
+    double term[MAX_ELEMENTS];
+    double next[MAX_ELEMENTS];
+    memcpy(term, a, (size_t)(n * stride) * sizeof term[0]);
+    memcpy(f, a, (size_t)(n * stride) * sizeof f[0]);
     for (int k = 2; k <= TAYLOR_TERMS; k++) {
-        compose(n, columns, a, term, next);
-        for (int i = 0; i < n * columns; i++) {
+        compose(n, stride, a, term, next);
+        for (int i = 0; i < n * stride; i++) {
             term[i] = next[i] / (double)k;
             f[i] += term[i];
         }
@@ -149,13 +158,13 @@ static void taylor(int n, int columns, const double *a, double *f)
 }
 
 /* Largest absolute row sum of the first n columns. */
-static double norm(int n, int columns, const double *a)
+static double norm(int n, int stride, const double *a)
 {
     double largest = 0.0;
     for (int i = 0; i < n; i++) {
         double sum = 0.0;
         for (int j = 0; j < n; j++) {
-            sum += fabs(a[i * columns + j]);
+            sum += fabs(a[i * stride + j]);
         }
         largest = sum > largest ? sum : largest;
     }
@@ -169,47 +178,51 @@ static double norm(int n, int columns, const double *a)
 /* [A B c] + G phi'([C D e]) for the given pieces. */
 static void affine_map(const engine *self, const unsigned char *piece, double *a)
 {
-    const int n = self->states, q = self->kinks, columns = self->columns;
-    memcpy(a, self->abc, (size_t)(n * columns) * sizeof a[0]);
+    const int n = self->states, q = self->kinks, columns = self->columns, stride = PADDED(columns);
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < stride; j++) {
+            a[i * stride + j] = j < columns ? self->abc[i * columns + j] : 0.0;
+        }
+    }
     for (int k = 0; k < q; k++) {
         const double slope = self->kink[k].slope[piece[k]];
         const double intercept = self->kink[k].intercept[piece[k]];
         for (int i = 0; i < n; i++) {
             const double gain = self->g[i * q + k];
             for (int j = 0; j < columns; j++) {
-                a[i * columns + j] += gain * (slope * self->cde[k * columns + j]);
+                a[i * stride + j] += gain * (slope * self->cde[k * columns + j]);
             }
-            a[i * columns + columns - 1] += gain * intercept;
+            a[i * stride + columns - 1] += gain * intercept;
         }
     }
 }
 
 static enum engine_status build_ladder(const engine *self, const unsigned char *piece, double *ladder)
 {
-    const int n = self->states, columns = self->columns;
-    double a[ENGINE_MAX_STATES * MAX_COLUMNS];
-    double f[ENGINE_MAX_STATES * MAX_COLUMNS];
+    const int n = self->states, columns = self->columns, stride = PADDED(columns);
+    double a[MAX_ELEMENTS];
+    double f[MAX_ELEMENTS];
     double step_s = self->tick_s;
     int halvings = 0;
 
     affine_map(self, piece, a);
-    const double rate = norm(n, columns, a);
+    const double rate = norm(n, stride, a);
     while (!(rate * step_s <= TAYLOR_NORM)) {
         if (++halvings > MAX_HALVINGS) {
             return ENGINE_TOO_STIFF;
         }
         step_s *= 0.5;
     }
-    for (int i = 0; i < n * columns; i++) {
+    for (int i = 0; i < n * stride; i++) {
         a[i] *= step_s;
     }
-    taylor(n, columns, a, f);
+    taylor(n, stride, a, f);
     while (halvings-- > 0) {
-        square(n, columns, f);
+        square(n, stride, f);
     }
     for (int level = 0; level < ENGINE_LEVELS; level++) {
-        to_panels(n, columns, f, &ladder[level * PANEL_ELEMENTS(n, columns)]);
-        square(n, columns, f);
+        to_panels(n, columns, stride, f, &ladder[level * PANEL_ELEMENTS(n, columns)]);
+        square(n, stride, f);
     }
     return ENGINE_OK;
 }
@@ -461,7 +474,7 @@ enum engine_status engine_set_system(
     changed |= replace(self->cde, cde, q * columns, sizeof(double));
     changed |= replace(self->kink, kinks, q, sizeof(struct engine_kink));
     if (replace(self->lmn, lmn, p * columns, sizeof(double))) {
-        to_panels(self->outputs, self->columns, self->lmn, self->lmn_panels);
+        to_panels(self->outputs, self->columns, self->columns, self->lmn, self->lmn_panels);
     }
     if (!changed) {
         return ENGINE_OK;
@@ -469,7 +482,7 @@ enum engine_status engine_set_system(
     self->has_system = true;
     self->stored = 0;
     self->oldest = 0;
-    to_panels(self->kinks, self->columns, self->cde, self->cde_panels);
+    to_panels(self->kinks, self->columns, self->columns, self->cde, self->cde_panels);
     measure(self, self->here);
     return enter_mode(self);
 }

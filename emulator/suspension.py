@@ -176,7 +176,7 @@ class SuspensionComputer:
         )
         self._circuit = Circuit(_netlist(self.parts, models, self._dials))
         self._nodal = Nodal(self._circuit)
-        self._engine = self._new_engine()
+        self._engine: Engine | None = None
 
     @property
     def circuit(self) -> Circuit:
@@ -224,13 +224,10 @@ class SuspensionComputer:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         turns = self._plan(tweaks, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
-        self._engine = self._new_engine()
+        self._engine = Engine(self._nodal.at(self._dials), _NODES, self.sample_rate_hz)
         return self._blocks(self._engine, excitation, samples, turns, block_samples)
 
     # ---- playing
-
-    def _new_engine(self) -> Engine:
-        return Engine(self._nodal.at(self._dials), _NODES, self.sample_rate_hz)
 
     def _plan(self, tweaks: Sequence[Tweak], samples: int) -> list[tuple[int, dict[str, float]]]:
         """The tweaks as (samples to be recorded before, dials), in order of time."""
@@ -273,7 +270,8 @@ class SuspensionComputer:
 
     def _turn(self, dials: Mapping[str, float]) -> None:
         self._dials |= dials
-        self._engine.set_system(self._nodal.at(self._dials))
+        if self._engine is not None:
+            self._engine.set_system(self._nodal.at(self._dials))
 
     def _resolve(self, settings: Mapping[str, float]) -> dict[str, float]:
         dials: dict[str, float] = {}

@@ -43,6 +43,7 @@ def run_trials(count: int) -> None:
 
 
 def turn(computer: SuspensionComputer, count: int) -> None:
+    next(computer.play(Excitation(), 100))
     for i in range(count):
         computer.set(M_kg=100.0 + i)
 
