@@ -49,16 +49,19 @@ class Conversation:
 
     def send(self, message: Message) -> float:
         """Send, and return when the last of the answers is due, on the clock."""
-        self.link.send([message])
+        try:
+            self.link.send([message])
+        except LinkError as error:
+            raise self._named(error) from error
         return self.clock() + self.timeout_s
 
     def receive(self, deadline_s: float) -> Message | None:
         """The next message of the device, or None if none comes in time. One that is repeated is passed over.
 
-        :raises LinkError: messages before it were lost.
+        :raises LinkError: messages before it were lost, or the line failed.
         """
-        while True:
-            message = self.link.receive(deadline_s - self.clock())
+        while (left_s := deadline_s - self.clock()) >= 0.0:  # also when messages never cease
+            message = self._from_link(left_s)
             if message is None:
                 return None
             expected = self._expected
@@ -72,6 +75,7 @@ class Conversation:
                     f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
                     f" ({self.link.dropped} frames were damaged)"
                 )
+        return None
 
     def ask(self, request: Message, kind: type[Answer]) -> Answer:
         """Send ``request`` and return its answer.
@@ -94,6 +98,15 @@ class Conversation:
                 )
             if isinstance(message, kind) and message.answers == request.seq:
                 return message
+
+    def _from_link(self, timeout_s: float) -> Message | None:
+        try:
+            return self.link.receive(timeout_s)
+        except LinkError as error:
+            raise self._named(error) from error
+
+    def _named(self, error: LinkError) -> LinkError:
+        return type(error)(f"device {self.name}: {error}")
 
 
 def _brief(message: Message) -> str:

@@ -309,7 +309,7 @@ class Dut:
                 if not self._collect(index, deadline_s, collected):
                     raise self._silence(index)
         except LinkClosed as error:
-            raise LinkClosed(f"device {self.name}: {error} after sample {index - 1}") from error
+            raise LinkClosed(f"{error} after sample {index - 1}") from error
 
     def _message(self, first: int, samples: Sequence[_Codes]) -> Message:
         seq = self._talk.next_seq()
@@ -409,12 +409,21 @@ def connect(description: DeviceDescription) -> Dut:
     """Reach the device, shake hands, configure it; errors as ``open_dut``."""
     dut = Dut(_link(description), description)
     try:
-        dut.handshake()
+        _handshake(dut, description)
         dut.configure()
     except BaseException:
         dut.close()
         raise
     return dut
+
+
+def _handshake(dut: Dut, description: DeviceDescription) -> None:
+    try:
+        dut.handshake()
+    except LinkTimeout as error:
+        if description.kind != "serial":
+            raise
+        raise LinkTimeout(f"{error}; the line was opened at {description.baud} baud") from error
 
 
 def _link(description: DeviceDescription) -> Link:

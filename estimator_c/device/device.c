@@ -337,7 +337,7 @@ static void on_configure(device_t* const self, answer_t* const answer, const uin
 
 /// As after device_init(), except for the identity, the input and the sequence numbers.
 static void reset(device_t* const self) {
-    self->decoder.dropped   = 0U;
+    frame_decoder_init(&self->decoder, self->identity.catalogue_hash);
     self->counters          = (device_counters_t){ 0 };
     self->stopped           = (est_counters_t){ 0 };
     self->config            = est_config_default();
@@ -521,7 +521,6 @@ void device_init(device_t* const self, const device_identity_t* const identity) 
     DEVICE_ASSERT((self != 0) && (identity != 0));
     *self          = (device_t){ 0 };
     self->identity = *identity;
-    frame_decoder_init(&self->decoder, identity->catalogue_hash);
     reset(self);
 }
 
