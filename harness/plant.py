@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 PARAMETERS = ("M", "B", "K")
 """Names and order of the physical parameters wherever they stand in one array."""
 
+UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
+
 
 @dataclass(frozen=True)
 class Plant:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from harness.plant import UNITS
 from harness.run import Run
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
 
 SHOWN_ALARMS = 10
-
-UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
 def summary(run: Run, verdict: Verdict) -> str:
