@@ -22,7 +22,7 @@ class Record(NamedTuple):
 
 def record(n: int = 400, noise: float = 0.0, seed: int = 5, offset: float = 0.0) -> Record:
     rng = np.random.default_rng(seed)
-    u = rng.integers(0, 2, n) * 2000.0 - 1000.0
+    u = np.asarray(rng.integers(0, 2, n) * 2000.0 - 1000.0, dtype=np.float64)
     y = np.asarray(lfilter(B, A, u), dtype=np.float64)
     return Record(u, y + rng.normal(0.0, 1.0, n) * noise + offset)
 

@@ -42,7 +42,7 @@ class Detection:
 
 
 def shipped_device_in_process() -> DeviceDescription:
-    """The settings of the device `host`, in this process: the same C and the same messages, without a pseudo terminal."""
+    """The settings of the device `host`, in this process: the same C, the same messages, no pseudo terminal."""
     with open_dut("host") as dut:
         table = dict(dut.description())
     with open_dut("inproc") as dut:
