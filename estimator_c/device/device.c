@@ -2,6 +2,8 @@
 
 #include "analogrig_codec.h"
 
+#include <float.h>
+
 #ifndef DEVICE_ASSERT
 #include <assert.h>
 #define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
@@ -177,6 +179,8 @@ static void step_block(device_t* const self, answer_t* const answer) {
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
+static bool is_finite(const float value) { return (value >= -FLT_MAX) && (value <= FLT_MAX); }
+
 /// A float that is a whole number in [0, limit]. False for NaN too.
 static bool whole(const float value, const uint16_t limit, uint16_t* const out) {
     if (!((value >= 0.0F) && (value <= (float)limit))) {
@@ -301,6 +305,9 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
         return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
     }
     if (field != 0) {
+        if (!is_finite(value)) {  // est_init() looks only at the coefficients that the order uses
+            return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
+        }
         *field = value;
     } else {
         uint16_t number = 0U;
