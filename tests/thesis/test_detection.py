@@ -1,7 +1,8 @@
 """The thesis profile over 100 seeds: nothing missed, hardly a false alarm, latencies near the information bound.
 
 The seeds are fixed, so what these tests say is decided once and for all by the code. Of other seeds: over 600 further
-ones there was 1 false alarm in 1,080,000 samples (ARL0 = 1e5 promises at most 10.8), none missed, and no ratio above 1.3.
+runs there was 1 false alarm in 1,080,000 samples (ARL0 = 1e5 promises at most 10.8), none was missed, and no ratio was
+above 1.3.
 """
 
 from __future__ import annotations
