@@ -8,6 +8,8 @@
   const ROBUST_TAIL = 0.15; // of the estimates in view, on either side, may lie outside the plot ...
   const ROBUST_SPREAD = 0.6; // ... and nothing farther than this from the truth widens it
   const CEILINGS_SHOWN = 2;
+  const DENSE_PX = 10; // false alarms that are nearer to each other than this ...
+  const DENSE_ALPHA = 0.2; // ... fade, at most to this
 
   const run = JSON.parse(document.getElementById("run").textContent);
   const last = run.samples - 1;
@@ -58,7 +60,7 @@
   }
 
   function padded(low, high) {
-    const margin = Math.max(0.08 * (high - low), 0.01 * Math.abs(high), 1e-12);
+    const margin = Math.max(0.1 * (high - low), 0.01 * Math.abs(high), 1e-12);
     return [low - margin, high + margin];
   }
 
@@ -125,10 +127,13 @@
     ctx.save();
     stroke(run.tweaks, ink("ink"), 1.25, []);
     const [right, wrong] = [run.alarms.filter((a) => !a.false), run.alarms.filter((a) => a.false)];
-    stroke(right, ink("alarm"), 1.75, [6, 4]);
+    const room_px = bbox.width / px / Math.max(1, wrong.filter(seen).length);
+    ctx.globalAlpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
     stroke(wrong, ink("false"), 2.25, [2, 3]);
-    flags(right, ink("alarm"));
+    ctx.globalAlpha = 1;
     flags(wrong, ink("false"));
+    stroke(right, ink("alarm"), 1.75, [6, 4]);
+    flags(right, ink("alarm"));
     labels(u, run.tweaks.filter(seen), at, ink);
     ctx.restore();
   }
@@ -239,7 +244,7 @@
 
   function statistic(signals, ink) {
     const values = signals.statistic.values;
-    const ceiling = run.ceiling === null ? [] : [line("ceiling", ink, "false", "", { scale: "left", dash: [10, 6] })];
+    const ceiling = run.ceiling === null ? [] : [line("ceiling", ink, "truth", "", { scale: "left", width: 2, dash: [10, 6] })];
     return {
       caption: "Trigger: its statistic, and the ceiling above which it raises an alarm",
       data: ceiling.length ? [values, new Array(run.samples).fill(run.ceiling)] : [values],
@@ -255,7 +260,7 @@
       width,
       height: HEIGHT_PX,
       padding: [20, rightAxis ? 0 : RIGHT_PX, 0, 0],
-      cursor: { sync: { key: "run", scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
+      cursor: { y: false, sync: { key: "run", scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
       scales: {
         x: {
           time: false,

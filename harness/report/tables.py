@@ -10,7 +10,7 @@ from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
 
-_MAX_FALSE_ALARMS = 200
+_MAX_FALSE_ALARMS = 20
 """Rows of their table; the plots mark them all."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
@@ -39,7 +39,7 @@ def outcome(run: Run, verdict: Verdict) -> str:
         f" {_text(verdict.outcome.upper())}<small>{_what_ran(run)}</small></h1>"
         f"<p>{_SENTENCES[verdict.outcome]}</p>"
         f"{f'<ul>{reasons}</ul>' if reasons else ''}"
-        f"<p>{_text(_tally(run, verdict))}</p></section>"
+        f"{_tally(run, verdict)}</section>"
     )
 
 
@@ -64,7 +64,8 @@ def tweaks(verdict: Verdict) -> str:
     """Each change of the plant, and how it was noticed."""
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
-    caption = f"Latency and bound in samples from the change; the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
+    assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
+    caption = f"Latency and bound in samples from the change; {assumed}"
     head = _row(
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
     )
@@ -124,14 +125,19 @@ def _what_ran(run: Run) -> str:
 
 
 def _tally(run: Run, verdict: Verdict) -> str:
+    """The figures in one sentence; none for a run that is not valid, since they would read like a result."""
+    if not verdict.valid:
+        return ""
     noticed = sum(tweak.latency_n is not None for tweak in verdict.tweaks)
     count = len(verdict.tweaks)
     changes = f"{noticed} of {_plural(count, 'change')} noticed" if count else "No change to notice"
-    return f"{changes}, {_plural(len(verdict.false_alarms), 'false alarm')}, in {_plural(run.samples, 'sample')}."
+    false = _plural(len(verdict.false_alarms), "false alarm")
+    return f"<p>{changes}, {false}, in {_plural(run.samples, 'sample')}.</p>"
 
 
 def _plural(count: int, noun: str) -> str:
-    return f"{count or 'no':{',' if count else ''}} {noun}{'' if count == 1 else 's'}"
+    number = f"{count:,}" if count else "no"
+    return f"{number} {noun}{'' if count == 1 else 's'}"
 
 
 def _samples(run: Run, verdict: Verdict) -> str:
