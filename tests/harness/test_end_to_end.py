@@ -77,7 +77,7 @@ def test_estimates_are_the_plants_within_two_percent(thesis: tuple[Path, dict[st
 
 def test_run_leaves_a_report_and_a_recording(thesis: tuple[Path, dict[str, Any]]) -> None:
     _, out = thesis
-    assert Path(out["report"]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert Path(out["report"]).read_text(encoding="utf-8").startswith("<!doctype html>")
     assert Run.load(Path(out["run"])).theta_hash() == out["theta_hash"]
 
 
