@@ -18,6 +18,9 @@ _RESETS: tuple[ResetName, ...] = ("covariance", "all")
 
 DEFAULT_ARL0 = 1e5
 
+MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
+"""The catalogue has keys for so many coefficients of C; a build of the device may take fewer."""
+
 _FLOAT32_MAX = 3.4e38
 
 
@@ -52,6 +55,8 @@ class EstimatorConfig:
     reset: ResetName = "covariance"
 
     def __post_init__(self) -> None:
+        if not 1 <= self.na <= MAX_NA:
+            raise ValueError(f"na must be in 1 .. {MAX_NA}, not {self.na}")
         if len(self.c) > self.na:
             raise ValueError(f"c must have at most na = {self.na} elements, not {len(self.c)}")
         if self.arl0 is not None and (self.trigger != "cusum" or self.ceiling is not None):

@@ -1,0 +1,533 @@
+"""A device behind a link: the same answers whatever the line, and every fault told for what it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from harness import dut as dut_module
+from harness.catalogue import (
+    CATALOGUE_HASH,
+    Alarm,
+    Configured,
+    Controlled,
+    Estimate,
+    Hello,
+    Identify,
+    Message,
+    Sample,
+    Stepped,
+    SteppedFlag,
+)
+from harness.dut import DeviceDescription, Dut, Replies, connect, open_dut, reopen_dut
+from harness.errors import (
+    CatalogueMismatch,
+    ConfigurationError,
+    DeviceError,
+    DeviceRefused,
+    LinkClosed,
+    LinkError,
+    LinkTimeout,
+)
+from harness.estimator_config import EstimatorConfig
+from harness.host_process import HostProcess
+from harness.link import Link, MemoryLink
+
+N = 400
+CHANGE_AT = 300
+
+
+def signals(n: int = N) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """Force, displacement (n,) of a second-order system whose gain grows at CHANGE_AT, and some missing samples."""
+    rng = np.random.default_rng(7)
+    u = np.where((np.arange(n) // 40) % 2, 3900.0, 150.0)
+    y = np.zeros(n)
+    for k in range(2, n):
+        gain = 1.0 if k < CHANGE_AT else 1.4
+        y[k] = 1.5 * y[k - 1] - 0.54 * y[k - 2] + gain * (0.01 * u[k] + 0.02 * u[k - 1])
+    codes = np.clip(np.round(y + rng.normal(size=n)), 0, 4095)
+    return u.astype(np.uint16), codes.astype(np.uint16), np.arange(n) % 97 == 50
+
+
+FORCE, DISPLACEMENT, MISSING = signals()
+
+
+def feed(dut: Dut, first: int, end: int) -> Replies:
+    return dut.feed(first, FORCE[first:end], DISPLACEMENT[first:end], MISSING[first:end])
+
+
+def started(link: Link, **settings: Any) -> Dut:
+    dut = Dut(link, DeviceDescription(name="bob", kind="inproc", **settings))
+    dut.handshake()
+    dut.configure()
+    dut.start()
+    return dut
+
+
+@pytest.fixture(scope="module")
+def reference() -> Replies:
+    return feed(started(MemoryLink(1)), 0, N)
+
+
+def assert_same(one: Replies, other: Replies) -> None:
+    for name in ("theta", "innovation", "statistic", "flags"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    assert one.alarms == other.alarms
+
+
+# ---- replies
+
+
+def test_replies_are_one_row_a_sample(reference: Replies) -> None:
+    shapes = {"theta": (N, 6), "innovation": (N,), "statistic": (N,), "flags": (N,)}
+    assert {name: getattr(reference, name).shape for name in shapes} == shapes
+    assert [getattr(reference, name).dtype.name for name in shapes] == ["float32"] * 3 + ["uint8"]
+    assert np.array_equal((reference.flags & SteppedFlag.MISSING) != 0, MISSING)
+
+
+def test_theta_comes_to_the_system_that_made_the_samples(reference: Replies) -> None:
+    assert reference.theta[CHANGE_AT - 1, :4] == pytest.approx([-1.5, 0.54, 0.01, 0.02], abs=0.003)
+
+
+def test_alarm_tells_its_sample(reference: Replies) -> None:
+    (alarm,) = reference.alarms
+    assert CHANGE_AT <= alarm.index < CHANGE_AT + 20
+    assert alarm.statistic == reference.statistic[alarm.index] > 11.5
+
+
+@pytest.mark.parametrize("kind", ["host", "inproc"])
+@pytest.mark.parametrize("exchange", ["sample", "block"])
+def test_line_and_exchange_change_nothing(reference: Replies, kind: Any, exchange: Any) -> None:
+    with connect(DeviceDescription(name="bob", kind=kind, exchange=exchange)) as dut:
+        dut.start()
+        assert_same(feed(dut, 0, N), reference)
+
+
+@pytest.mark.parametrize("exchange", ["sample", "block"])
+def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) -> None:
+    dut = started(MemoryLink(1), exchange=exchange)
+    bounds = [0, 1, 1, 14, 29, 100, 257, N]
+    parts = [feed(dut, first, end) for first, end in itertools.pairwise(bounds)]
+    assert np.array_equal(np.concatenate([part.theta for part in parts]), reference.theta)
+    assert [alarm for part in parts for alarm in part.alarms] == list(reference.alarms)
+
+
+def test_second_run_is_as_the_first(reference: Replies) -> None:
+    dut = started(MemoryLink(1))
+    feed(dut, 0, 123)
+    dut.stop()
+    dut.start()
+    assert_same(feed(dut, 0, N), reference)
+
+
+def test_alarms_beyond_sample_65535_are_counted_on() -> None:
+    dut = started(MemoryLink(1), exchange="block")
+    rest = 65536 - 200
+    still = np.zeros(rest, np.uint16)
+    dut.feed(0, still, still, np.ones(rest, bool))
+    replies = dut.feed(rest, FORCE, DISPLACEMENT, MISSING)
+    assert [alarm.index - rest for alarm in replies.alarms if alarm.index - rest >= CHANGE_AT] != []
+    assert all(rest <= alarm.index < rest + N for alarm in replies.alarms)
+    assert replies.alarms[-1].index > 65536
+
+
+def test_skipped_indices_are_lost_samples_to_the_device() -> None:
+    dut = started(MemoryLink(1))
+    feed(dut, 0, 100)
+    feed(dut, 130, 200)
+    assert dut.stop()["samples_lost"] == 30
+
+
+def test_samples_that_come_again_are_the_callers_mistake() -> None:
+    dut = started(MemoryLink(1))
+    feed(dut, 0, 100)
+    with pytest.raises(ValueError, match="sample 99 comes again: the next one is 100"):
+        feed(dut, 99, 120)
+
+
+def test_arrays_of_different_lengths_are_the_callers_mistake() -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        started(MemoryLink(1)).feed(0, FORCE[:5], DISPLACEMENT[:4], MISSING[:5])
+
+
+def test_counters_tell_what_the_device_did(reference: Replies) -> None:
+    dut = started(MemoryLink(1))
+    feed(dut, 0, N)
+    counters = dut.stop()
+    missing = int(MISSING.sum())
+    assert counters["updated"] == N - missing
+    assert counters["missing"] == missing
+    assert counters["alarms"] == len(reference.alarms)
+    assert counters["frames_dropped"] == counters["sequence_gaps"] == counters["messages_refused"] == 0
+
+
+# ---- opening
+
+
+def test_device_is_opened_by_name(reference: Replies) -> None:
+    for name in ("host", "inproc"):
+        with open_dut(name) as dut:
+            assert dut.name == name
+            assert dut.parameters == 6
+            dut.start()
+            assert_same(feed(dut, 0, N), reference)
+
+
+def test_recorded_device_is_the_same_again() -> None:
+    description = DeviceDescription(
+        name="bob", kind="inproc", exchange="block", estimator=EstimatorConfig(nb=2, nk=1, arl0=1e7)
+    )
+    with connect(description) as dut:
+        dut.start()
+        first, record = feed(dut, 0, N), dict(dut.description())
+    assert record["identity"]["firmware"] == "LIBRARY"
+    with reopen_dut(record) as dut:
+        assert {**dut.description(), "identity": None} == {**record, "identity": None}
+        dut.start()
+        assert_same(feed(dut, 0, N), first)
+
+
+def test_own_file_may_say_everything(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(
+        'kind = "inproc"\nexchange = "block"\ntimeout_s = 1.5\n[estimator]\nna = 1\nc = [-0.5]\ntrigger = "none"\n'
+    )
+    with open_dut(str(tmp_path / "mine.toml")) as dut:
+        assert dut.name == "mine"
+        assert dut.parameters == 5
+        assert dut.link_name == "memory"
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ('kind = "hots"', "kind: must be one of 'host', 'inproc', 'serial', not 'hots'"),
+        ('kind = "serial"', "a url goes with the kind 'serial', and with no other"),
+        ('kind = "host"\nurl = "/dev/ttyS0"', "a url goes with the kind 'serial', and with no other"),
+        ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be positive, not 0"),
+        ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be positive, not 0"),
+        ('kind = "inproc"\n[estimator]\nnab = 1', "estimator: unknown key 'nab'"),
+    ],
+)
+def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str) -> None:
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        open_dut(str(tmp_path / "mine.toml"))
+    assert str(caught.value).startswith(f"{tmp_path}/mine.toml: ")
+    assert complaint in str(caught.value)
+
+
+def test_stranger_is_refused_with_both_catalogues() -> None:
+    dut = Dut(MemoryLink(1, catalogue_hash=0xDEADBEEF), DeviceDescription(name="bob", kind="inproc"))
+    with pytest.raises(
+        CatalogueMismatch, match=f"device bob: it speaks catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
+    ):
+        dut.handshake()
+
+
+def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> None:
+    """As when the harness before was killed: answers are still under way, and the device is running."""
+    link = MemoryLink(1)
+    feed(started(link), 0, 100)
+    link.send([Sample(9, 0, 100, 1, 2), Identify(10), Sample(11, 0, 101, 1, 2)])
+    assert_same(feed(started(link), 0, N), reference)
+
+
+def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
+    dut = Dut(MemoryLink(1), DeviceDescription(name="bob", kind="inproc"))
+    dut.handshake()
+    with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
+        dut.configure(EstimatorConfig(nb=7))
+
+
+def test_running_device_cannot_be_configured() -> None:
+    with pytest.raises(DeviceRefused, match=r"^device bob: na = 2 was not applied: RUNNING, it has 2$"):
+        started(MemoryLink(1)).configure(EstimatorConfig())
+
+
+def test_running_device_cannot_be_started() -> None:
+    with pytest.raises(DeviceRefused, match="^device bob: START was refused: RUNNING$"):
+        started(MemoryLink(1)).start()
+
+
+# ---- faults of the line
+
+Fault = Callable[[Message], Iterable[Message]]
+
+
+class FaultyLink:
+    """Passes messages through two functions, each of which may lose, change or repeat them."""
+
+    name = "faulty"
+    dropped = 0
+
+    def __init__(self) -> None:
+        self.inner = MemoryLink(boot_nonce=1)
+        self.to_device: Fault = lambda message: [message]
+        self.from_device: Fault = lambda message: [message]
+        self._waiting: list[Message] = []
+
+    def send(self, messages: Iterable[Message]) -> None:
+        self.inner.send([passed for message in messages for passed in self.to_device(message)])
+
+    def receive(self, timeout_s: float) -> Message | None:
+        while not self._waiting:
+            message = self.inner.receive(timeout_s)
+            if message is None:
+                return None
+            self._waiting += self.from_device(message)
+        return self._waiting.pop(0)
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+@pytest.fixture
+def line() -> FaultyLink:
+    return FaultyLink()
+
+
+def about(kind: type, sample: int, do: Fault) -> Fault:
+    """``do`` once, to the first message of a kind about a sample."""
+    done: list[Message] = []
+
+    def fault(message: Message) -> Iterable[Message]:
+        if isinstance(message, kind) and getattr(message, "sample_index", None) == sample and not done:
+            done.append(message)
+            return do(message)
+        return [message]
+
+    return fault
+
+
+def lose(message: Message) -> list[Message]:  # noqa: ARG001 - it is gone
+    return []
+
+
+def repeat(message: Message) -> list[Message]:
+    return [message, message]
+
+
+def test_lost_sample_is_told_and_the_device_found_alive(line: FaultyLink) -> None:
+    dut = started(line)
+    line.to_device = about(Sample, 81, lose)
+    with pytest.raises(LinkTimeout) as caught:
+        feed(dut, 0, N)
+    assert str(caught.value) == (
+        "device bob: no estimate for sample 81 within 2 s (last message: Stepped 80);"
+        " it is alive and has dropped 0 damaged frames"
+    )
+
+
+def test_damaged_sample_is_told_with_the_devices_count(line: FaultyLink) -> None:
+    def damage(message: Message) -> list[Message]:  # noqa: ARG001 - it is replaced by noise
+        line.inner.send_bytes(b"\0noise\0")
+        return []
+
+    dut = started(line)
+    line.to_device = about(Sample, 81, damage)
+    with pytest.raises(LinkTimeout, match="it is alive and has dropped 1 damaged frames"):
+        feed(dut, 0, N)
+
+
+@pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81")])
+def test_lost_answer_is_told(line: FaultyLink, kind: type, after: str) -> None:
+    dut = started(line)
+    line.from_device = about(kind, 81, lose)
+    with pytest.raises((LinkError, DeviceError)) as caught:
+        feed(dut, 0, N)
+    assert type(caught.value) is (LinkTimeout if kind is Stepped else LinkError)
+    assert after in str(caught.value)
+
+
+def test_lost_answer_in_a_block_is_told(line: FaultyLink) -> None:
+    dut = started(line, exchange="block")
+    line.from_device = about(Stepped, 81, lose)
+    with pytest.raises(LinkError, match="^device bob: 1 messages were lost between Estimate 81 and Estimate 82"):
+        feed(dut, 0, N)
+
+
+@pytest.mark.parametrize("kind", [Estimate, Stepped, Alarm])
+def test_repeated_answer_changes_nothing(line: FaultyLink, reference: Replies, kind: type) -> None:
+    dut = started(line)
+    line.from_device = lambda message: repeat(message) if isinstance(message, kind) else [message]
+    assert_same(feed(dut, 0, N), reference)
+
+
+def test_repeated_sample_changes_nothing(line: FaultyLink, reference: Replies) -> None:
+    dut = started(line)
+    line.to_device = lambda message: repeat(message) if isinstance(message, Sample) else [message]
+    assert_same(feed(dut, 0, N), reference)
+    assert dut.stop()["messages_repeated"] == N
+
+
+def test_repeated_everything_changes_nothing(line: FaultyLink, reference: Replies) -> None:
+    line.to_device = line.from_device = repeat
+    dut = started(line)
+    assert_same(feed(dut, 0, N), reference)
+    dut.stop()
+
+
+def test_answer_that_was_not_due_is_told(line: FaultyLink) -> None:
+    dut = started(line)
+    line.from_device = about(Estimate, 81, lambda message: [Stepped(message.seq, 0, 81, 0.0)])
+    with pytest.raises(DeviceError, match=r"^device bob: Estimate of THETA_0 for sample 81 was due, Stepped\(.*came$"):
+        feed(dut, 0, N)
+
+
+def test_answer_about_another_sample_is_told(line: FaultyLink) -> None:
+    dut = started(line)
+    line.from_device = about(Stepped, 81, lambda message: [Stepped(message.seq, 0, 80, 0.0)])
+    with pytest.raises(DeviceError, match=r"^device bob: Stepped for sample 81 was due, .*sample_index=80"):
+        feed(dut, 0, N)
+
+
+def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:
+    dut = started(line)
+    feed(dut, 0, 80)
+    line.to_device = lose
+    with pytest.raises(LinkTimeout, match=r"sample 80 within 2 s .*; it answers nothing else either$"):
+        feed(dut, 80, N)
+
+
+def test_nobody_at_the_line_is_told(line: FaultyLink) -> None:
+    line.to_device = lose
+    ticks = iter(range(1000))
+    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"), clock=lambda: next(ticks) / 100)
+    with pytest.raises(
+        LinkTimeout, match=r"^device bob: no Hello in answer to Identify within 2 s \(last message: none\)$"
+    ):
+        dut.handshake()
+
+
+def test_device_that_misses_the_first_call_is_called_again(line: FaultyLink) -> None:
+    """A board that resets when its port is opened."""
+    calls: list[Message] = []
+
+    def deaf_at_first(message: Message) -> list[Message]:
+        calls.append(message)
+        return [message] if len(calls) > 3 else []
+
+    line.to_device = deaf_at_first
+    started(line)
+    assert [type(call) for call in calls[:4]] == [Identify] * 4
+
+
+@pytest.mark.parametrize("message", [Hello(0, 6, 250, CATALOGUE_HASH), Stepped(0, 0, 0, 0.0)])
+def test_babbling_device_ends_at_the_deadline(line: FaultyLink, message: Message) -> None:
+    """Good messages without end, numbered as they should be or repeated, but never an answer."""
+    ticks = iter(range(10_000))
+    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"), clock=lambda: next(ticks) / 100)
+    for numbered in (True, False):
+        seq = iter(i % 256 if numbered else 7 for i in range(10_000))
+        line.receive = lambda _timeout_s, seq=seq: message._replace(seq=next(seq))  # type: ignore[misc, method-assign]
+        with pytest.raises(LinkTimeout, match="no Hello"):
+            dut.handshake()
+
+
+# ---- faults of the device
+
+
+def reboots_at(line: FaultyLink, sample: int) -> None:
+    """The device is reset just before a sample."""
+
+    def reboot(message: Message) -> list[Message]:
+        line.inner = MemoryLink(boot_nonce=2)
+        return [message]
+
+    line.to_device = about(Sample, sample, reboot)
+
+
+def test_reset_in_the_run_is_told_by_its_boot_nonce(line: FaultyLink) -> None:
+    dut = started(line)
+    reboots_at(line, 81)
+    with pytest.raises(DeviceError) as caught:
+        feed(dut, 0, N)
+    assert str(caught.value) == (
+        "device bob: it was reset after the handshake (boot nonce 0x00000001 became 0x00000002)"
+    )
+
+
+def test_reset_after_the_last_sample_is_told_at_stop(line: FaultyLink) -> None:
+    dut = started(line)
+    feed(dut, 0, N)
+    line.inner = MemoryLink(boot_nonce=2)
+    with pytest.raises(DeviceError, match="it was reset after the handshake"):
+        dut.stop()
+
+
+def test_value_that_is_applied_otherwise_is_refused(line: FaultyLink) -> None:
+    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
+    dut.handshake()
+    line.from_device = lambda message: [message._replace(value=9.5) if isinstance(message, Configured) else message]
+    with pytest.raises(DeviceRefused, match="na = 2 was not applied: APPLIED, it has 9.5"):
+        dut.configure()
+
+
+def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
+    dut = started(line)
+    line.from_device = lambda message: [message._replace(result=77) if isinstance(message, Controlled) else message]
+    with pytest.raises(DeviceRefused, match="STOP was refused: number 77"):
+        dut.stop()
+
+
+@pytest.fixture
+def host() -> Iterator[tuple[Dut, HostProcess]]:
+    process = HostProcess()
+    dut = Dut(process, DeviceDescription(name="host", kind="host", timeout_s=0.1))
+    dut.handshake()
+    dut.configure()
+    dut.start()
+    yield dut, process
+    dut.close()
+
+
+def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[Dut, HostProcess]) -> None:
+    dut, process = host
+    feed(dut, 0, 82)
+    os.kill(process.pid, signal.SIGKILL)
+    with pytest.raises(LinkClosed, match="^device host: the device process ended with status -9 after sample 81$"):
+        feed(dut, 82, N)
+
+
+def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, HostProcess], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("harness.host_process.END_TIMEOUT_S", 0.05)
+    dut, process = host
+    feed(dut, 0, 82)
+    os.kill(process.pid, signal.SIGSTOP)
+    with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 0.1 s \(last message: Stepped 81\)"):
+        feed(dut, 82, N)
+
+
+def test_device_is_let_go_when_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    links: list[HostProcess] = []
+
+    def stranger() -> HostProcess:
+        links.append(HostProcess(["--catalogue-hash", "1"]))
+        return links[0]
+
+    monkeypatch.setattr(dut_module, "HostProcess", stranger)
+    with pytest.raises(CatalogueMismatch):
+        open_dut("host")
+    assert links[0]._process.returncode == 0
+
+
+def test_silent_serial_line_is_told_with_its_baud_rate() -> None:
+    """Loop back: what is heard is the call itself."""
+    description = DeviceDescription(name="bob", kind="serial", url="loop://", baud=9600, timeout_s=0.05)
+    with pytest.raises(LinkTimeout, match="no Hello .*; the line was opened at 9600 baud$"):
+        connect(description)
+
+
+def test_description_is_plain_and_frozen() -> None:
+    description = DeviceDescription(name="bob", kind="inproc")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        description.name = "eve"  # type: ignore[misc]
