@@ -38,14 +38,14 @@ GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c",)
-FIXTURES = "fixtures/**/*"
+FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 OTHER_SOURCES = (
     "emulator/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/host/*.h",
     "estimator_c/catalogue/*",
-    FIXTURES,
+    *FIXTURES,
 )
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
@@ -95,7 +95,10 @@ class BuildProducts(Command):
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)
         if not in_tree:
-            shutil.copytree("fixtures", destination / "harness/fixtures", dirs_exist_ok=True)
+            for path in sources(FIXTURES):
+                installed = destination / "harness" / path
+                installed.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, installed)
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
@@ -103,7 +106,7 @@ class BuildProducts(Command):
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""
-        fixtures = [Path("harness") / path for path in sources((FIXTURES,))]
+        fixtures = [Path("harness") / path for path in sources(FIXTURES)]
         return [str(Path(self.build_lib) / product) for product in (*PRODUCTS, *fixtures)]
 
     def get_output_mapping(self) -> dict[str, str]:

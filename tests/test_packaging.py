@@ -82,12 +82,12 @@ def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
     assert not [name for name in held if name.endswith((".c", ".h")) or name.startswith("tests/")]
 
 
-def test_sdist_holds_every_shipped_fixture(distributions: Path) -> None:
-    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
-        held = {name.partition("/")[2] for name in sdist.getnames()}
-    fixtures = {str(path.relative_to(CHECKOUT)) for path in CHECKOUT.glob("fixtures/**/*") if path.is_file()}
+def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Path) -> None:
+    fixtures = {str(path.relative_to(CHECKOUT)) for path in CHECKOUT.glob("fixtures/*/*.toml")}
     assert fixtures
-    assert held >= fixtures
+    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
+        assert {name.partition("/")[2] for name in sdist.getnames()} >= fixtures
+    assert set(zipfile.ZipFile(wheel).namelist()) >= {f"harness/{fixture}" for fixture in fixtures}
 
 
 def test_command_works_from_the_wheel(environment: Path) -> None:
