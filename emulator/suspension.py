@@ -127,9 +127,7 @@ class Program:
             raise PotError(f"pot {pot}: {pot} must be positive and finite, got {value!r}")
         scales, parts = self.scales, self.parts
         if pot == "M":
-            return (
-                scales.time * scales.force_n * parts.r1_ohm * parts.c1_farad / (value * scales.velocity_m_per_s)
-            )
+            return scales.time * scales.force_n * parts.r1_ohm * parts.c1_farad / (value * scales.velocity_m_per_s)
         if pot == "B":
             return (value * scales.velocity_m_per_s / scales.force_n) * (parts.rb_ohm / parts.rfb_ohm)
         return (value * scales.displacement_m / scales.force_n) * (parts.rk_ohm / parts.rfb_ohm)
