@@ -101,7 +101,7 @@ class SerialLink:
             raise ConfigurationError(f"{url}: {error}") from error
         except OSError as error:
             raise LinkError(f"cannot open {url}: {_reason(error)}") from error
-        # What is a plain file descriptor is read as one: pyserial's read() costs as much as a whole exchange.
+        # A plain file descriptor is used as one: pyserial's read() and write() cost as much as a whole exchange.
         self._fd = self._port.fileno() if type(self._port) is serial.Serial else None
         self._poll = select.poll()
         if self._fd is not None:
@@ -114,7 +114,7 @@ class SerialLink:
     def send(self, messages: Iterable[Message]) -> None:
         frames = b"".join([frame.encode(pack(message)) for message in messages])
         try:
-            self._port.write(frames)
+            self._write(frames)
         except serial.SerialTimeoutException as error:
             raise LinkError(f"{self.name}: nothing can be sent, the other end takes nothing") from error
         except OSError as error:
@@ -134,6 +134,13 @@ class SerialLink:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._port.close()
+
+    def _write(self, frames: bytes) -> None:
+        if self._fd is not None:
+            with contextlib.suppress(BlockingIOError):
+                frames = frames[os.write(self._fd, frames) :]
+        if frames:
+            self._port.write(frames)
 
     def _read(self, timeout_s: float) -> bytes:
         """What has come, at least one byte unless the time is over."""
