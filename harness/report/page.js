@@ -97,61 +97,81 @@
 
   // Marks
 
-  function verticals(u, ink) {
+  // Lines lie under the signals, flags and labels above them.
+  function marks(u, ink) {
+    const px = devicePixelRatio;
+    const seen = (mark) => mark.sample >= view.min && mark.sample <= view.max;
+    const noticed = run.alarms.filter((alarm) => seen(alarm) && !alarm.false);
+    const wrong = run.alarms.filter((alarm) => seen(alarm) && alarm.false);
+    const room_px = u.bbox.width / px / Math.max(1, wrong.length);
+    const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
+    return {
+      lines() {
+        verticals(u, run.tweaks.filter(seen), { colour: ink("ink"), width: 1.25, dash: [], alpha: 1 });
+        verticals(u, wrong, { colour: ink("false"), width: 2.25, dash: [2, 3], alpha });
+        verticals(u, noticed, { colour: ink("alarm"), width: 1.75, dash: [6, 4], alpha: 1 });
+      },
+      flags() {
+        flags(u, wrong, ink("false"));
+        flags(u, noticed, ink("alarm"));
+        labels(u, run.tweaks.filter(seen), ink);
+      },
+    };
+  }
+
+  function position(u, sample) {
+    return Math.round(u.valToPos(sample, "x", true)) + 0.5;
+  }
+
+  function verticals(u, marked, { colour, width, dash, alpha }) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
-    const at = (sample) => Math.round(u.valToPos(sample, "x", true)) + 0.5;
-    const seen = (mark) => mark.sample >= view.min && mark.sample <= view.max;
-    const stroke = (marks, colour, width, dash) => {
-      ctx.strokeStyle = colour;
-      ctx.lineWidth = width * px;
-      ctx.setLineDash(dash.map((d) => d * px));
-      ctx.beginPath();
-      for (const mark of marks.filter(seen)) {
-        ctx.moveTo(at(mark.sample), bbox.top);
-        ctx.lineTo(at(mark.sample), bbox.top + bbox.height);
-      }
-      ctx.stroke();
-    };
-    const flags = (marks, colour) => {
-      ctx.fillStyle = colour;
-      const [size, bottom] = [5 * px, bbox.top + bbox.height];
-      for (const mark of marks.filter(seen)) {
-        ctx.beginPath();
-        ctx.moveTo(at(mark.sample), bottom - 2 * size);
-        ctx.lineTo(at(mark.sample) + size, bottom);
-        ctx.lineTo(at(mark.sample) - size, bottom);
-        ctx.fill();
-      }
-    };
     ctx.save();
-    stroke(run.tweaks, ink("ink"), 1.25, []);
-    const [right, wrong] = [run.alarms.filter((a) => !a.false), run.alarms.filter((a) => a.false)];
-    const room_px = bbox.width / px / Math.max(1, wrong.filter(seen).length);
-    ctx.globalAlpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
-    stroke(wrong, ink("false"), 2.25, [2, 3]);
-    ctx.globalAlpha = 1;
-    flags(wrong, ink("false"));
-    stroke(right, ink("alarm"), 1.75, [6, 4]);
-    flags(right, ink("alarm"));
-    labels(u, run.tweaks.filter(seen), at, ink);
+    ctx.strokeStyle = colour;
+    ctx.globalAlpha = alpha;
+    ctx.lineWidth = width * px;
+    ctx.setLineDash(dash.map((d) => d * px));
+    ctx.beginPath();
+    for (const { sample } of marked) {
+      ctx.moveTo(position(u, sample), bbox.top);
+      ctx.lineTo(position(u, sample), bbox.top + bbox.height);
+    }
+    ctx.stroke();
     ctx.restore();
   }
 
-  function labels(u, tweaks, at, ink) {
+  function flags(u, marked, colour) {
+    const { ctx, bbox } = u;
+    const [size, bottom] = [5 * devicePixelRatio, bbox.top + bbox.height];
+    ctx.save();
+    ctx.fillStyle = colour;
+    for (const { sample } of marked) {
+      ctx.beginPath();
+      ctx.moveTo(position(u, sample), bottom - 2 * size);
+      ctx.lineTo(position(u, sample) + size, bottom);
+      ctx.lineTo(position(u, sample) - size, bottom);
+      ctx.fill();
+    }
+    ctx.restore();
+  }
+
+  function labels(u, tweaks, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
+    ctx.save();
     ctx.font = FONT.replace(/^\d+/, (size) => String(size * px));
     ctx.fillStyle = ink("ink");
     ctx.textAlign = "center";
     ctx.textBaseline = "bottom";
     let free = -Infinity;
     for (const tweak of tweaks) {
+      const x = position(u, tweak.sample);
       const half = ctx.measureText(tweak.label).width / 2;
-      if (at(tweak.sample) - half < free) continue; // it would cover its neighbour; zooming in makes room
-      ctx.fillText(tweak.label, at(tweak.sample), bbox.top - 2 * px);
-      free = at(tweak.sample) + half + 6 * px;
+      if (x - half < free) continue; // it would cover its neighbour; zooming in makes room
+      ctx.fillText(tweak.label, x, bbox.top - 2 * px);
+      free = x + half + 6 * px;
     }
+    ctx.restore();
   }
 
   function missingBand(u, stretches, ink) {
@@ -275,8 +295,8 @@
       axes: [sampleAxis(ink), ...plot.axes],
       series: [{ label: "sample" }, ...plot.series],
       hooks: {
-        drawAxes: [(u) => verticals(u, ink)],
-        draw: [(u) => missingBand(u, stretches, ink)],
+        drawAxes: [(u) => marks(u, ink).lines()],
+        draw: [(u) => missingBand(u, stretches, ink), (u) => marks(u, ink).flags()],
       },
     };
   }

@@ -1,0 +1,245 @@
+"""The page in a real browser: whatever only a browser can tell."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, sync_playwright
+
+from harness.report import write_report
+from harness.run import Run
+from harness.verdict import Verdict, judge
+from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
+
+PLOTS = 6
+FORCE, MASS, STIFFNESS, STATISTIC = 0, 2, 4, 5
+
+ALARM, FALSE_ALARM, MISSING = (0, 158, 115), (213, 94, 0), (86, 180, 233)
+"""Bluish green, vermilion and sky blue of Okabe and Ito."""
+
+COUNT_PIXELS = """(canvas, [r, g, b]) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) count += data[i] === r && data[i + 1] === g && data[i + 2] === b;
+    return count;
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("needs a browser: apt-get install chromium")
+    with sync_playwright() as playwright:
+        # Without a sandbox, since tests may run as root; the page under test is our own.
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return reported_run()
+
+
+class Watched:
+    """A page of the browser, with everything it complained of and asked for."""
+
+    def __init__(self, browser: Browser, path: Path) -> None:
+        self.page: Page = browser.new_page(viewport={"width": 1200, "height": 1000})
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+
+    def plots(self) -> list[Locator]:
+        self.page.wait_for_selector("html[data-drawn]")
+        return self.page.locator("#plots canvas").all()
+
+    def images(self) -> list[str]:
+        """What each plot shows, after the browser has painted."""
+        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        return [plot.evaluate("(canvas) => canvas.toDataURL()") for plot in self.plots()]
+
+    def pixels(self, colour: tuple[int, int, int]) -> list[int]:
+        """How many pixels of exactly this colour each plot has."""
+        return [plot.evaluate(COUNT_PIXELS, list(colour)) for plot in self.plots()]
+
+    def drag(self, plot: int, start: float, end: float) -> None:
+        """Drag across a plot, between two fractions of its width."""
+        x, y, width = self._area(plot)
+        self.page.mouse.move(x + start * width, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + end * width, y, steps=3)
+        self.page.mouse.up()
+        self.page.mouse.move(0, 0)
+
+    def point_at(self, plot: int, fraction: float) -> None:
+        x, y, width = self._area(plot)
+        self.page.mouse.move(x + fraction * width, y)
+
+    def values(self, plot: int) -> list[str]:
+        """What the legend of a plot says of the sample under the pointer."""
+        return self.page.locator(".u-legend").nth(plot).locator(".u-value").all_inner_texts()
+
+    def _area(self, plot: int) -> tuple[float, float, float]:
+        area = self.page.locator(".u-over").nth(plot)
+        area.scroll_into_view_if_needed()
+        box = area.bounding_box()
+        assert box is not None
+        return box["x"], box["y"] + box["height"] / 2, box["width"]
+
+
+@pytest.fixture
+def opened(browser: Browser, run: Run, tmp_path: Path) -> Iterator[Watched]:
+    with_page = _open(browser, run, reported_verdict(run), tmp_path)
+    yield with_page
+    with_page.page.close()
+
+
+def test_every_plot_is_drawn_without_a_complaint_or_a_request(opened: Watched) -> None:
+    assert len(opened.plots()) == PLOTS
+    assert min(opened.pixels((0, 114, 178))) > 100  # the first signal of each
+    assert opened.complaints == []
+    assert [url.rpartition("/")[2] for url in opened.requests] == ["report.html"]
+
+
+def test_alarms_are_marked_in_every_plot(opened: Watched) -> None:
+    assert min(opened.pixels(ALARM)) > 20  # a flag at the least, where a signal hides the line
+    assert min(opened.pixels(FALSE_ALARM)) > 20
+    assert min(opened.pixels(MISSING)) > 50
+
+
+def test_run_without_alarms_and_gaps_shows_no_such_mark(browser: Browser, run: Run, tmp_path: Path) -> None:
+    quiet = replace(
+        run,
+        clipped=run.clipped & False,
+        alarm_index=run.alarm_index[:0],
+        alarm_kind=run.alarm_kind[:0],
+        alarm_statistic=run.alarm_statistic[:0],
+    )
+    watched = _open(browser, quiet, replace(reported_verdict(run), false_alarms=()), tmp_path)
+    for colour in (ALARM, FALSE_ALARM, MISSING):
+        assert watched.pixels(colour) == [0] * PLOTS
+
+
+def test_drag_zooms_every_plot_and_double_click_shows_the_whole_run_again(opened: Watched) -> None:
+    whole = opened.images()
+    opened.drag(MASS, 0.2, 0.5)
+    zoomed = opened.images()
+    assert all(before != after for before, after in zip(whole, zoomed, strict=True))
+    opened.page.locator(".u-over").nth(FORCE).dblclick()
+    opened.page.mouse.move(0, 0)
+    assert opened.images() == whole
+
+
+def test_button_shows_the_whole_run_again(opened: Watched) -> None:
+    whole = opened.images()
+    opened.drag(STATISTIC, 0.6, 0.8)
+    opened.page.get_by_role("button", name="Whole run").click()
+    assert opened.images() == whole
+
+
+def test_row_of_a_change_takes_all_plots_there(opened: Watched) -> None:
+    opened.page.get_by_role("button", name="1200", exact=True).click()
+    opened.point_at(MASS, 0.0)
+    assert [opened.values(plot)[0] for plot in range(PLOTS)] == ["1,160"] * PLOTS
+    opened.point_at(MASS, 0.999)
+    assert opened.values(STIFFNESS)[0] == "1,280"
+
+
+def test_pointer_in_one_plot_reads_the_values_of_all(opened: Watched, run: Run) -> None:
+    opened.page.get_by_role("button", name="0–1199").click()
+    opened.point_at(STATISTIC, 400 / 1199)
+    (k,) = {int(opened.values(plot)[0]) for plot in range(PLOTS)}
+    assert k == pytest.approx(400, abs=2)  # a pixel is more than a sample
+    force, displacement = opened.values(FORCE)[1:]
+    assert _number(force, "N") == pytest.approx(run.codes[k, 0] * 2940.0 / 4096, rel=1e-4)
+    assert _number(displacement, "mm") == pytest.approx(run.codes[k, 1] * 199.6 / 4096, rel=1e-4)
+    truth, estimate = opened.values(STIFFNESS)[1:]
+    assert _number(truth, "N/m") == 24500.0
+    assert _number(estimate, "N/m") == pytest.approx(24500.0, rel=1e-3)
+
+
+def test_transients_are_hidden_until_asked_for(opened: Watched) -> None:
+    calm = opened.images()
+    every = opened.page.get_by_label("show every value")
+    every.check()
+    wild = opened.images()
+    changed = [plot for plot in range(PLOTS) if wild[plot] != calm[plot]]
+    assert changed == [2, 3, 4, STATISTIC]
+    every.uncheck()
+    assert opened.images() == calm
+
+
+def test_dark_scheme_redraws_the_plots_in_its_own_colours(opened: Watched) -> None:
+    light = opened.images()
+    opened.page.emulate_media(color_scheme="dark")
+    assert min(opened.pixels((86, 180, 233))) > 100
+    assert all(before != after for before, after in zip(light, opened.images(), strict=True))
+    assert opened.complaints == []
+
+
+def test_narrow_window_does_not_cut_the_plots(opened: Watched) -> None:
+    opened.plots()
+    opened.page.set_viewport_size({"width": 600, "height": 900})
+    opened.images()
+    assert opened.page.evaluate("document.documentElement.scrollWidth") <= 600
+
+
+def test_printed_page_is_light_and_holds_every_plot(opened: Watched) -> None:
+    opened.page.emulate_media(color_scheme="dark")
+    dark = opened.images()
+    opened.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert min(opened.pixels((0, 114, 178))) > 100
+    assert opened.page.locator(".u-wrap").first.evaluate("(plot) => plot.offsetWidth") == 700
+    opened.page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert opened.images() == dark
+
+
+def test_run_without_a_sample_says_so_where_the_plots_would_be(browser: Browser, tmp_path: Path) -> None:
+    watched = _open(browser, empty_run(), judge(empty_run()), tmp_path)
+    assert "before its first sample" in watched.page.get_by_role("alert").inner_text()
+    assert watched.complaints == []
+
+
+@pytest.mark.parametrize("samples", [1, 2, NOTICED])
+def test_run_that_broke_off_is_drawn(browser: Browser, run: Run, tmp_path: Path, samples: int) -> None:
+    arrays = {
+        name: getattr(run, name)[:samples] for name in ("codes", "clipped", "theta", "innovation", "statistic", "flags")
+    }
+    watched = _open(browser, short := replace(run, **arrays).with_faults("cut"), judge(short), tmp_path)
+    assert len(watched.plots()) == PLOTS
+    assert watched.complaints == []
+
+
+def test_run_without_truth_and_trigger_is_drawn(browser: Browser, run: Run, tmp_path: Path) -> None:
+    blind = replace(run, conditions=replace(run.conditions, segments=()))
+    watched = _open(browser, blind, replace(judge(blind), ceiling=None), tmp_path)
+    assert len(watched.plots()) == PLOTS
+    assert len(watched.values(MASS)) == 2  # sample and estimate
+    assert watched.complaints == []
+
+
+def test_run_that_converged_nowhere_is_drawn(browser: Browser, run: Run, tmp_path: Path) -> None:
+    nowhere = replace(run, theta=run.theta * 0.0)
+    watched = _open(browser, nowhere, judge(nowhere), tmp_path)
+    assert len(watched.plots()) == PLOTS
+    assert watched.complaints == []
+
+
+def _open(browser: Browser, run: Run, verdict: Verdict, folder: Path) -> Watched:
+    write_report(run, verdict, folder / "report.html")
+    return Watched(browser, folder / "report.html")
+
+
+def _number(text: str, unit: str) -> float:
+    value, found = text.split()
+    assert found == unit
+    return float(value)
