@@ -39,6 +39,7 @@ class Column:
 def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
     """All that the plots need, in plain JSON types without NaN."""
     columns = _columns(run)
+    false_alarms = set(verdict.false_alarms)
     return {
         "samples": run.samples,
         "columns": [
@@ -47,9 +48,7 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
         ],
         "deflated": deflated(column.values for column in columns),
         "tweaks": [{"sample": tweak.sample, "label": direction(tweak)} for tweak in verdict.tweaks],
-        "alarms": [
-            {"sample": index, "false": index in set(verdict.false_alarms)} for index in run.alarm_index.tolist()
-        ],
+        "alarms": [{"sample": index, "false": index in false_alarms} for index in run.alarm_index.tolist()],
         "segments": [
             {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in run.segments
         ],
