@@ -29,7 +29,11 @@ class HostProcess:
         """
         try:
             self._process = subprocess.Popen(
-                [str(program), *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
+                [str(program), *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                bufsize=0,
+                process_group=0,  # Ctrl-C is for the harness, which then ends the device
             )
         except OSError as error:
             raise LinkError(f"cannot start {program}: {error.strerror}; run `make setup`") from error

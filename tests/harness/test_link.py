@@ -204,6 +204,13 @@ def test_process_answers_and_is_gone_after_close() -> None:
     link.close()
 
 
+def test_ctrl_c_at_the_terminal_does_not_reach_the_process() -> None:
+    """It goes to all processes of a group."""
+    link = HostProcess()
+    assert os.getpgid(link.pid) != os.getpgid(0)
+    link.close()
+
+
 def test_process_that_hangs_is_gone_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.host_process.END_TIMEOUT_S", 0.05)
     link = HostProcess()

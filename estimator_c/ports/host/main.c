@@ -16,8 +16,6 @@
 #include <termios.h>
 #include <unistd.h>
 
-#define VERSION "0.1.0"
-
 #define EXIT_USAGE 2
 
 /// A burst of blocks and all their answers; when either is full the line waits.
@@ -79,7 +77,8 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
             return false;
         }
         if (strcmp(argv[i], "--version") == 0) {
-            (void)printf("analogrig-device %s, catalogue %08" PRIx32 "\n", VERSION, (uint32_t)ANALOGRIG_CATALOGUE_HASH);
+            (void)printf("analogrig-device %d.%d, catalogue %08" PRIx32 "\n", EST_VERSION_MAJOR, EST_VERSION_MINOR,
+                         (uint32_t)ANALOGRIG_CATALOGUE_HASH);
             return false;
         }
         if (strcmp(argv[i], "--catalogue-hash") == 0) {
