@@ -50,22 +50,22 @@ def turn(computer: SuspensionComputer, count: int) -> None:
 
 def streams() -> Iterator[tuple[str, Excitation]]:
     yield "quiet", Excitation(low_v=5.0, high_v=5.0)
-    yield "square_200_hz", Excitation()
-    yield "square_200_hz_free_running", Excitation(clock="free", phase=0.137, drift_ppm=20.0)
-    yield "prbs_10_khz", Excitation(shape="prbs", frequency_hz=10e3)
+    yield "200 Hz square wave", Excitation()
+    yield "200 Hz square wave, free-running", Excitation(clock="free", phase=0.137, drift_ppm=20.0)
+    yield "10 kHz PRBS", Excitation(shape="prbs", frequency_hz=10e3)
 
 
 def main() -> None:
     samples = 500_000
     for name, excitation in streams():
         rate = samples / best_s(functools.partial(play, excitation, samples))
-        print(f"emulator_{name} {rate:.3g} samples/s")
+        print(f"emulator, {name}\t{rate:.0f}\tsamples/s")
     trials = 50
     trial_s = best_s(functools.partial(run_trials, trials)) / trials
-    print(f"emulator_trial_800_samples_4_tweaks {1e3 * trial_s:.3g} ms")
+    print(f"emulator, trial of 800 samples with 4 tweaks\t{1e3 * trial_s:.2f}\tms")
     turns = 200
     turn_s = best_s(functools.partial(turn, SuspensionComputer("front"), turns)) / turns
-    print(f"emulator_pot_turned {1e6 * turn_s:.3g} us")
+    print(f"emulator, pot turned\t{1e6 * turn_s:.0f}\tus")
 
 
 if __name__ == "__main__":
