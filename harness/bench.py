@@ -28,21 +28,25 @@ _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
 @dataclass
 class _Collected:
-    """What has come from rig and device so far, block by block."""
+    """What has come from rig and device so far, block by block; the volts are not kept."""
 
-    blocks: list[Block] = field(default_factory=list)
+    codes: list[NDArray[np.uint16]] = field(default_factory=list)
+    clipped: list[NDArray[np.bool_]] = field(default_factory=list)
     replies: list[Replies] = field(default_factory=list)
+    samples: int = 0
 
-    @property
-    def samples(self) -> int:
-        return sum(len(reply.statistic) for reply in self.replies)
+    def add(self, block: Block, reply: Replies) -> None:
+        self.codes.append(block.codes)
+        self.clipped.append(block.clipped)
+        self.replies.append(reply)
+        self.samples += len(block.codes)
 
     def run(self, conditions: Conditions, parameters: int) -> Run:
         alarms = [alarm for reply in self.replies for alarm in reply.alarms]
         return Run(
             conditions=conditions,
-            codes=_stacked([block.codes for block in self.blocks], (0, len(CHANNELS)), np.uint16),
-            clipped=_stacked([block.clipped for block in self.blocks], (0, len(CHANNELS)), np.bool_),
+            codes=_stacked(self.codes, (0, len(CHANNELS)), np.uint16),
+            clipped=_stacked(self.clipped, (0, len(CHANNELS)), np.bool_),
             theta=_stacked([reply.theta for reply in self.replies], (0, parameters), np.float32),
             innovation=_stacked([reply.innovation for reply in self.replies], (0,), np.float32),
             statistic=_stacked([reply.statistic for reply in self.replies], (0,), np.float32),
@@ -101,7 +105,6 @@ class Bench:
         for block in blocks:
             missing = block.clipped[:, _FORCE] | block.clipped[:, _DISPLACEMENT]
             reply = self.dut.feed(block.first, block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], missing)
-            collected.blocks.append(block)
-            collected.replies.append(reply)
+            collected.add(block, reply)
             if self._progress is not None:
                 self._progress(collected.samples, samples)

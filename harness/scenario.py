@@ -19,7 +19,8 @@ from harness.verdict import Expectations
 PLANTS = {name: Plant(program.M_kg, program.B_n_s_per_m, program.K_n_per_m) for name, program in PROGRAMS.items()}
 """The parameters with which each program of the computer starts."""
 
-MAX_SAMPLES = 100_000_000
+MAX_SAMPLES = 10_000_000
+"""A run is kept in memory, some 70 bytes a sample."""
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def test_mistake_is_named_with_its_place(table: dict[str, object], message: str)
     ("old", "new", "message"),
     [
         ("samples = 100", "samples = 100\nsampels = 3", "unknown key 'sampels'"),
-        ("samples = 100", "samples = 0", "samples must be in 1 .. 100000000, not 0"),
+        ("samples = 100", "samples = 0", "samples must be in 1 .. 10000000, not 0"),
         ("sample = 50", "sample = 100", "the tweak at sample 100 is beyond the last of 100 samples"),
         ("mass_kg = 30.0", "mass_kg = -30.0", "tweaks[0]: mass_kg must be more than 0, not -30"),
         ("mass_kg = 30.0", "", "tweaks[0]: a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m"),
