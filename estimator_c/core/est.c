@@ -17,6 +17,9 @@
 /// default orders can filter, is then far below one code.
 #define IMPULSE_NEGLIGIBLE 1.0e-7F
 
+/// Certain beyond the precision of float32 by any measure of the data.
+#define VARIANCE_NEGLIGIBLE 1.0e-30F
+
 /// A prefilter coefficient cannot reasonably be larger: (1 - z^-1)^8 has 70.
 #define C_LIMIT 70.0F
 
@@ -52,11 +55,15 @@ static void reset_covariance(est_t* const self, const uint8_t rows) {
     }
 }
 
-/// Without this the variance of a direction that is not excited grows by 1 / forgetting per sample, without end
-/// ("covariance blow-up", thesis 3.6). No direction needs to be less certain than it was at the start.
-static float capped(const est_t* const self, const uint8_t j, const float d) {
-    const float cap = prior_variance(self, j);
-    return (d < cap) ? d : cap;
+/// Without the upper limit the variance of a direction that is not excited grows by 1 / forgetting per sample, without end
+/// ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it was at the start. Without the lower
+/// one a direction excited beyond all measure would be lost to underflow.
+static float limited(const est_t* const self, const uint8_t j, const float d) {
+    const float upper = prior_variance(self, j);
+    if (d > upper) {
+        return upper;
+    }
+    return (d < VARIANCE_NEGLIGIBLE) ? VARIANCE_NEGLIGIBLE : d;
 }
 
 /// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
@@ -73,7 +80,7 @@ static float update_factors(est_t* const self, const float* const phi, float* co
         const float v     = self->d[j] * f;
         const float prior = alpha;
         alpha += f * v;
-        self->d[j]    = capped(self, j, (self->d[j] * prior) / (alpha * forgetting));
+        self->d[j]    = limited(self, j, (self->d[j] * prior) / (alpha * forgetting));
         const float p = f / prior;
         for (uint8_t i = self->first; i < j; i++) {
             const float u = upper[i];
@@ -157,10 +164,15 @@ static void fill_regressor(const est_t* const self, float* const phi) {
 
 // ---------------------------------------------       ESTIMATOR       ---------------------------------------------
 
+/// Beyond this the products of the update could overflow. Only an unstable prefilter gets there.
+#define FILTERED_LIMIT 1.0e9F
+
 /// False for NaN too.
 static bool plausible(const float code) { return (code >= -EST_CODE_LIMIT) && (code <= EST_CODE_LIMIT); }
 
 static bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
+
+static bool bounded(const float x) { return within(x, -FILTERED_LIMIT, FILTERED_LIMIT); }
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
@@ -311,7 +323,11 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         advance_impulse(self, first_sample);
     }
     const float y = filtered(self, self->y, sample.y);
-    shift(self->u, (uint8_t)(self->past + 1U), filtered(self, self->u, sample.u));
+    const float u = filtered(self, self->u, sample.u);
+    if (!bounded(y) || !bounded(u) || !bounded(self->impulse[0])) {
+        return enter_gap(self, EST_REFUSED);
+    }
+    shift(self->u, (uint8_t)(self->past + 1U), u);
     enter_edge(self, sample.u);
 
     float phi[EST_DIM_MAX];

@@ -122,7 +122,8 @@ typedef struct {
 typedef enum {
     EST_UPDATED = 0,  ///< the sample entered the estimate
     EST_MISSING = 1,  ///< the sample was declared missing: theta, its covariance and the statistic stay as they were
-    EST_REFUSED = 2,  ///< u or y was not finite, or beyond EST_CODE_LIMIT: counted, otherwise as a missing sample
+    EST_REFUSED = 2,  ///< u or y was not finite, or beyond EST_CODE_LIMIT, or C is unstable and what it makes of them
+                      ///< has grown beyond all use: counted, otherwise as a missing sample
 } est_status_t;
 
 /// A sample of larger magnitude than this is refused [codes].

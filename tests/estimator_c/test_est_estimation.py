@@ -121,6 +121,17 @@ def test_absurd_sample_is_counted_and_leaves_theta_untouched(estimator: Estimato
     assert (np.delete(result.status, 200) == UPDATED).all()
 
 
+def test_unstable_prefilter_is_noticed_and_breaks_nothing(estimator: Estimator) -> None:
+    """C = 1 - 3 z^-1 grows threefold a sample; the driver checks the invariants after every one."""
+    data = record(noise=3.0)
+    assert estimator.init(c=(-3.0, 0.0), kind=NONE)
+    result = estimator.run(*data)
+    assert np.isfinite(result.theta).all()
+    assert result.counters["refused"] > 10
+    assert estimator.init(c=(70.0, -70.0), kind=NONE)
+    assert np.isfinite(estimator.run(np.zeros(400), np.zeros(400)).theta).all()
+
+
 def test_lost_excitation_does_not_wind_up(estimator: Estimator) -> None:
     """Thesis section 3.6: P grows by 1/lambda a sample, to overflow after some 3000, when nothing is excited."""
     data = record(noise=1.0)

@@ -1,0 +1,77 @@
+"""Whatever the configuration and the data, the state stays one that the estimator can live with."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tests.estimator_c.est_driver import Estimator
+
+N = 300
+
+VARIANCES = st.floats(-9.0, 9.0).map(lambda exponent: 10.0**exponent).filter(lambda x: 1e-9 < x < 1e9)
+
+CONFIGURATIONS = st.fixed_dictionaries(
+    {
+        "na": st.integers(1, 2),
+        "nb": st.integers(1, 3),
+        "nk": st.integers(0, 1),
+        "offset": st.integers(0, 1),
+        "forgetting": st.sampled_from([0.5, 0.97, 0.998, 1.0]),
+        "p0": VARIANCES,
+        "p0_offset": VARIANCES,
+        "noise_variance": VARIANCES,
+        "c": st.tuples(st.floats(-70.0, 70.0), st.floats(-70.0, 70.0)) | st.just((-1.6, 0.64)),
+        "edge_codes": st.sampled_from([0.0, 1.0, 64.0]),
+        "kind": st.integers(0, 3),
+        "ceiling": st.floats(1e-3, 1e6),
+        "hold_off_n": st.integers(0, 9),
+        "warm_up_n": st.integers(0, 9),
+        "absolute": st.integers(0, 1),
+        "reset": st.integers(0, 1),
+    }
+)
+
+
+def signal(kind: str, scale: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    if kind == "noise":
+        return np.asarray(rng.normal(size=N) * scale)
+    if kind == "square":
+        return np.where(np.arange(N) // 7 % 2, scale, -scale)
+    return np.full(N, {"zero": 0.0, "constant": scale, "denormal": 1e-42}[kind])
+
+
+KINDS = st.sampled_from(["noise", "square", "zero", "constant", "denormal"])
+
+
+@settings(
+    max_examples=400,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    configuration=CONFIGURATIONS,
+    kinds=st.tuples(KINDS, KINDS),
+    exponent=st.floats(-6.0, 6.0),
+    missing=st.sampled_from([0.0, 0.02, 0.3]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_invariants_hold_after_every_sample(
+    estimator: Estimator,
+    configuration: dict[str, float],
+    kinds: tuple[str, str],
+    exponent: float,
+    missing: float,
+    seed: int,
+) -> None:
+    """The driver asks est_invariants_hold() after every sample, and fails if it does not."""
+    rng = np.random.default_rng(seed)
+    assert estimator.init(**configuration)
+    u, y = (signal(kind, 10.0**exponent, rng) for kind in kinds)
+    result = estimator.run(u, y, rng.random(N) >= missing)
+    for values in (result.theta, result.innovation, result.statistic, result.variance):
+        assert np.isfinite(values).all()
