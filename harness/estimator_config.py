@@ -12,9 +12,13 @@ from harness.catalogue import Key, Trigger
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
 ResetName = Literal["covariance", "all"]
+EdgeInstants = Literal["locked", "may-slip", "anywhere"]
 
 _RESETS: tuple[ResetName, ...] = ("covariance", "all")
 """In the order of est_reset_t."""
+
+_EDGE_INSTANTS: tuple[EdgeInstants, ...] = ("locked", "may-slip", "anywhere")
+"""In the order of est_edge_instants_t."""
 
 DEFAULT_ARL0 = 1e5
 
@@ -44,6 +48,10 @@ class EstimatorConfig:
     c: tuple[float, ...] = (-1.6, 0.64)
     """Prefilter C = 1 + c[0] z^-1 + ...; what is not given is zero."""
     edge_codes: float = 64.0
+    """A step of the force at least this large is an edge; codes."""
+    edge_instants: EdgeInstants = "may-slip"
+    """Where between two samples the edges of the force come: always at the same place (``locked``), at nearly the same
+    (``may-slip``), or each elsewhere (``anywhere``), as when the period is no whole number of samples."""
     trigger: TriggerName = "cusum"
     ceiling: float | None = None
     """Codes; ln(ARL0) for ``cusum``, where ``arl0`` may be given instead."""
@@ -94,6 +102,7 @@ class EstimatorConfig:
             yield Key.CEILING, self.statistic_ceiling
         for name in ("hold_off_n", "warm_up_n", "absolute"):
             yield Key[name.upper()], float(getattr(self, name))
+        yield Key.EDGE_INSTANTS, float(_EDGE_INSTANTS.index(self.edge_instants))
         yield Key.RESET, float(_RESETS.index(self.reset))
 
     def as_table(self) -> dict[str, Any]:

@@ -195,7 +195,8 @@ static bool config_valid(const est_config_t* const config) {
            within(config->p0, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->p0_offset, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->noise_variance, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
-           within(config->edge_codes, 0.0F, EST_CODE_LIMIT) && est_trigger_config_valid(&config->trigger);
+           within(config->edge_codes, FLT_MIN, EST_CODE_LIMIT) && (config->edge_instants >= EST_EDGES_LOCKED) &&
+           (config->edge_instants <= EST_EDGES_ANYWHERE) && est_trigger_config_valid(&config->trigger);
 }
 
 static float predicted(const est_t* const self, const float* const phi, const float* const theta) {
@@ -236,6 +237,11 @@ static void enter_edge(est_t* const self, const float u) {
             self->edges.theta[i] = self->theta[i];
         }
     }
+}
+
+/// An edge at an unknown instant leaves the plant in an unknown state, as a gap does.
+static bool begins_anew(const est_t* const self, const float u) {
+    return (self->config.edge_instants == EST_EDGES_ANYWHERE) && est_edges_is_edge(&self->edges, &self->config, u);
 }
 
 static est_step_t enter_gap(est_t* const self, const est_status_t status) {
@@ -280,6 +286,7 @@ est_config_t est_config_default(void) {
         .noise_variance = 1.2F,
         .c              = { -1.6F, 0.64F },
         .edge_codes     = 64.0F,
+        .edge_instants  = EST_EDGES_MAY_SLIP,
         .trigger        = { .kind       = EST_TRIGGER_CUSUM,
                             .ceiling    = 11.512925F,
                             .hold_off_n = 0U,
@@ -315,7 +322,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
     if (!plausible(sample.u) || !plausible(sample.y)) {
         return enter_gap(self, EST_REFUSED);
     }
-    const bool first_sample = !self->running;
+    const bool first_sample = !self->running || begins_anew(self, sample.u);
     if (first_sample) {
         begin_segment(self);
     }

@@ -94,6 +94,19 @@ typedef struct {
     est_reset_t        reset;
 } est_trigger_config_t;
 
+/// Where between two sampling instants the edges of u come. The sampled u does not tell.
+typedef enum {
+    /// Always at the same place, as with a generator on the card's clock: the b's take it in.
+    EST_EDGES_LOCKED = 0,
+    /// At nearly the same place, but it may drift across a sampling instant: then the edge is recorded one sample earlier
+    /// or later than before, and no alarm is raised for that alone. For a generator on a clock of its own whose period is
+    /// a whole number of samples, to some 50 ppm.
+    EST_EDGES_MAY_SLIP = 1,
+    /// Anywhere, and each elsewhere: what an edge did to the plant within its interval is unknown, so that each begins the
+    /// past anew. For any generator; costs some 10 % of latency.
+    EST_EDGES_ANYWHERE = 2,
+} est_edge_instants_t;
+
 /// Everything that is fixed before a run. P is in units of the noise variance of y: P = 10 means a prior standard
 /// deviation of sqrt(10) times that of the noise.
 typedef struct {
@@ -106,9 +119,8 @@ typedef struct {
     float   p0_offset;       ///< initial variance of d; > 0 [codes^2]
     float   noise_variance;  ///< of the noise e, not underestimated; > 0 [codes^2]
     float   c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 70
-    float   edge_codes;      ///< a step of u at least this large may have been recorded one sample early or late,
-                             ///< as happens when a generator on a clock of its own drifts across a sampling
-                             ///< instant: no alarm is raised for that alone. 0: off. 0 .. EST_CODE_LIMIT [codes]
+    float   edge_codes;      ///< a step of u at least this large is an edge; > 0, at most EST_CODE_LIMIT [codes]
+    est_edge_instants_t  edge_instants;
     est_trigger_config_t trigger;
 } est_config_t;
 

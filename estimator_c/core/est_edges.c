@@ -31,18 +31,26 @@ void est_edges_forget(est_edges_t* const self) {
     clear_train(self);
 }
 
+static float step_of(const est_edges_t* const self, const float u) {
+    return self->u_known ? (u - self->u_previous) : 0.0F;
+}
+
+bool est_edges_is_edge(const est_edges_t* const self, const est_config_t* const config, const float u) {
+    const float step = step_of(self, u);
+    return (step >= config->edge_codes) || (step <= -config->edge_codes);
+}
+
 bool est_edges_enter(est_edges_t* const self, const est_config_t* const config, const float u, const bool keep) {
-    const float step  = self->u_known ? (u - self->u_previous) : 0.0F;
-    const bool  edge  = (config->edge_codes > 0.0F) && ((step >= config->edge_codes) || (step <= -config->edge_codes));
-    const bool  begin = edge && !keep;
-    self->u_previous  = u;
-    self->u_known     = true;
+    const float height = est_edges_is_edge(self, config, u) ? step_of(self, u) : 0.0F;
+    const bool  begin  = (config->edge_instants == EST_EDGES_MAY_SLIP) && est_edges_is_edge(self, config, u) && !keep;
+    self->u_previous   = u;
+    self->u_known      = true;
     if (begin) {
         clear_train(self);
         self->age_n = 0U;
     }
     if (begin || (self->age_n > 0U)) {
-        advance_train(self, config, edge ? step : 0.0F);
+        advance_train(self, config, height);
         self->age_n++;
     }
     return begin;

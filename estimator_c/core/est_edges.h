@@ -14,6 +14,9 @@
 /// No edge is in doubt, and the level before the next sample is unknown.
 void est_edges_forget(est_edges_t* self);
 
+/// Whether u(k), unfiltered, would be an edge.
+bool est_edges_is_edge(const est_edges_t* self, const est_config_t* config, float u);
+
 /// Enters u(k), unfiltered. If it is an edge and no doubt is kept, a new doubt begins; returns true then.
 /// `keep` is true while the present doubt must not be dropped for a new one.
 bool est_edges_enter(est_edges_t* self, const est_config_t* config, float u, bool keep);

@@ -230,6 +230,8 @@ static uint16_t limit_of(const uint8_t key) {
         return (uint16_t)EST_TRIGGER_CUSUM;
     case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
         return (uint16_t)EST_RESET_ALL;
+    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
+        return (uint16_t)EST_EDGES_ANYWHERE;
     default:
         return 0U;
     }
@@ -264,6 +266,9 @@ static void set_whole(est_config_t* const config, const uint8_t key, const uint1
     case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
         config->trigger.reset = (est_reset_t)value;
         break;
+    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
+        config->edge_instants = (est_edge_instants_t)value;
+        break;
     default:
         break;
     }
@@ -289,6 +294,8 @@ static uint16_t whole_value(const est_config_t* const config, const uint8_t key)
         return (uint16_t)config->trigger.kind;
     case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
         return (uint16_t)config->trigger.reset;
+    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
+        return (uint16_t)config->edge_instants;
     default:
         return 0U;
     }

@@ -5,7 +5,7 @@
 #include <stddef.h>
 
 typedef struct {
-    double na, nb, nk, offset, forgetting, p0, p0_offset, noise_variance, c[2], edge_codes;
+    double na, nb, nk, offset, forgetting, p0, p0_offset, noise_variance, c[2], edge_codes, edge_instants;
     double kind, ceiling, hold_off_n, warm_up_n, absolute, reset;
 } driver_config_t;
 
@@ -16,7 +16,7 @@ int driver_init(const driver_config_t* in) {
         .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .offset = in->offset != 0,
         .forgetting = (float)in->forgetting, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
         .noise_variance = (float)in->noise_variance, .c = { (float)in->c[0], (float)in->c[1] },
-        .edge_codes = (float)in->edge_codes,
+        .edge_codes = (float)in->edge_codes, .edge_instants = (est_edge_instants_t)in->edge_instants,
         .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
                      .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,
                      .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset },
@@ -27,7 +27,7 @@ int driver_init(const driver_config_t* in) {
 void driver_default(driver_config_t* out) {
     const est_config_t c = est_config_default();
     *out = (driver_config_t){ c.na, c.nb, c.nk, c.offset, c.forgetting, c.p0, c.p0_offset, c.noise_variance,
-                              { c.c[0], c.c[1] }, c.edge_codes, c.trigger.kind, c.trigger.ceiling,
+                              { c.c[0], c.c[1] }, c.edge_codes, c.edge_instants, c.trigger.kind, c.trigger.ceiling,
                               c.trigger.hold_off_n, c.trigger.warm_up_n, c.trigger.absolute, c.trigger.reset };
 }
 

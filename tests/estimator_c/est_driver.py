@@ -27,6 +27,7 @@ COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips")
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM = range(4)
 UPDATED, MISSING, REFUSED = range(3)
+LOCKED, MAY_SLIP, ANYWHERE = range(3)
 
 
 class Config(ctypes.Structure):
@@ -35,7 +36,10 @@ class Config(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_double) for name in "na nb nk offset forgetting p0 p0_offset noise_variance".split()),
         ("c", ctypes.c_double * 2),
-        *((name, ctypes.c_double) for name in "edge_codes kind ceiling hold_off_n warm_up_n absolute reset".split()),
+        *(
+            (name, ctypes.c_double)
+            for name in "edge_codes edge_instants kind ceiling hold_off_n warm_up_n absolute reset".split()
+        ),
     ]
 
 

@@ -310,7 +310,8 @@ VALUES = {
     Key.P0: 25.0,
     Key.P0_OFFSET: 64.0,
     Key.NOISE_VARIANCE: 2.5,
-    Key.EDGE_CODES: 0.0,
+    Key.EDGE_CODES: 32.0,
+    Key.EDGE_INSTANTS: 2.0,
     Key.TRIGGER: float(Trigger.MEAN_BETWEEN_FAULTS),
     Key.CEILING: 3.5,
     Key.HOLD_OFF_N: 4.0,
@@ -348,7 +349,7 @@ def test_each_key_sets_its_field_and_no_other(idle: Device, key: Key, value: flo
 
 def test_configuration_is_what_the_run_uses(idle: Device, estimator: Estimator) -> None:
     u, y = codes(300)
-    settings = {"nb": 2.0, "nk": 1.0, "forgetting": 0.95, "edge_codes": 0.0}
+    settings = {"nb": 2.0, "nk": 1.0, "forgetting": 0.95, "edge_codes": 32.0}
     for name, value in settings.items():
         assert idle.configure(Key[name.upper()], value).result == Result.APPLIED
     idle.control(Command.START)

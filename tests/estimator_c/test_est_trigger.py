@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from tests.estimator_c.est_driver import CUSUM, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
+from tests.estimator_c.est_driver import ANYWHERE, CUSUM, LOCKED, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01
@@ -22,7 +22,7 @@ PLAIN: dict[str, float | tuple[float, float]] = {
     "offset": 0,
     "c": (0.0, 0.0),
     "forgetting": 1.0,
-    "edge_codes": 0.0,
+    "edge_instants": LOCKED,
 }
 
 
@@ -137,8 +137,24 @@ def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator
     watched = estimator.run(u, y)
     assert len(watched.alarms) == 0
     assert watched.counters["slips"] == 1
-    assert estimator.init(edge_codes=0.0)
+    assert estimator.init(edge_instants=LOCKED)
     assert len(estimator.run(u, y).alarms) == 1, "without the second look it is a false alarm"
+
+
+@pytest.mark.parametrize("period_n", [33.37, 66.66, 50.05], ids=str)
+def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator, period_n: float) -> None:
+    """Half periods that are no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each."""
+    alarms = {ANYWHERE: 0, LOCKED: 0}
+    for seed in range(20):
+        edges = np.arange(10.3 + seed, 1600.0, period_n)
+        u, y = suspension([(0, FRONT), (1400, (115.0, 3021.0, 18000.0))], edges, 1600, 1.0, seed)
+        for instants in alarms:
+            assert estimator.init(edge_instants=instants)
+            raised = estimator.run(u, y).alarms
+            alarms[instants] += len(raised)
+            assert instants == LOCKED or (len(raised) == 1 and 1400 < raised[0] <= 1400 + 80)
+    assert alarms[ANYWHERE] == 20
+    assert alarms[LOCKED] > 60, "without it hardly an edge passes for what it is"
 
 
 def test_missing_samples_do_not_move_the_statistic(estimator: Estimator) -> None:
