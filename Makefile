@@ -72,6 +72,7 @@ distclean: clean ## remove the environment too
 # The environment, in two steps. Each ends with its stamp, so that one which was interrupted is made again from nothing.
 
 $(VENV)/.requirements: requirements.lock
+	@command -v $(PYTHON) >/dev/null || { echo "analogrig needs Python ($(PYTHON)): apt-get install python3 python3-venv" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo "analogrig needs Python 3.11 or newer, not $$($(PYTHON) -V 2>&1): make PYTHON=python3.11" >&2; exit 1; }
 	@command -v $(firstword $(CC)) >/dev/null || \

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from harness.bench import Progress
@@ -26,6 +26,9 @@ PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
 
 _STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE}
 
+RUN_FILE, REPORT_FILE = "run.npz", "report.html"
+
+DEFAULT_SCENARIO = "thesis"
 DEFAULT_SEED = 1995
 
 
@@ -49,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="analogrig",
         description="Hardware in the loop for embedded parameter estimators: a rig, a link, a device, a verdict.",
         epilog="Exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted.",
@@ -60,6 +63,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_replay(commands)
     _add_emulate(commands)
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE, f"analogrig: {message} (see {self.prog} --help)\n")
 
 
 class _Version(argparse.Action):
@@ -107,7 +117,9 @@ def _add_emulate(commands: Any) -> None:
 
 def _add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--scenario", default="thesis", metavar="NAME", help="a shipped name or a .toml file (%(default)s)"
+        "--scenario",
+        metavar="NAME",
+        help=f"a shipped name or a .toml file (default: {DEFAULT_SCENARIO}, or that recorded)",
     )
     command.add_argument(
         "--rig",
@@ -116,7 +128,7 @@ def _add_what_to_play(command: argparse.ArgumentParser) -> None:
         help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG or emulator)",
     )
     command.add_argument(
-        "--seed", type=_seed, default=DEFAULT_SEED, metavar="N", help="of all that is random (%(default)s)"
+        "--seed", type=_seed, metavar="N", help=f"of all that is random (default: {DEFAULT_SEED}, or that recorded)"
     )
 
 
@@ -147,20 +159,55 @@ def _add_output(command: argparse.ArgumentParser, default: Path = Path("build/ru
 def _run(arguments: argparse.Namespace) -> int:
     from harness.dut import open_dut
     from harness.rig import open_rig
-    from harness.scenario import Scenario
 
-    scenario = Scenario.load(arguments.scenario)
-    with open_rig(arguments.rig) as rig, open_dut(arguments.dut) as dut:
-        return _play(rig, dut, scenario, arguments.seed, arguments)
+    with open_rig(arguments.rig) as rig:
+        scenario, seed = _what_to_play(rig, arguments)
+        _prepare(arguments.out, rig)
+        with open_dut(arguments.dut) as dut:
+            return _play(rig, dut, scenario, seed, arguments)
 
 
 def _replay(arguments: argparse.Namespace) -> int:
     from harness.dut import open_dut, reopen_dut
     from harness.rig import RecordingRig
 
-    rig = RecordingRig.open(arguments.file)
-    with open_dut(arguments.dut) if arguments.dut else reopen_dut(rig.run.conditions.dut) as dut:
-        return _play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments)
+    with RecordingRig.open(arguments.file) as rig:
+        _prepare(arguments.out, rig)
+        with open_dut(arguments.dut) if arguments.dut else reopen_dut(rig.run.conditions.dut) as dut:
+            return _play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments)
+
+
+def _what_to_play(rig: Rig, arguments: argparse.Namespace) -> tuple[Scenario, int]:
+    """Scenario and seed: those asked for; by default those of the recording if the rig is one."""
+    from harness.rig import RecordingRig
+    from harness.scenario import Scenario
+
+    recording = rig if isinstance(rig, RecordingRig) else None
+    if recording is not None and arguments.scenario is None:
+        scenario = recording.scenario()
+    else:
+        scenario = Scenario.load(arguments.scenario or DEFAULT_SCENARIO)
+    if arguments.seed is not None:
+        return scenario, arguments.seed
+    return scenario, DEFAULT_SEED if recording is None else recording.run.conditions.seed
+
+
+def _prepare(out: Path, rig: Rig) -> None:
+    """Find out before the run whether its results can be kept.
+
+    :raises ConfigurationError: the folder cannot be made, or holds the recording that is being played.
+    """
+    from harness.errors import ConfigurationError
+    from harness.rig import RecordingRig
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"--out {out}: {error.strerror or error}") from error
+    if not os.access(out, os.W_OK | os.X_OK):
+        raise ConfigurationError(f"--out {out}: cannot be written to")
+    if isinstance(rig, RecordingRig) and rig.path.resolve() == (out / RUN_FILE).resolve():
+        raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
 
 
 def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace) -> int:
@@ -172,8 +219,8 @@ def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse
     run = Bench(rig, dut, progress=_progress_line()).play(scenario, seed)
     verdict = judge(run)
     try:
-        run.save(arguments.out / "run.npz")
-        write_report(run, verdict, arguments.out / "report.html")
+        run.save(arguments.out / RUN_FILE)
+        write_report(run, verdict, arguments.out / REPORT_FILE)
     except RecordingError as error:
         print(f"analogrig: INCONCLUSIVE: {error}", file=sys.stderr)
         return INCONCLUSIVE
@@ -183,13 +230,14 @@ def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse
         from harness.summary import summary
 
         print(summary(run, verdict))
-        print(f"report: {arguments.out / 'report.html'}\nrun:    {arguments.out / 'run.npz'}")
+        print(f"report: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
     for fault in run.conditions.faults:
         print(f"analogrig: INCONCLUSIVE: {fault}", file=sys.stderr)
     return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else _STATUS[verdict.outcome]
 
 
 def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
+    from harness.advice import advice
     from harness.verdict import as_json
 
     conditions = run.conditions
@@ -202,21 +250,21 @@ def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
         "samples": run.samples,
         "counters": dict(conditions.counters),
         **as_json(verdict),
-        "report": str(out / "report.html"),
-        "run": str(out / "run.npz"),
+        "advice": list(advice(run, verdict)),
+        "report": str(out / REPORT_FILE),
+        "run": str(out / RUN_FILE),
     }
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
     from harness.emulate import write_signals
     from harness.rig import open_rig
-    from harness.scenario import Scenario
 
-    scenario = Scenario.load(arguments.scenario)
     with open_rig(arguments.rig) as rig:
-        written = write_signals(rig, scenario, arguments.seed, arguments.out, progress=_progress_line())
+        scenario, seed = _what_to_play(rig, arguments)
+        written = write_signals(rig, scenario, seed, arguments.out, progress=_progress_line())
     if arguments.json:
-        print(json.dumps({"file": str(arguments.out), "seed": arguments.seed, **written}))
+        print(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
     else:
         print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
     return PASSED

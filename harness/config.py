@@ -40,7 +40,7 @@ def locate(kind: Kind, name: str) -> Path:
         path = Path(name)
         if path.is_file():
             return path
-        raise ConfigurationError(f"{name}: no such file")
+        raise ConfigurationError(f"{name}: {'is a directory' if path.is_dir() else 'no such file'}")
     path = fixtures() / kind / f"{name}.toml"
     if path.is_file():
         return path

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator import Card, EmulatorError, Sampler, SuspensionComputer
+from emulator.opamp import preset
 from harness import config
 from harness.errors import AnalogrigError, ConfigurationError, RigError
 from harness.run import CHANNELS, Channel, Run, Segment
@@ -93,7 +94,9 @@ def open_rig(name: str) -> Rig:
     if kind == "recording" and rest:
         return RecordingRig.open(Path(rest))
     path = config.locate("rigs", name)
-    return EmulatorRig(config.build(EmulatorDescription, {"name": path.stem, **config.read_toml(path)}, str(path)))
+    description = config.build(EmulatorDescription, {"name": path.stem, **config.read_toml(path)}, str(path))
+    with _emulator_errors(f"{path}: "):
+        return EmulatorRig(description)
 
 
 @dataclass(frozen=True)
@@ -153,9 +156,10 @@ class EmulatorRig:
     capabilities = frozenset({"tweak", "excite"})
 
     def __init__(self, description: EmulatorDescription) -> None:
+        """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
-        with _emulator_errors():
-            self._card = description.card.card()
+        self._card = description.card.card()
+        self._amplifier = preset(description.computer.op_amp)
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
@@ -164,7 +168,13 @@ class EmulatorRig:
         with _emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
-            tweaks = [(tweak.sample, _settings(tweak.given())) for tweak in scenario.tweaks]
+        tweaks = []
+        for i, tweak in enumerate(scenario.tweaks):
+            with _emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
+                settings = _settings(tweak.given())
+                computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
+            tweaks.append((tweak.sample, settings))
+        with _emulator_errors(f"scenario {scenario.name}: "):
             volts = computer.play(excitation, scenario.samples, tweaks, BLOCK_SAMPLES)
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
@@ -178,7 +188,7 @@ class EmulatorRig:
         drawn = self._description.computer
         computer = SuspensionComputer(
             scenario.plant.set,
-            opamp=drawn.op_amp,
+            opamp=self._amplifier,
             rng=_Stream.COMPONENTS.generator(seed),
             offset_v=drawn.offset_v,
             sample_rate_hz=self._card.rate_hz,
@@ -210,14 +220,15 @@ class RecordingRig:
 
     capabilities: frozenset[str] = frozenset()
 
-    def __init__(self, run: Run, name: str) -> None:
+    def __init__(self, run: Run, path: Path) -> None:
         self.run = run
-        self._name = name
+        self.path = path
+        self._name = f"recording:{path}"
 
     @classmethod
     def open(cls, path: Path) -> RecordingRig:
         """:raises RecordingError: the file cannot be read."""
-        return cls(Run.load(path), name=f"recording:{path}")
+        return cls(Run.load(path), path)
 
     def description(self) -> Mapping[str, Any]:
         return {**self.run.conditions.rig, "name": self._name}
@@ -231,10 +242,12 @@ class RecordingRig:
             tweaks=tuple(tweak for tweak in scenario.tweaks if tweak.sample < self.run.samples),
         )
 
-    def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002 - nothing is drawn any more
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        conditions = self.run.conditions
         if scenario != self.scenario():
             raise ConfigurationError(f"{self._name}: holds the scenario {self.scenario().name!r} and can play no other")
-        conditions = self.run.conditions
+        if seed != conditions.seed:
+            raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}")
         return Performance(
             conditions.sample_period_s, conditions.time_scale, conditions.channels, conditions.segments, self._blocks()
         )

@@ -174,7 +174,7 @@ class Run:
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
         except (KeyError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
-            raise RecordingError(f"{path}: truncated, or not a recording of analogrig: {error}") from error
+            raise RecordingError(f"{path}: truncated, or not a recording of analogrig") from error
         try:
             if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
                 found = f"{header['format']} {header['version']}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from harness.advice import advice
 from harness.plant import UNITS
 from harness.run import Run
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
@@ -27,7 +28,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
-    lines += ["", f"  theta hash {verdict.theta_hash}"]
+    lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
     return "\n".join(lines)
 
 

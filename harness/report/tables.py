@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from harness.advice import advice
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
@@ -31,8 +32,9 @@ def title(run: Run, verdict: Verdict) -> str:
 
 
 def outcome(run: Run, verdict: Verdict) -> str:
-    """The banner: the outcome in words, and the reasons."""
-    reasons = "".join(f"<li>{_text(reason)}</li>" for reason in verdict.reasons)
+    """The banner: the outcome in words, the reasons, and what else to know."""
+    notes = (f"Note: {sentence}." for sentence in advice(run, verdict))
+    reasons = "".join(f"<li>{_text(sentence)}</li>" for sentence in (*verdict.reasons, *notes))
     return (
         f'<section class="outcome {verdict.outcome}" aria-labelledby="outcome">'
         f'<h1 id="outcome"><span class="sign" aria-hidden="true">{_SIGNS[verdict.outcome]}</span>'

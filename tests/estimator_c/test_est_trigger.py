@@ -143,7 +143,7 @@ def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator
 
 @pytest.mark.parametrize("period_n", [33.37, 66.66, 50.05], ids=str)
 def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator, period_n: float) -> None:
-    """Half periods that are no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each."""
+    """Half periods of no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each."""
     alarms = {ANYWHERE: 0, LOCKED: 0}
     for seed in range(20):
         edges = np.arange(10.3 + seed, 1600.0, period_n)
@@ -152,7 +152,7 @@ def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator,
             assert estimator.init(edge_instants=instants)
             raised = estimator.run(u, y).alarms
             alarms[instants] += len(raised)
-            assert instants == LOCKED or (len(raised) == 1 and 1400 < raised[0] <= 1400 + 80)
+            assert instants == LOCKED or (len(raised) == 1 and 1400 < raised[0] <= 1480)
     assert alarms[ANYWHERE] == 20
     assert alarms[LOCKED] > 60, "without it hardly an edge passes for what it is"
 

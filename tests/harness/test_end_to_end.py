@@ -136,7 +136,39 @@ def test_failed_verdict_has_status_1(tmp_path: Path) -> None:
     assert [tweak["latency"] for tweak in out["tweaks"]] == [None] * 4
 
 
+def test_recording_is_a_rig_with_its_own_scenario_and_seed(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    _, out = thesis
+    rig = f"recording:{out['run']}"
+    assert run_json("run", "--rig", rig, cwd=tmp_path)["theta_hash"] == out["theta_hash"]
+    assert "was recorded with seed 3, not 4" in refusal("run", "--rig", rig, "--seed", "4", cwd=tmp_path)
+    assert "can play no other" in refusal("run", "--rig", rig, "--scenario", "healthy", cwd=tmp_path)
+    assert "would overwrite" in refusal("replay", out["run"], "--out", Path(out["run"]).parent, cwd=tmp_path)
+
+
+def test_generator_of_any_period_wants_its_own_setting(tmp_path: Path) -> None:
+    text = (
+        locate("scenarios", "thesis-free-running").read_text().replace("frequency_hz = 200.0", "frequency_hz = 180.0")
+    )
+    (tmp_path / "180.toml").write_text(text)
+    assert run_json("run", "--scenario", "180.toml", "--dut", "any-edges", cwd=tmp_path)["outcome"] == "passed"
+    alarmed = run_json("run", "--scenario", "180.toml", cwd=tmp_path, status=1)
+    assert "any-edges" in alarmed["advice"][0]
+
+
 # ---- what goes wrong
+
+
+def test_place_that_cannot_hold_the_results_is_found_before_the_run(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert "--out file/run: Not a directory" in refusal("run", "--out", "file/run", cwd=tmp_path)
+
+
+def test_wrong_rig_is_named_by_its_file(tmp_path: Path) -> None:
+    text = locate("rigs", "emulator").read_text()
+    (tmp_path / "a.toml").write_text(text.replace('"tl07x"', '"lm358"'))
+    (tmp_path / "b.toml").write_text(text.replace("noise_lsb = 1.0", "noise_lsb = -1.0"))
+    assert "a.toml: " in refusal("run", "--rig", "a.toml", cwd=tmp_path)
+    assert "b.toml: " in refusal("run", "--rig", "b.toml", cwd=tmp_path)
 
 
 def test_unknown_key_is_named_with_its_file(tmp_path: Path) -> None:
@@ -276,4 +308,4 @@ def test_killed_harness_leaves_no_device_behind(tmp_path: Path) -> None:
 
 def test_wrong_option_is_a_usage_error(tmp_path: Path) -> None:
     for arguments in (["run", "--sede", "3"], ["run", "--seed", "-1"], ["run", "--seed", "x"], [], ["fly"]):
-        assert analogrig(*arguments, cwd=tmp_path).returncode == 2
+        assert refusal(*arguments, cwd=tmp_path)

@@ -82,7 +82,10 @@ def test_tweak_to_the_same_value_is_no_change() -> None:
 
 def test_pot_beyond_its_track_is_refused_before_the_run() -> None:
     scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(Tweak(sample=50, mass_kg=20.0),))
-    with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match=r"scenario healthy: pot M: .*M_kg = 20"):
+    with (
+        open_rig("emulator") as rig,
+        pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M_kg = 20"),
+    ):
         rig.perform(scenario, 1)
 
 

@@ -1,0 +1,70 @@
+"""What a user should know beyond the verdict: settings that do not fit together, and what could not be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from emulator.excitation import TICKS_PER_SAMPLE, Excitation
+from harness import config
+from harness.information import QUANTISATION_VARIANCE_LSB2
+from harness.run import Run
+from harness.verdict import Verdict
+
+NOISE_MARGIN = 1.05
+"""The device may be set for this much less noise than there is before it matters."""
+
+MOST_EDGE_SHIFT = 1.5e-3
+"""From one edge to the next, in samples: 30 ppm of drift at an edge every 50 samples."""
+
+_SAMPLES_LOOKED_AT = 4000
+
+
+def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
+    """Sentences, the gravest first; empty if all is well."""
+    return (*_noise(run), *_edges(run), *_false_alarms(verdict), *_unseen(verdict), *_unidentified(verdict))
+
+
+def _noise(run: Run) -> Iterator[str]:
+    there = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
+    expected = float(run.conditions.dut["estimator"].get("noise_variance", np.inf))
+    if there > NOISE_MARGIN * expected:
+        yield (
+            f"the rig's noise has a variance of {there:.2g} codes^2, the device is set for {expected:.2g}:"
+            " false alarms are to be expected until its noise_variance is raised"
+        )
+
+
+def _edges(run: Run) -> Iterator[str]:
+    estimator = run.conditions.dut["estimator"]
+    if "excitation" not in run.conditions.scenario or estimator.get("edge_instants") == "anywhere":
+        return
+    excitation = config.build(Excitation, run.conditions.scenario["excitation"], "the recorded excitation")
+    if excitation.clock == "card":
+        return
+    rate_hz = 1.0 / run.conditions.sample_period_s
+    instants = excitation.edges(0, _SAMPLES_LOOKED_AT * TICKS_PER_SAMPLE, rate_hz).ticks[1:] / TICKS_PER_SAMPLE
+    intervals = np.diff(instants)
+    if len(intervals) and np.abs(intervals - np.round(intervals)).max() > MOST_EDGE_SHIFT:
+        yield (
+            "the edges of the excitation do not come a whole number of samples apart: false alarms are to be expected"
+            ' until the device is set to edge_instants = "anywhere" (as the device any-edges is)'
+        )
+
+
+def _false_alarms(verdict: Verdict) -> Iterator[str]:
+    if len(verdict.false_alarms) > max(2, len(verdict.tweaks)):
+        yield "with so many false alarms, an alarm soon after a change may be chance and its latency no merit"
+
+
+def _unseen(verdict: Verdict) -> Iterator[str]:
+    for tweak in verdict.tweaks:
+        if tweak.bound_n is None:
+            yield f"{tweak.what} at {tweak.sample} could not be seen before the next change or the end: not judged"
+
+
+def _unidentified(verdict: Verdict) -> Iterator[str]:
+    for segment in verdict.estimates:
+        if segment.estimate is None:
+            yield f"the last estimate of samples {segment.start}-{segment.end - 1} describes no mass, damper and spring"

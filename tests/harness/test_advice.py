@@ -1,0 +1,69 @@
+"""Advice: each sentence comes when it should, and none when all is well."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness.advice import advice
+from harness.plant import Plant
+from harness.run import Run
+from harness.verdict import judge
+from tests.harness.runs import ESTIMATOR, made_run
+
+FRONT = Plant(115.0, 3021.0, 24500.0)
+SOFT = Plant(115.0, 3021.0, 18000.0)
+LOADED = np.full(800, 2900.0)
+GOOD_THETA = np.tile([-1.7503, 0.769, 0.0, 0.0575, 0.0527, 0.0], (800, 1))
+"""Thesis Equ 4.8, in codes of the runs made by hand, nearly."""
+
+
+def advised(run: Run) -> str:
+    return "\n".join(advice(run, judge(run)))
+
+
+def excited(**excitation: Any) -> Run:
+    run = made_run(LOADED, [(0, FRONT)], theta=GOOD_THETA)
+    scenario = {**run.conditions.scenario, "excitation": excitation}
+    return dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, scenario=scenario))
+
+
+def test_run_in_which_all_is_well_needs_none() -> None:
+    assert advised(made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[404], theta=GOOD_THETA)) == ""
+
+
+def test_more_noise_than_the_device_is_set_for_is_named() -> None:
+    run = made_run(
+        LOADED, [(0, FRONT)], noise_lsb=2.0, theta=GOOD_THETA, estimator={**ESTIMATOR, "noise_variance": 1.2}
+    )
+    assert "variance of 4.1 codes^2, the device is set for 1.2" in advised(run)
+
+
+@pytest.mark.parametrize(
+    ("excitation", "told"),
+    [
+        ({"clock": "free", "frequency_hz": 180.0}, True),
+        ({"clock": "free", "frequency_hz": 200.0, "drift_ppm": 200.0}, True),
+        ({"clock": "free", "frequency_hz": 200.0, "drift_ppm": 20.0}, False),
+        ({"clock": "card", "frequency_hz": 180.0}, False),
+    ],
+    ids=str,
+)
+def test_edges_that_come_anywhere_are_named(excitation: dict[str, Any], told: bool) -> None:  # noqa: FBT001
+    assert ("whole number of samples apart" in advised(excited(**excitation))) == told
+
+
+def test_many_false_alarms_devalue_latencies() -> None:
+    run = made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[10, 20, 30, 404], theta=GOOD_THETA)
+    assert "may be chance" in advised(run)
+
+
+def test_change_that_could_not_be_seen_is_named() -> None:
+    assert "K at 400 could not be seen" in advised(made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA))
+
+
+def test_estimate_that_is_no_suspension_is_named() -> None:
+    assert "samples 0-799 describes no mass" in advised(made_run(LOADED, [(0, FRONT)]))
