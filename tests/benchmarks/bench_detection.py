@@ -1,18 +1,24 @@
-"""How soon the shipped device sees the thesis's changes, over 100 seeds, against the information bound."""
+"""How soon the shipped device sees the thesis's changes, over 100 seeds, against the information bound.
+
+python -m tests.benchmarks.bench_detection [FIRST_SEED END_SEED]
+"""
 
 from __future__ import annotations
 
+import sys
+
 from tests.thesis.detection import detect
 
-SEEDS = range(100)
+DEFAULT_SEEDS = (0, 100)
 
 CASES = [(scenario, rig) for rig in ("emulator", "emulator-0-10v") for scenario in ("thesis", "thesis-free-running")]
 
 
 def main() -> None:
     """Print one line a figure: name, value, unit."""
+    seeds = range(*(map(int, sys.argv[1:3]) if len(sys.argv) > 2 else DEFAULT_SEEDS))
     for scenario, rig in CASES:
-        detection = detect(scenario, rig, SEEDS)
+        detection = detect(scenario, rig, seeds)
         name = f"{scenario} on {rig}"
         print(f"{name}: missed\t{detection.missed}\tof {detection.latencies_n.size} changes")
         print(f"{name}: false alarms\t{detection.false_alarms}\tin {detection.runs} runs of 1800 samples")
