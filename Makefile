@@ -22,6 +22,7 @@ PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 export UV_PYTHON_DOWNLOADS := never
+export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test check lint strict format bench wheel lock clean distclean

@@ -94,9 +94,7 @@ class Excitation:
         self._require(
             "high_v", math.isfinite(self.high_v) and self.high_v >= self.low_v, "must be finite and not below low_v"
         )
-        self._require(
-            "frequency_hz", math.isfinite(self.frequency_hz) and self.frequency_hz > 0, "must be positive and finite"
-        )
+        self._require("frequency_hz", 1e-6 <= self.frequency_hz <= 1e12, "must be 1e-6 to 1e12")
         self._require("phase", 0 <= self.phase < 1, "must be at least 0 and less than 1 period")
         self._require("duty", 0 < self.duty < 1, "must be between 0 and 1, exclusive")
         self._require("duty", self.shape == "pulse" or self.duty == 0.5, "is for the shape pulse")
@@ -107,7 +105,7 @@ class Excitation:
             "is for the clock free: the card's clock is the reference",
         )
         self._require("register_length", self.register_length in _TAPS, f"must be {min(_TAPS)} to {max(_TAPS)}")
-        self._require("seed", isinstance(self.seed, int), "must be an integer")
+        self._require("seed", 0 <= self.seed < 2**63, "must be an integer, 0 to 2^63 - 1")
 
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
         """The edges at ticks start_tick <= t < stop_tick, t >= 0; the one at tick 0 is the switching on.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from harness.dut import Dut, Replies
 from harness.errors import DeviceError, LinkError, RigError
 from harness.rig import Block, Rig
-from harness.run import CHANNELS, Conditions, Run
+from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 
 T = TypeVar("T", bound=np.generic)
@@ -103,8 +103,8 @@ class Bench:
 
     def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
         for block in blocks:
-            missing = block.clipped[:, _FORCE] | block.clipped[:, _DISPLACEMENT]
-            reply = self.dut.feed(block.first, block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], missing)
+            codes = block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT]
+            reply = self.dut.feed(block.first, *codes, missing_to_device(block.clipped))
             collected.add(block, reply)
             if self._progress is not None:
                 self._progress(collected.samples, samples)

@@ -34,21 +34,49 @@ DEFAULT_SEED = 1995
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status. Every failure is one line on standard error."""
-    arguments = _parser().parse_args(argv)
+    _open_standard_streams()
+    try:
+        arguments = _parser().parse_args(argv)
+        return int(arguments.command(arguments))
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
+        return _explain(error)
+
+
+def _explain(error: Exception) -> int:
+    """What ended a command, in one line."""
     from emulator.errors import EmulatorError
     from harness.errors import AnalogrigError
 
+    if isinstance(error, AnalogrigError | EmulatorError):
+        return _complain(str(error), USAGE)
+    if "ANALOGRIG_DEBUG" in os.environ:
+        raise error
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return _complain(f"a fault of analogrig itself: {what} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
+
+
+def _complain(message: str, status: int) -> int:
+    print(f"analogrig: {message}", file=sys.stderr)
+    return status
+
+
+def _open_standard_streams() -> None:
+    """Whoever closed one of them wants to hear nothing; a file opened later must not take its place."""
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - for as long as we live
+
+
+def _print(text: str) -> None:
+    """To standard output. If nobody listens any more, that is no reason to change what the command has found."""
     try:
-        return int(arguments.command(arguments))
-    except (AnalogrigError, EmulatorError) as error:
-        print(f"analogrig: {error}", file=sys.stderr)
-        return USAGE
-    except KeyboardInterrupt:
-        print("analogrig: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return PASSED
+        print(text, flush=True)
+    except OSError as error:
+        print(f"analogrig: standard output: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -81,7 +109,7 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         from importlib.metadata import version
 
-        print(f"analogrig {version('analogrig')}")
+        _print(f"analogrig {version('analogrig')}")
         parser.exit()
 
 
@@ -133,9 +161,9 @@ def _add_what_to_play(command: argparse.ArgumentParser) -> None:
 
 
 def _seed(text: str) -> int:
-    if text.isdecimal() and int(text) < 2**63:
+    if text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 2**63:
         return int(text)
-    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text!r}")
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
 
 
 def _add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
@@ -214,25 +242,22 @@ def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse
     from harness.bench import INTERRUPTED_BY_USER, Bench
     from harness.errors import RecordingError
     from harness.report import write_report
+    from harness.summary import summary
     from harness.verdict import judge
 
     run = Bench(rig, dut, progress=_progress_line()).play(scenario, seed)
     verdict = judge(run)
+    if arguments.json:
+        _print(json.dumps(_as_json(run, verdict, arguments.out)))
+    else:
+        _print(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
     try:
         run.save(arguments.out / RUN_FILE)
         write_report(run, verdict, arguments.out / REPORT_FILE)
     except RecordingError as error:
-        print(f"analogrig: INCONCLUSIVE: {error}", file=sys.stderr)
-        return INCONCLUSIVE
-    if arguments.json:
-        print(json.dumps(_as_json(run, verdict, arguments.out)))
-    else:
-        from harness.summary import summary
-
-        print(summary(run, verdict))
-        print(f"report: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
-    for fault in run.conditions.faults:
-        print(f"analogrig: INCONCLUSIVE: {fault}", file=sys.stderr)
+        return _complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+    if not verdict.valid:
+        _complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
     return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else _STATUS[verdict.outcome]
 
 
@@ -264,9 +289,9 @@ def _emulate(arguments: argparse.Namespace) -> int:
         scenario, seed = _what_to_play(rig, arguments)
         written = write_signals(rig, scenario, seed, arguments.out, progress=_progress_line())
     if arguments.json:
-        print(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
+        _print(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
     else:
-        print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
+        _print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
     return PASSED
 
 

@@ -7,7 +7,6 @@ the file, the table and the key. Nothing read from a file is ever executed.
 from __future__ import annotations
 
 import dataclasses
-import math
 import tomllib
 import types
 import typing
@@ -24,6 +23,13 @@ Kind = Literal["scenarios", "rigs", "devices"]
 
 MAX_FILE_BYTES = 1_000_000
 
+MOST_NUMBER = 1e30
+"""Of any quantity in any unit; beyond it even a product overflows."""
+
+MOST_INTEGER = 2**63 - 1
+
+MOST_SHOWN = 200
+
 
 def fixtures() -> Path:
     """The folder of the shipped scenarios, rigs and devices: inside the installed package, or that of the checkout."""
@@ -38,14 +44,22 @@ def locate(kind: Kind, name: str) -> Path:
     """
     if name.endswith(".toml") or "/" in name:
         path = Path(name)
-        if path.is_file():
+        if _is_file(path):
             return path
-        raise ConfigurationError(f"{name}: {'is a directory' if path.is_dir() else 'no such file'}")
+        raise ConfigurationError(f"{_brief(name)}: {'is a directory' if path.is_dir() else 'no such file'}")
     path = fixtures() / kind / f"{name}.toml"
-    if path.is_file():
+    if _is_file(path):
         return path
     known = ", ".join(names(kind))
-    raise ConfigurationError(f"no {kind[:-1]} is called {name!r}: there are {known}, or give a .toml file")
+    raise ConfigurationError(f"no {kind[:-1]} is called {_shown(name)}: there are {known}, or give a .toml file")
+
+
+def _is_file(path: Path) -> bool:
+    """:raises ConfigurationError: the system will not even look."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise ConfigurationError(f"{_brief(str(path))}: {error.strerror or error}") from error
 
 
 def names(kind: Kind) -> list[str]:
@@ -64,7 +78,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
 
 
@@ -87,7 +101,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
-    except (ValueError, EmulatorError) as error:
+    except (ValueError, ArithmeticError, EmulatorError) as error:
         table_name = where.rpartition(": ")[2]
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
 
@@ -137,11 +151,11 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if hint is Any:
         return value
     if hint is float:
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER:
             return float(value)
-        raise ConfigurationError(f"{where}: must be a finite number, not {value!r}")
-    if hint is int and isinstance(value, bool):
-        raise ConfigurationError(f"{where}: must be a whole number, not {value!r}")
+        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_shown(value)}")
+    if hint is int and (isinstance(value, bool) or (isinstance(value, int) and abs(value) > MOST_INTEGER)):
+        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_shown(value)}")
     words = {int: "a whole number", bool: "true or false", str: "a text"}
     return _expect(hint, value, words[hint], where)
 
@@ -149,4 +163,13 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
 def _expect(kind: type[T], value: Any, words: str, where: str) -> T:
     if isinstance(value, kind):
         return value
-    raise ConfigurationError(f"{where}: must be {words}, not {value!r}")
+    raise ConfigurationError(f"{where}: must be {words}, not {_shown(value)}")
+
+
+def _shown(value: Any) -> str:
+    """A value in an error, in one line of bounded length."""
+    return "a longer one" if isinstance(value, int) and abs(value) > MOST_INTEGER else _brief(repr(value))
+
+
+def _brief(text: str) -> str:
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."

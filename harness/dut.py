@@ -47,6 +47,7 @@ from harness.catalogue import (
 from harness.conversation import Conversation
 from harness.errors import (
     CatalogueMismatch,
+    ConfigurationError,
     DeviceError,
     DeviceRefused,
     LinkClosed,
@@ -57,6 +58,8 @@ from harness.host_process import HostProcess
 from harness.link import DEFAULT_BAUD, Clock, Link, MemoryLink, SerialLink
 
 DEFAULT_TIMEOUT_S = 2.0
+LONGEST_TIMEOUT_S = 3600.0
+MOST_BAUD = 100_000_000
 
 _HELLO_AGAIN_S = 0.25
 """A board that resets when its port is opened does not hear the first call."""
@@ -122,10 +125,10 @@ class DeviceDescription:
     def __post_init__(self) -> None:
         if (self.kind == "serial") != (self.url is not None):
             raise ValueError("a url goes with the kind 'serial', and with no other")
-        if not self.baud > 0:
-            raise ValueError(f"baud must be positive, not {self.baud}")
-        if not self.timeout_s > 0.0:
-            raise ValueError(f"timeout_s must be positive, not {self.timeout_s:g}")
+        if not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+        if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
+            raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
 
     def as_table(self) -> dict[str, Any]:
         """In plain values, from which the same can be made."""
@@ -309,7 +312,8 @@ class Dut:
                 if not self._collect(index, deadline_s, collected):
                     raise self._silence(index)
         except LinkClosed as error:
-            raise LinkClosed(f"{error} after sample {index - 1}") from error
+            place = f"after sample {index - 1}" if index > 0 else "before the first sample"
+            raise LinkClosed(f"{error} {place}") from error
 
     def _message(self, first: int, samples: Sequence[_Codes]) -> Message:
         seq = self._talk.next_seq()
@@ -400,9 +404,17 @@ def open_dut(name: str) -> Dut:
 
 
 def reopen_dut(description: Mapping[str, Any]) -> Dut:
-    """A device as in a record of ``Dut.description()``; errors as ``open_dut``."""
+    """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
+
+    What a file names is not opened on its word alone: a device at a URL must be named again.
+    """
     table = {key: value for key, value in description.items() if key != "identity"}
-    return connect(config.build(DeviceDescription, table, "the recorded device"))
+    recorded = config.build(DeviceDescription, table, "the recorded device")
+    if recorded.kind == "serial":
+        raise ConfigurationError(
+            f"the recorded device was at {recorded.url}: say --dut serial:{recorded.url}, or another"
+        )
+    return connect(recorded)
 
 
 def connect(description: DeviceDescription) -> Dut:

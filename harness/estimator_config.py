@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from harness.catalogue import Key, Trigger
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
@@ -25,7 +27,8 @@ DEFAULT_ARL0 = 1e5
 MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
 """The catalogue has keys for so many coefficients of C; a build of the device may take fewer."""
 
-_FLOAT32_MAX = 3.4e38
+MOST_CEILING = 1e9
+"""As EST_CEILING_LIMIT in est.h."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class EstimatorConfig:
     nb: int = 3
     nk: int = 0
     offset: bool = True
-    forgetting: float = 0.998
+    forgetting: float = 0.99
     p0: float = 10.0
     p0_offset: float = 1.0e6
     """codes^2"""
@@ -63,10 +66,18 @@ class EstimatorConfig:
     reset: ResetName = "covariance"
 
     def __post_init__(self) -> None:
+        self._check_prefilter()
+        self._check_ceiling()
+
+    def _check_prefilter(self) -> None:
         if not 1 <= self.na <= MAX_NA:
             raise ValueError(f"na must be in 1 .. {MAX_NA}, not {self.na}")
         if len(self.c) > self.na:
             raise ValueError(f"c must have at most na = {self.na} elements, not {len(self.c)}")
+        if any(abs(root) >= 1.0 for root in np.roots([1.0, *self.c])):
+            raise ValueError(f"c makes an unstable prefilter: {', '.join(format(x, 'g') for x in self.c)}")
+
+    def _check_ceiling(self) -> None:
         if self.arl0 is not None and (self.trigger != "cusum" or self.ceiling is not None):
             raise ValueError("arl0 goes with the trigger 'cusum' and without a ceiling")
         if self.arl0 is not None and not self.arl0 > 1.0:
@@ -75,9 +86,8 @@ class EstimatorConfig:
             raise ValueError(f"the trigger {self.trigger!r} needs a ceiling")
         if self.ceiling is not None and self.trigger == "none":
             raise ValueError("the trigger 'none' has no ceiling")
-        for key, value in self.settings():
-            if not abs(value) <= _FLOAT32_MAX:
-                raise ValueError(f"{key.name.lower()} must be a number that float32 can hold, not {value:g}")
+        if self.ceiling is not None and not 0.0 < self.ceiling <= MOST_CEILING:
+            raise ValueError(f"ceiling must be more than 0 and at most {MOST_CEILING:g}, not {self.ceiling:g}")
 
     @property
     def parameters(self) -> int:

@@ -97,10 +97,10 @@ class SerialLink:
         self._inbox = _Inbox()
         try:
             self._port = serial.serial_for_url(url, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
-        except ValueError as error:
-            raise ConfigurationError(f"{url}: {error}") from error
         except OSError as error:
             raise LinkError(f"cannot open {url}: {_reason(error)}") from error
+        except Exception as error:  # the handlers of pyserial's URLs raise whatever a wrong URL makes them
+            raise ConfigurationError(f"{url}: not a serial port or URL that pyserial understands: {error}") from error
         # A plain file descriptor is used as one: pyserial's read() and write() cost as much as a whole exchange.
         self._fd = self._port.fileno() if type(self._port) is serial.Serial else None
         self._poll = select.poll()

@@ -19,6 +19,10 @@ PARAMETERS = ("M", "B", "K")
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
+MOST_PARAMETER = 1e12
+"""Of any of the three, in its unit."""
+
+
 @dataclass(frozen=True)
 class Plant:
     """M x'' + B x' + K x = F (thesis Equ 2.3)."""
@@ -26,6 +30,11 @@ class Plant:
     mass_kg: float
     damping_n_s_per_m: float
     stiffness_n_per_m: float
+
+    def __post_init__(self) -> None:
+        for name, value in self.parameters().items():
+            if not 0.0 < value < MOST_PARAMETER:
+                raise ValueError(f"{name} must be more than 0 and less than {MOST_PARAMETER:g}, not {value:g}")
 
     def parameters(self) -> dict[str, float]:
         """The values under their short names ``M``, ``B``, ``K``."""

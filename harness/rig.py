@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 from emulator import Card, EmulatorError, Sampler, SuspensionComputer
 from emulator.opamp import preset
 from harness import config
-from harness.errors import AnalogrigError, ConfigurationError, RigError
+from harness.errors import AnalogrigError, ConfigurationError, RecordingError, RigError
 from harness.run import CHANNELS, Channel, Run, Segment
 from harness.scenario import Scenario
 
 BLOCK_SAMPLES = 256
 """Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
+
+MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
+MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
 
 CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
 
@@ -107,6 +110,10 @@ class ComputerDescription:
     offset_v: float = 0.0
     """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
 
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
+            raise ValueError(f"offset_v must be 0 to {MOST_OFFSET_V:g}, not {self.offset_v:g}")
+
 
 @dataclass(frozen=True)
 class CardDescription:
@@ -121,6 +128,15 @@ class CardDescription:
     def __post_init__(self) -> None:
         if set(self.range_v) != set(CHANNELS):
             raise ValueError(f"range_v must give the channels {', '.join(CHANNELS)}, not {', '.join(self.range_v)}")
+        for name, (low, high) in self.range_v.items():
+            if not -MOST_VOLTS <= low < high <= MOST_VOLTS or high - low < LEAST_SPAN_V:
+                raise ValueError(
+                    f"range_v.{name} must be (low, high) within +-{MOST_VOLTS:g} V, not ({low:g}, {high:g})"
+                )
+        if not 1.0 <= self.rate_hz <= MOST_RATE_HZ:
+            raise ValueError(f"rate_hz must be 1 to {MOST_RATE_HZ:g}, not {self.rate_hz:g}")
+        if not 0.0 <= self.noise_lsb <= MOST_NOISE_LSB:
+            raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {self.noise_lsb:g}")
 
     def card(self) -> Card:
         """:raises SamplerError: a value is out of range."""
@@ -227,8 +243,11 @@ class RecordingRig:
 
     @classmethod
     def open(cls, path: Path) -> RecordingRig:
-        """:raises RecordingError: the file cannot be read."""
-        return cls(Run.load(path), path)
+        """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
+        run = Run.load(path)
+        if run.samples == 0:
+            raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
+        return cls(run, path)
 
     def description(self) -> Mapping[str, Any]:
         return {**self.run.conditions.rig, "name": self._name}

@@ -10,14 +10,15 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import RecordingError
+from harness import config
+from harness.errors import ConfigurationError, RecordingError
 from harness.plant import Plant
 from harness.storage import replacing
 
@@ -63,6 +64,12 @@ class Channel:
     def lsb(self) -> float:
         """One code in ``unit``."""
         return self.lsb_v * self.unit_per_v
+
+
+def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) of (n, 4): a sample whose force or displacement was clipped is no measurement."""
+    used = [CHANNELS.index("force"), CHANNELS.index("displacement")]
+    return np.asarray(clipped[:, used].any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -132,9 +139,8 @@ class Run:
 
     @property
     def missing(self) -> NDArray[np.bool_]:
-        """(n,): the device could not use this sample, since force or displacement was clipped."""
-        used = [CHANNELS.index("force"), CHANNELS.index("displacement")]
-        return np.asarray(self.clipped[:, used].any(axis=1))
+        """(n,): the device was told that this sample is missing."""
+        return missing_to_device(self.clipped)
 
     def channel(self, name: str) -> NDArray[np.float64]:
         """One channel in its physical unit, (n,) float64."""
@@ -165,38 +171,62 @@ class Run:
     def load(cls, path: Path) -> Run:
         """Read a recording.
 
-        :raises RecordingError: the file is absent, truncated, or not a recording of this format.
+        :raises RecordingError: the file is absent, truncated, damaged, or not a recording of this format.
         """
         try:
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                header = json.loads(str(file["header"]))
-                arrays = {name: _checked(name, file[name]) for name in _ARRAYS}
+            with path.open("rb") as raw:
+                _check_archive(raw)
+                with np.load(raw, allow_pickle=False) as file:
+                    header = json.loads(str(file["header"]))
+                    arrays = {name: _checked(name, file[name]) for name in _ARRAYS}
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
-        except (KeyError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+        except Exception as error:  # numpy and zipfile raise a dozen types on damaged archives, undocumented
             raise RecordingError(f"{path}: truncated, or not a recording of analogrig") from error
-        try:
-            if header["format"] != FORMAT or header["version"] != FORMAT_VERSION:
-                found = f"{header['format']} {header['version']}"
-                raise RecordingError(f"{path}: its format is {found}, expected {FORMAT} {FORMAT_VERSION}")
-            run = cls(conditions=_from_json(header["conditions"]), **arrays)
-        except (KeyError, TypeError, ValueError) as error:
-            raise RecordingError(f"{path}: the header of the recording is damaged: {error!r}") from error
-        run._check_shapes(path)
+        run = cls(conditions=_conditions(header, path), **arrays)
+        run._check_consistency(path)
         return run
 
-    def with_faults(self, *faults: str) -> Run:
-        """The same run, marked as not valid for these further reasons."""
-        return replace(self, conditions=replace(self.conditions, faults=(*self.conditions.faults, *faults)))
-
-    def _check_shapes(self, path: Path) -> None:
-        n = self.samples
-        rows = {name: len(getattr(self, name)) for name in ("clipped", "theta", "innovation", "statistic", "flags")}
-        wrong = [f"{name} has {count} rows" for name, count in rows.items() if count != n]
-        if self.codes.shape[1:] != (len(CHANNELS),) or self.clipped.shape[1:] != (len(CHANNELS),):
-            wrong.append(f"codes have the shape {self.codes.shape}")
+    def _check_consistency(self, path: Path) -> None:
+        """The arrays belong together, and so do they and the header."""
+        n, alarms = self.samples, len(self.alarm_index)
+        conditions = self.conditions
+        starts = [segment.start for segment in conditions.segments]
+        checks = {
+            "arrays of different lengths": all(
+                len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
+            )
+            and len(self.alarm_kind) == len(self.alarm_statistic) == alarms,
+            "channels": set(conditions.channels) == set(CHANNELS)
+            and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
+            "sample times": conditions.sample_period_s > 0.0 and conditions.time_scale > 0.0,
+            "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
+            "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
+            "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
+            "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),
+        }
+        wrong = [what for what, holds in checks.items() if not holds]
         if wrong:
-            raise RecordingError(f"{path}: damaged recording of {n} samples: {', '.join(wrong)}")
+            raise RecordingError(f"{path}: damaged recording: its {', '.join(wrong)} do not fit together")
+
+
+def _check_archive(raw: BinaryIO) -> None:
+    """Refuses what would be far larger in memory than on disk: a recording is not compressed."""
+    with zipfile.ZipFile(raw) as archive:
+        if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+            raise ValueError("compressed")
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(damaged)
+    raw.seek(0)
+
+
+def _parameters(estimator: Any) -> int | None:
+    """How many elements theta has."""
+    try:
+        return int(estimator["na"]) + int(estimator["nb"]) + int(estimator["offset"])
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
@@ -213,9 +243,14 @@ def _to_json(conditions: Conditions) -> dict[str, Any]:
     return out
 
 
-def _from_json(header: Mapping[str, Any]) -> Conditions:
-    values = dict(header)
-    values["channels"] = {name: Channel(**channel) for name, channel in header["channels"].items()}
-    values["segments"] = tuple(Segment(s["start"], Plant(**s["plant"])) for s in header["segments"])
-    values["faults"] = tuple(header["faults"])
-    return Conditions(**values)
+def _conditions(header: Any, path: Path) -> Conditions:
+    """:raises RecordingError: the header is not one, or of another format."""
+    if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
+        raise RecordingError(f"{path}: not of the format {FORMAT} {FORMAT_VERSION}")
+    table = header.get("conditions")
+    if not isinstance(table, dict):
+        raise RecordingError(f"{path}: the header of the recording has no conditions")
+    try:
+        return config.build(Conditions, table, f"{path}: the header of the recording")
+    except ConfigurationError as error:
+        raise RecordingError(str(error)) from error

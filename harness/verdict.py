@@ -14,9 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import information
+from harness import config, information
 from harness.plant import PARAMETERS, physical_parameters
 from harness.run import Run
+
+LARGEST_LEVEL = 700.0
+"""exp() of more does not fit a float."""
 
 Outcome = Literal["passed", "failed", "inconclusive"]
 
@@ -33,7 +36,7 @@ class Expectations:
     """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
     late_information_ratio: float = 4.0
     """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
-    late_slack_n: int = 10
+    late_slack_n: int = 15
     """... so many samples ago."""
     max_missing_fraction: float = 0.25
     """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
@@ -117,10 +120,10 @@ class Verdict:
 
 def judge(run: Run) -> Verdict:
     """Judge ``run`` by the expectations of the scenario it carries."""
-    expect = Expectations(**run.conditions.scenario.get("expect", {}))
+    expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
     trigger = run.conditions.dut["estimator"]
-    arl0 = math.exp(trigger["ceiling"]) if trigger["trigger"] == "cusum" else expect.arl0
-    tweaks, false_alarms = _attribute_alarms(run, expect, math.log(arl0))
+    level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
+    tweaks, false_alarms = _attribute_alarms(run, expect, level)
     invalid = _invalidities(run, expect)
     failures = _failures(tweaks, false_alarms, expect)
     outcome: Outcome = "inconclusive" if invalid else "failed" if failures else "passed"
@@ -130,7 +133,7 @@ def judge(run: Run) -> Verdict:
         tweaks=tweaks,
         false_alarms=false_alarms,
         estimates=_segment_estimates(run),
-        arl0=arl0,
+        arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
         missing_n=int(run.missing.sum()),
         theta_hash=run.theta_hash(),
@@ -214,6 +217,11 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
+    reasons += [
+        f"the device {what} {run.conditions.counters[counter]} samples"
+        for counter, what in (("refused", "refused"), ("samples_lost", "never saw"))
+        if run.conditions.counters.get(counter)
+    ]
     missing = int(run.missing.sum())
     if run.samples and missing > expect.max_missing_fraction * run.samples:
         reasons.append(

@@ -25,6 +25,10 @@
 
 static void count(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
+/// The orders of the default configuration, as far as this build has room for them.
+#define DEFAULT_NA ((EST_NA_MAX < 2U) ? EST_NA_MAX : 2U)
+#define DEFAULT_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
+
 // ---------------------------------------------      U-D FACTORS      ---------------------------------------------
 
 /// The part of column j of U above its diagonal: rows 0 .. j-1.
@@ -225,7 +229,8 @@ static void read_innovation(const est_t* const self, const float* const phi, con
     readings[2] = e - late;
 }
 
-/// Beyond its term a doubt is dropped, unless it is about to decide; see est_trigger_step().
+/// A doubt that has lasted its term has been decided by est_trigger_step(). Until then another edge joins it if another
+/// reading of the earlier ones is ahead, and otherwise begins a doubt of its own.
 static void enter_edge(est_t* const self, const float u) {
     const bool expired = self->edges.age_n >= EST_DOUBT_N;
     if (expired) {
@@ -242,12 +247,6 @@ static void enter_edge(est_t* const self, const float u) {
 /// An edge at an unknown instant leaves the plant in an unknown state, as a gap does.
 static bool begins_anew(const est_t* const self, const float u) {
     return (self->config.edge_instants == EST_EDGES_ANYWHERE) && est_edges_is_edge(&self->edges, &self->config, u);
-}
-
-static est_step_t enter_gap(est_t* const self, const est_status_t status) {
-    count((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
-    self->running = false;
-    return (est_step_t){ .status = status, .alarm = false, .innovation = 0.0F, .statistic = self->trigger.statistic };
 }
 
 /// Thesis Equ 3.19, 3.21 on the filtered signals. Returns the innovation's variance over that of the noise.
@@ -274,17 +273,26 @@ static void react(est_t* const self, const est_finding_t finding) {
     self->running = false;  // the filters remember the plant, or the clock, as it was
 }
 
+static est_step_t enter_gap(est_t* const self, const est_status_t status) {
+    count((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
+    if (self->running && (self->edges.age_n > 0U)) {
+        react(self, est_trigger_end_doubt(&self->trigger, &self->config.trigger));
+    }
+    self->running = false;
+    return (est_step_t){ .status = status, .alarm = false, .innovation = 0.0F, .statistic = self->trigger.statistic };
+}
+
 est_config_t est_config_default(void) {
-    return (est_config_t){
-        .na             = 2U,
-        .nb             = 3U,
+    est_config_t config = {
+        .na             = (uint8_t)DEFAULT_NA,
+        .nb             = (uint8_t)DEFAULT_NB,
         .nk             = 0U,
         .offset         = true,
-        .forgetting     = 0.998F,
+        .forgetting     = 0.99F,
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
-        .c              = { -1.6F, 0.64F },
+        .c              = { 0.0F },
         .edge_codes     = 64.0F,
         .edge_instants  = EST_EDGES_MAY_SLIP,
         .trigger        = { .kind       = EST_TRIGGER_CUSUM,
@@ -294,6 +302,11 @@ est_config_t est_config_default(void) {
                             .absolute   = false,
                             .reset      = EST_RESET_COVARIANCE },
     };
+#if EST_NA_MAX >= 2
+    config.c[0] = -1.6F;
+    config.c[1] = 0.64F;
+#endif
+    return config;
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {

@@ -2,7 +2,7 @@
 ///
 /// The model, in sampled codes y (output) and u (input):
 ///
-///     y(k) = -a1 y(k-1) - ... - a_na y(k-na) + b_0 u(k-nk) + ... + b_(nb-1) u(k-nk-nb+1) + d + C(z) e(k)
+///     y(k) = -a1 y(k-1) - ... - a_na y(k-na) + b_0 u(k-nk) + ... + b_(nb-1) u(k-nk-nb+1) + C(1) d + C(z) e(k)
 ///
 /// theta = (a1 .. a_na, b_0 .. b_(nb-1) [, d]) is estimated by Bierman's U-D factorised least squares on the signals
 /// filtered by 1/C; a trigger watches the innovation and tells when theta has jumped. Missing samples are survived.
@@ -67,9 +67,9 @@ extern "C" {
 /// The change triggers.
 typedef enum {
     EST_TRIGGER_NONE = 0,
-    /// Alarm when |innovation| exceeds the ceiling. Thesis 4.4.2.
+    /// Alarm when |innovation| reaches the ceiling. Thesis 4.4.2.
     EST_TRIGGER_PREDICTION_ERROR = 1,
-    /// Alarm when |mean innovation since the last alarm| exceeds the ceiling; the mean is held at zero for hold_off_n
+    /// Alarm when |mean innovation since the last alarm| reaches the ceiling; the mean is held at zero for hold_off_n
     /// samples after an alarm. Thesis 4.4.3.
     EST_TRIGGER_MEAN_BETWEEN_FAULTS = 2,
     /// Cumulative sum of the normalised squared innovation; ceiling = ln(ARL0), the logarithm of the wanted mean
@@ -100,7 +100,7 @@ typedef enum {
     EST_EDGES_LOCKED = 0,
     /// At nearly the same place, but it may drift across a sampling instant: then the edge is recorded one sample earlier
     /// or later than before, and no alarm is raised for that alone. For a generator on a clock of its own whose period is
-    /// a whole number of samples, to some 50 ppm.
+    /// a whole number of samples, to some 20 ppm: the forgetting must follow what the drift does to the b's.
     EST_EDGES_MAY_SLIP = 1,
     /// Anywhere, and each elsewhere: what an edge did to the plant within its interval is unknown, so that each begins the
     /// past anew. For any generator; costs some 10 % of latency.
@@ -133,7 +133,7 @@ typedef struct {
 
 typedef enum {
     EST_UPDATED = 0,  ///< the sample entered the estimate
-    EST_MISSING = 1,  ///< the sample was declared missing: theta, its covariance and the statistic stay as they were
+    EST_MISSING = 1,  ///< the sample was declared missing: theta and its covariance stay as they were
     EST_REFUSED = 2,  ///< u or y was not finite, or beyond EST_CODE_LIMIT, or C is unstable and what it makes of them
                       ///< has grown beyond all use: counted, otherwise as a missing sample
 } est_status_t;
@@ -205,7 +205,7 @@ typedef struct {
 } est_t;
 
 /// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C fixed at
-/// (1 - 0.8 z^-1)^2, mild forgetting, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
+/// (1 - 0.8 z^-1)^2, forgetting 0.99, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
 est_config_t est_config_default(void);
 
 /// Makes the estimator ready for the first sample: theta zero, P = P0, counters zero.
@@ -215,7 +215,7 @@ bool est_init(est_t* self, const est_config_t* config);
 
 /// Enters one sample: filters, regressor, U-D update (Bierman 1977), trigger.
 /// Cost: constant for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension.
-/// RAM: none beyond the state and about 100 bytes of stack. May be called from an interrupt.
+/// RAM: none beyond the state and some 300 bytes of stack. May be called from an interrupt.
 /// Bad data never fails and never enters the estimate: see est_status_t.
 est_step_t est_step(est_t* self, est_sample_t sample);
 

@@ -1,12 +1,12 @@
-/// The change triggers of est.h, apart from the estimator: they see the innovation and nothing else.
-/// A new trigger is a new est_trigger_kind_t and a new function in est_trigger.c; the estimator does not change.
+/// The change triggers of est.h. They see the innovation, in every reading of the edges in doubt, and its variance, and
+/// nothing else of the estimator. A new trigger is a new est_trigger_kind_t and a new function in est_trigger.c.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
 
 #include "est.h"
 
-/// True iff every value that this kind of trigger uses is in the range stated in est.h.
+/// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
 bool est_trigger_config_valid(const est_trigger_config_t* config);
 
 typedef enum {
@@ -20,6 +20,10 @@ void est_trigger_restart(est_trigger_t* self, uint32_t quiet_n);
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
 void est_trigger_begin_doubt(est_trigger_t* self);
+
+/// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
+/// had already passed the ceiling, another reading explained them: a slip. Else the statistic goes on from the best reading.
+est_finding_t est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
 
 /// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
 bool est_trigger_in_doubt(const est_trigger_t* self);

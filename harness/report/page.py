@@ -26,7 +26,7 @@ def write_report(run: Run, verdict: Verdict, path: Path) -> None:
     """
     page = render(run, verdict)
     with replacing(path) as file:
-        file.write(page.encode("utf-8"))
+        file.write(page.encode("utf-8", "replace"))
 
 
 def render(run: Run, verdict: Verdict) -> str:

@@ -93,6 +93,15 @@ def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:
     assert theta[30] == pytest.approx([0.5, 0.8, -0.9], abs=1e-3)
 
 
+@pytest.mark.parametrize("c", [(0.0, 0.0), (-1.6, 0.64)], ids=["no prefilter", "prefilter"])
+def test_offset_is_that_of_the_model_over_the_prefilters_gain(estimator: Estimator, c: tuple[float, float]) -> None:
+    """y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1) + C(1) d, by the definition of est.h: y shifts by C(1) d / A(1)."""
+    data = record(offset=100.0)
+    assert estimator.init(nb=1, nk=1, kind=NONE, c=c, forgetting=1.0)
+    theta = estimator.run(*data).theta[-1]
+    assert theta == pytest.approx([0.5, 0.8, -0.9, 100.0 * (1.0 + 0.5 + 0.8) / (1.0 + sum(c))], rel=1e-3)
+
+
 @pytest.mark.parametrize("gap_n", [1, 2, 7, 60])
 def test_gap_costs_only_its_own_samples(estimator: Estimator, gap_n: int) -> None:
     data = record(noise=3.0, offset=40.0)

@@ -141,6 +141,32 @@ def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator
     assert len(estimator.run(u, y).alarms) == 1, "without the second look it is a false alarm"
 
 
+@pytest.mark.parametrize("lag_n", [2, 5, 11])
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+def test_gap_while_edges_are_in_doubt_raises_no_alarm(estimator: Estimator, slip: int, lag_n: int) -> None:
+    """One sample missing soon after every edge, also after the one that crosses a sampling instant."""
+    edges = np.arange(10.0, 1800.0, 50.0)
+    edges = edges + (edges - 900.0) * 20e-6 * slip
+    valid = np.ones(1800)
+    valid[np.ceil(edges).astype(int)[:-1] + lag_n] = 0
+    for seed in range(5):
+        u, y = suspension([(0, FRONT)], edges, 1800, 1.0, seed)
+        assert estimator.init()
+        result = estimator.run(u, y, valid)
+        assert len(result.alarms) == 0
+        assert result.counters["slips"] == 1
+
+
+@pytest.mark.parametrize("plant", [FRONT, (30.0, 2123.0, 20000.0)], ids=["front", "light"])
+@pytest.mark.parametrize("drift_ppm", [20.0, -20.0])
+def test_long_free_running_stretch_stays_quiet(estimator: Estimator, plant: Plant, drift_ppm: float) -> None:
+    """60,000 samples: four or more alarms have a probability of 0.4 % at ARL0 = 1e5; a forgetting of 0.998 has 60."""
+    edges = np.arange(10.3, 60_000.0, 50.0) * (1.0 + drift_ppm * 1e-6)
+    u, y = suspension([(0, plant)], edges, 60_000, 1.0, 11)
+    assert estimator.init()
+    assert len(estimator.run(u, y).alarms) <= 3
+
+
 @pytest.mark.parametrize("period_n", [33.37, 66.66, 50.05], ids=str)
 def test_edges_anywhere_between_the_samples_raise_no_alarm(estimator: Estimator, period_n: float) -> None:
     """Half periods of no whole number of samples, the last one a drift of 1000 ppm; 20 runs, one change in each."""

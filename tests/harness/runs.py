@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -66,3 +67,8 @@ def made_run(
         alarm_kind=np.full(count, 3, np.uint8),
         alarm_statistic=np.full(count, 12.0, np.float32),
     )
+
+
+def with_fault(run: Run, fault: str) -> Run:
+    """The same run, marked as not valid for this reason."""
+    return dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, faults=(fault,)))

@@ -212,8 +212,8 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
         ('kind = "hots"', "kind: must be one of 'host', 'inproc', 'serial', not 'hots'"),
         ('kind = "serial"', "a url goes with the kind 'serial', and with no other"),
         ('kind = "host"\nurl = "/dev/ttyS0"', "a url goes with the kind 'serial', and with no other"),
-        ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be positive, not 0"),
-        ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be positive, not 0"),
+        ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be more than 0 and at most 3600, not 0"),
+        ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be 1 to 100000000, not 0"),
         ('kind = "inproc"\n[estimator]\nnab = 1', "estimator: unknown key 'nab'"),
     ],
 )

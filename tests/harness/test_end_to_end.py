@@ -19,7 +19,9 @@ import pytest
 
 from harness.config import locate
 from harness.host_process import PROGRAM
+from harness.plant import Plant
 from harness.run import Run
+from tests.harness.runs import made_run
 
 TIMEOUT_S = 60.0
 ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith("ANALOGRIG_")}
@@ -183,7 +185,7 @@ def test_unknown_estimator_setting_is_named(tmp_path: Path) -> None:
 
 
 def test_setting_that_the_device_refuses_is_named(tmp_path: Path) -> None:
-    text = locate("devices", "host").read_text().replace("forgetting = 0.998", "forgetting = 0.2")
+    text = locate("devices", "host").read_text().replace("forgetting = 0.99\n", "forgetting = 0.2\n")
     (tmp_path / "dut.toml").write_text(text)
     line = refusal("run", "--dut", "dut.toml", cwd=tmp_path)
     assert "forgetting" in line
@@ -304,6 +306,53 @@ def test_killed_harness_leaves_no_device_behind(tmp_path: Path) -> None:
         while Path(f"/proc/{device_pid}").exists() and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert not Path(f"/proc/{device_pid}").exists()
+
+
+def test_closed_pipe_does_not_turn_a_failed_verdict_into_success(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "harness.cli", "run", "--dut", "mean-between-faults"]
+    environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stdout=writer, stderr=subprocess.PIPE, timeout=TIMEOUT_S, check=False
+    )
+    os.close(writer)
+    assert done.returncode == 1
+    assert b"Traceback" not in done.stderr
+
+
+def test_recording_without_a_sample_is_named(tmp_path: Path) -> None:
+    made_run(np.zeros(0), [(0, Plant(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
+    assert "holds no samples" in refusal("replay", "none.npz", cwd=tmp_path)
+
+
+def test_device_at_a_url_is_not_opened_on_the_word_of_a_file(tmp_path: Path) -> None:
+    with device() as path:
+        out = run_json("run", "--dut", f"serial:{path}", cwd=tmp_path)
+    assert f"--dut serial:{path}" in refusal("replay", out["run"], cwd=tmp_path)
+    assert run_json("replay", out["run"], "--dut", "host", cwd=tmp_path)["theta_hash"] == out["theta_hash"]
+
+
+@pytest.mark.parametrize("url", ["loop://?foo=1", "socket://127.0.0.1:abc", "nonsense://x", "alt://?class=x"])
+def test_url_that_makes_no_sense_is_one_line(tmp_path: Path, url: str) -> None:
+    assert url in refusal("run", "--dut", f"serial:{url}", cwd=tmp_path)
+
+
+def test_absurd_values_are_one_line(tmp_path: Path) -> None:
+    changes = {
+        "devices": [("arl0 = 1.0e5", "ceiling = 1.0e12"), ('kind = "host"', f'kind = "host"\nbaud = {10**20}')],
+        "rigs": [("noise_lsb = 1.0", "noise_lsb = 1e308"), ("0.003", "-1.0"), ("[-10.0, 10.0]", "[1e308, -1e308]")],
+        "scenarios": [("frequency_hz = 200.0", "frequency_hz = 1e-12"), ("samples = 1800", f"samples = {10**400}")],
+    }
+    option = {"devices": "--dut", "rigs": "--rig", "scenarios": "--scenario"}
+    shipped = {"devices": "host", "rigs": "emulator", "scenarios": "thesis"}
+    for kind, pairs in changes.items():
+        for old, new in pairs:
+            text = locate(kind, shipped[kind]).read_text()  # type: ignore[arg-type]
+            assert old in text
+            (tmp_path / "absurd.toml").write_text(text.replace(old, new))
+            assert "absurd.toml" in refusal("run", option[kind], "absurd.toml", cwd=tmp_path)
+    assert "File name too long" in refusal("run", "--scenario", "x" * 300, cwd=tmp_path)
 
 
 def test_wrong_option_is_a_usage_error(tmp_path: Path) -> None:

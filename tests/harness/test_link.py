@@ -18,7 +18,17 @@ from pathlib import Path
 import pytest
 
 from harness import frame
-from harness.catalogue import CATALOGUE_HASH, Control, Hello, Identify, Message, Stepped, pack
+from harness.catalogue import (
+    CATALOGUE_HASH,
+    Command,
+    Control,
+    Hello,
+    Identify,
+    Message,
+    SampleBlock,
+    Stepped,
+    pack,
+)
 from harness.errors import ConfigurationError, LinkClosed, LinkError
 from harness.host_process import PROGRAM, HostProcess
 from harness.link import Link, MemoryLink, SerialLink
@@ -323,6 +333,28 @@ def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(t
         assert process.wait(LONG_S) == 1
         assert process.stderr is not None
         assert process.stderr.read().decode().startswith(f"analogrig-device: lost {terminal.path}: ")
+
+
+def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
+    """Work that is left over when the output has just been emptied must not wait for the next message."""
+    burst, bursts = 11, 1500
+    with subprocess.Popen([PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        link = SerialLink(process.stdout.readline().strip())
+        link.send([Control(0, Command.START, 0)])
+        assert link.receive(LONG_S) is not None
+        for i in range(bursts):
+            first = i * burst
+            link.send(
+                SampleBlock((1 + k) % 256, 14, (14 * k) % 65536, 0, (100,) * 28) for k in range(first, first + burst)
+            )
+            stepped = 0
+            while stepped < 14 * burst:
+                answer = link.receive(LONG_S)
+                assert answer is not None, f"silent after {stepped} samples of burst {i}"
+                stepped += isinstance(answer, Stepped)
+        link.close()
+        process.stdin.close()  # type: ignore[union-attr]
 
 
 def test_device_waits_for_a_harness_that_does_not_read() -> None:

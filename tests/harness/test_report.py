@@ -22,6 +22,7 @@ from tests.harness.reported import (
     reported_run,
     reported_verdict,
 )
+from tests.harness.runs import with_fault
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>'\"&"
 
@@ -167,7 +168,7 @@ def test_outcome_stands_first_and_alone(run: Run, outcome: Outcome) -> None:
 
 
 def test_inconclusive_run_says_that_it_is_no_result() -> None:
-    run = reported_run().with_faults("the device was reset")
+    run = with_fault(reported_run(), "the device was reset")
     read = Page(render(run, judge(run)))
     assert "This run is not valid" in read.text
     assert "the device was reset" in read.text

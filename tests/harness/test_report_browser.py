@@ -14,6 +14,7 @@ from harness.report import write_report
 from harness.run import Run
 from harness.verdict import Verdict, judge
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
+from tests.harness.runs import with_fault
 
 PLOTS = 6
 FORCE, MASS, STIFFNESS, STATISTIC = 0, 2, 4, 5
@@ -214,7 +215,7 @@ def test_run_that_broke_off_is_drawn(browser: Browser, run: Run, tmp_path: Path,
     arrays = {
         name: getattr(run, name)[:samples] for name in ("codes", "clipped", "theta", "innovation", "statistic", "flags")
     }
-    watched = _open(browser, short := replace(run, **arrays).with_faults("cut"), judge(short), tmp_path)
+    watched = _open(browser, short := with_fault(replace(run, **arrays), "cut"), judge(short), tmp_path)
     assert len(watched.plots()) == PLOTS
     assert watched.complaints == []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,66 @@ def test_flipped_bytes_are_noticed(run: Run, tmp_path: Path) -> None:
             continue
         assert again.theta_hash() == run.theta_hash(), f"byte {place}"
         assert again.codes.tobytes() == run.codes.tobytes(), f"byte {place}"
+
+
+def rewritten(path: Path, header: object, **arrays: np.ndarray) -> None:
+    """The recording at ``path`` with another header, or other arrays."""
+    with np.load(path) as file:
+        members = {name: file[name] for name in file.files}
+    members |= {"header": np.array(json.dumps(header) if header is not None else str(members["header"]))} | arrays
+    np.savez(path, allow_pickle=False, **members)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("channels", "force"), None),
+        (("channels", "force", "noise_lsb"), None),
+        (("channels", "force", "lsb_v"), "x"),
+        (("channels",), []),
+        (("scenario",), "x"),
+        (("dut",), {}),
+        (("segments", 0, "plant", "mass_kg"), "heavy"),
+        (("segments", 0, "plant", "mass_kg"), 0.0),
+        (("segments", 0, "start"), 250),
+        (("sample_period_s",), float("nan")),
+        (("sample_period_s",), -1.0),
+        (("time_scale",), None),
+        (("seed",), 1.5),
+    ],
+    ids=str,
+)
+def test_damaged_header_is_one_line(run: Run, tmp_path: Path, place: tuple[str | int, ...], value: object) -> None:
+    path = tmp_path / "run.npz"
+    run.save(path)
+    with np.load(path) as file:
+        header = json.loads(str(file["header"]))
+    table = header["conditions"]
+    for key in place[:-1]:
+        table = table[key]
+    table[place[-1]] = value
+    rewritten(path, header)
+    with pytest.raises(RecordingError) as caught:
+        Run.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_arrays_that_do_not_fit_together_are_refused(run: Run, tmp_path: Path) -> None:
+    for name in ("theta", "flags", "alarm_kind"):
+        run.save(tmp_path / "run.npz")
+        rewritten(tmp_path / "run.npz", None, **{name: getattr(run, name)[:-1]})
+        with pytest.raises(RecordingError, match="do not fit together"):
+            Run.load(tmp_path / "run.npz")
+
+
+def test_archive_that_would_swell_is_refused(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    run.save(path)
+    with np.load(path) as file:
+        np.savez_compressed(path, allow_pickle=False, **{name: file[name] for name in file.files})
+    with pytest.raises(RecordingError, match="not a recording of analogrig"):
+        Run.load(path)
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:

@@ -167,6 +167,8 @@ static bool transmit(line_t* const line) {
     return is_transient();
 }
 
+#define WAIT_FOR_EVER (-1)
+
 // ---------------------------------------------        THE LOOP        ---------------------------------------------
 
 /// Lets the device work on what has come, as far as its answers have room.
@@ -212,7 +214,9 @@ static bool turn(device_t* const device, line_t* const line, bool* const ok) {
         { .fd = STDIN_FILENO, .events = POLLIN },
         { .fd = line->fd, .events = (short)(in | out) },
     };
-    if (poll(fds, 2, -1) < 0) {
+    // Work that is left over while the output is empty waits for nobody.
+    const int timeout_ms = ((in == 0) && (out == 0)) ? 0 : WAIT_FOR_EVER;
+    if (poll(fds, 2, timeout_ms) < 0) {
         *ok = errno == EINTR;
         return *ok;
     }
