@@ -105,7 +105,8 @@ class Excitation:
             "is for the clock free: the card's clock is the reference",
         )
         self._require("register_length", self.register_length in _TAPS, f"must be {min(_TAPS)} to {max(_TAPS)}")
-        self._require("seed", 0 <= self.seed < 2**63, "must be an integer, 0 to 2^63 - 1")
+        self._require("seed", isinstance(self.seed, int), "must be an integer")
+        self._require("seed", 0 <= self.seed < 2**63, "must be 0 to 2^63 - 1")
 
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
         """The edges at ticks start_tick <= t < stop_tick, t >= 0; the one at tick 0 is the switching on.
