@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import sys
 
+import numpy as np
+
+from harness.plant import PARAMETERS
 from tests.thesis.detection import detect
 
 DEFAULT_SEEDS = (0, 100)
@@ -27,6 +30,8 @@ def main() -> None:
         )
         for what, ratio, error in pairs:
             print(f"{name}: mean latency over mean bound, {what}\t{ratio:.2f}\t+- {error:.2f} (standard error)")
+        for parameter, error in zip(PARAMETERS, np.sqrt(np.nanmean(detection.errors**2, axis=(0, 1))), strict=True):
+            print(f"{name}: rms error of {parameter} at the end of a stretch\t{100.0 * error:.2f}\t%")
 
 
 if __name__ == "__main__":

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from harness.bench import Bench
 from harness.dut import DeviceDescription, connect, open_dut
+from harness.plant import PARAMETERS
 from harness.rig import open_rig
 from harness.scenario import Scenario
-from harness.verdict import Verdict, judge
+from harness.verdict import SegmentEstimate, Verdict, judge
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,8 @@ class Detection:
     """(r, t) samples; NaN where there was no alarm."""
     bounds_n: NDArray[np.float64]
     """(r, t) samples; NaN where the change could not be seen."""
+    errors: NDArray[np.float64]
+    """(r, t + 1, 3) relative errors of M, B, K at the end of each stretch; NaN without an estimate."""
     missed: int
     false_alarms: int
     inconclusive: int
@@ -59,11 +62,16 @@ def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection
     return Detection(
         latencies_n=_table(verdicts, "latency_n"),
         bounds_n=_table(verdicts, "bound_n"),
+        errors=np.array([[_errors(segment) for segment in verdict.estimates] for verdict in verdicts]),
         missed=sum(tweak.missed for verdict in verdicts for tweak in verdict.tweaks),
         false_alarms=sum(len(verdict.false_alarms) for verdict in verdicts),
         inconclusive=sum(not verdict.valid for verdict in verdicts),
         runs=len(verdicts),
     )
+
+
+def _errors(segment: SegmentEstimate) -> list[float]:
+    return [segment.error.get(name, np.nan) for name in PARAMETERS]
 
 
 def _table(verdicts: list[Verdict], what: str) -> NDArray[np.float64]:

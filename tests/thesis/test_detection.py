@@ -7,6 +7,7 @@ above 1.3.
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from tests.thesis.detection import Detection, detect
@@ -29,6 +30,11 @@ def test_no_change_is_missed_and_hardly_an_alarm_is_false(on_wide_range: Detecti
 @pytest.mark.xdist_group("detection")
 def test_mean_latency_is_within_half_again_the_mean_bound(on_wide_range: Detection) -> None:
     assert (on_wide_range.ratios() <= 1.5).all(), on_wide_range.ratios()
+
+
+def test_estimates_at_the_end_of_each_stretch_are_those_of_the_plant(on_wide_range: Detection) -> None:
+    rms = np.sqrt((on_wide_range.errors**2).mean(axis=0))
+    assert (rms <= [0.01, 0.0015, 0.001]).all(), rms
 
 
 @pytest.mark.parametrize("scenario", ["thesis", "thesis-free-running"])
