@@ -3,7 +3,7 @@
 README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
-from .circuit import Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
+from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
@@ -24,6 +24,7 @@ __all__ = [
     "Card",
     "Circuit",
     "CircuitError",
+    "DiodeLimiter",
     "Edges",
     "EmulatorError",
     "Engine",
@@ -42,6 +43,7 @@ __all__ = [
     "Scales",
     "SuspensionComputer",
     "SuspensionParts",
+    "Switch",
     "VoltageSource",
     "piecewise_linear",
     "to_spice",
