@@ -263,6 +263,8 @@ def _check_names(elements: tuple[Element, ...]) -> None:
             raise CircuitError(f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
+            if nodes.get(node.lower()) == node:
+                continue
             if not _NAME.fullmatch(node):
                 raise CircuitError(f"{_label(element)}: node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:

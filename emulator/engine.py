@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -112,10 +113,11 @@ class Engine:
             )
         rows = system.rows(self._outputs)
         arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
-        # The list keeps the arrays alive during the call.
-        blocks = [np.ascontiguousarray(array, np.float64) for array in (*arrays, _kink_table(system.kinks))]
-        fields = library.System(*(block.ctypes.data for block in blocks))
-        self._check(self._library.engine_set_system(self._handle, ctypes.byref(fields)))
+        # One block of memory, with the arrays in the order of the structure's fields.
+        parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
+        block = np.concatenate(parts)
+        starts = itertools.accumulate((part.nbytes for part in parts[:-1]), initial=block.ctypes.data)
+        self._check(self._library.engine_set_system(self._handle, ctypes.byref(library.System(*starts))))
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
@@ -179,16 +181,16 @@ class Engine:
                 raise EngineError(f"no input is called {name!r}; there are {', '.join(self._names[1]) or 'none'}")
             if train.ticks.shape != train.levels_v.shape or not np.isfinite(train.levels_v).all():
                 raise EngineError(f"the edges of {name} need as many finite levels as ticks")
-        trains = [(self._names[1].index(name), train) for name, train in edges.items()]
-        ticks = np.concatenate([np.empty(0, np.int64), *(train.ticks for _, train in trains)])
-        inputs = np.concatenate(
-            [np.empty(0, np.int32), *(np.full(train.ticks.size, i, np.int32) for i, train in trains)]
-        )
-        levels_v = np.concatenate([np.empty(0), *(train.levels_v for _, train in trains)])
+        trains = [(self._names[1].index(name), train) for name, train in edges.items() if train.ticks.size]
+        if not trains:
+            return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
+        levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)
+        inputs = np.repeat(np.array([i for i, _ in trains], np.int32), [train.ticks.size for _, train in trains])
         if len(trains) > 1:
             order = np.lexsort((inputs, ticks))
             ticks, inputs, levels_v = ticks[order], inputs[order], levels_v[order]
-        return np.ascontiguousarray(ticks), np.ascontiguousarray(inputs), np.ascontiguousarray(levels_v)
+        return ticks, inputs, levels_v
 
     def _check(self, status: int) -> None:
         if status:

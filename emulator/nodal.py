@@ -141,7 +141,8 @@ class Nodal:
         size = len(self._unknowns) + 1
         self._left = np.zeros((size, size))
         self._right = np.zeros((size, self._columns + len(self._limiters)))
-        self._leg_places = self._find_leg_places()
+        ends = [(switch.a, switch.b) for switch in self._switches]
+        self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
         self._enter(circuit)
 
@@ -184,8 +185,10 @@ class Nodal:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
     def _enter(self, circuit: Circuit) -> None:
-        for resistor in circuit.of(Resistor):
-            self._conductance(self._left, resistor.a, resistor.b, 1.0 / resistor.ohm)
+        resistors = circuit.of(Resistor)
+        places = self._places([(resistor.a, resistor.b) for resistor in resistors])
+        siemens = [1.0 / resistor.ohm for resistor in resistors]
+        np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
         for capacitor in self._capacitors:
             row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
             self._right[row, self._state[capacitor.name]] = 1.0
@@ -216,11 +219,8 @@ class Nodal:
             ohms += legs_ohm(checked_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
         return [1.0 / ohm for ohm in ohms]
 
-    def _find_leg_places(self) -> NDArray[np.intp]:
-        """Where the conductances of _leg_siemens enter the flattened matrix, four places each."""
-        ends = [(switch.a, switch.b) for switch in self._switches]
-        for pot in self._pots:
-            ends += pot.bonds
+    def _places(self, ends: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
+        """Where conductances between these nodes enter the flattened matrix, four places each."""
         size = len(self._unknowns) + 1
         rows = [(self._row[a], self._row[b]) for a, b in ends]
         return np.array([(i * size + i, j * size + j, i * size + j, j * size + i) for i, j in rows], np.intp).ravel()
