@@ -8,6 +8,7 @@
 
 #define TOP_LEVEL (ENGINE_LEVELS - 1)
 #define NO_LEVEL (-1)
+#define NEVER INT64_C(-1)
 #define MAX_COLUMNS (ENGINE_MAX_STATES + ENGINE_MAX_INPUTS + 1)
 
 /* Matrices that are multiplied in the inner loop are cut into panels of four rows; a panel is stored column by column.
@@ -112,6 +113,10 @@ struct engine {
     int slow_age;
     struct mode store[MODES];
     int stored, oldest;
+
+    int64_t patience;                  /* ticks; see engine_watch */
+    int64_t outside[ENGINE_MAX_KINKS]; /* the tick since which a kink has been outside its middle piece, or NEVER */
+    int64_t overdue[ENGINE_MAX_KINKS]; /* what engine_get_overdue tells of kinks that have come back since */
 
     struct engine_counts counts;
 };
@@ -449,6 +454,27 @@ static enum engine_status make_mode(engine *self)
     return build_ladder(self, slot->piece, slot->ladder);
 }
 
+/* The first tick at which a kink had been outside for as long as patience allows, by now; NEVER if it has not. */
+static int64_t overdue(const engine *self, int kink)
+{
+    if (self->overdue[kink] != NEVER || self->outside[kink] == NEVER) {
+        return self->overdue[kink];
+    }
+    const int64_t due = self->outside[kink] + self->patience;
+    return due <= self->now ? due : NEVER;
+}
+
+/* Notes that a kink is in its present piece from here on. */
+static void watch(engine *self, int kink)
+{
+    if (self->piece[kink] == 1) {
+        self->overdue[kink] = overdue(self, kink);
+        self->outside[kink] = NEVER;
+    } else if (self->outside[kink] == NEVER) {
+        self->outside[kink] = self->now;
+    }
+}
+
 static void measure(const engine *self, struct point *point)
 {
     product(self->kinks, self->columns, self->w_panels, point->z, point->w);
@@ -566,6 +592,7 @@ static enum engine_status enter_mode(engine *self)
         self->piece[k] = piece_of(&self->kink[k], self->here->w[k]);
         self->lower[k] = lower_bound(&self->kink[k], self->piece[k]);
         self->upper[k] = upper_bound(&self->kink[k], self->piece[k]);
+        watch(self, k);
     }
     self->elapsed = 0;
     self->level_before = NO_LEVEL;
@@ -1195,6 +1222,10 @@ engine *engine_new(int states, int inputs, int kinks, int outputs, double sample
     for (int i = 0; i < 4; i++) {
         self->points[i].z[self->columns - 1] = 1.0;
     }
+    for (int k = 0; k < ENGINE_MAX_KINKS; k++) {
+        self->outside[k] = NEVER;
+    }
+    engine_watch(self, ENGINE_TICKS_PER_SAMPLE);
     return self;
 }
 
@@ -1472,6 +1503,22 @@ enum engine_status engine_run(
         status = ENGINE_EDGE;
     }
     return status == ENGINE_OK && !is_finite(self) ? ENGINE_NOT_FINITE : status;
+}
+
+void engine_watch(engine *self, int64_t patience)
+{
+    self->patience = patience;
+    for (int k = 0; k < ENGINE_MAX_KINKS; k++) {
+        self->overdue[k] = NEVER;
+        self->outside[k] = self->outside[k] == NEVER ? NEVER : self->now;
+    }
+}
+
+void engine_get_overdue(const engine *self, int64_t *tick)
+{
+    for (int k = 0; k < self->kinks; k++) {
+        tick[k] = overdue(self, k);
+    }
 }
 
 void engine_get_counts(const engine *self, struct engine_counts *counts)

@@ -94,6 +94,13 @@ enum engine_status engine_run(
     engine *self, int64_t until, int64_t edges, const int64_t *tick, const int32_t *input, const double *level,
     double *y);
 
+/* Watches, from here on, for kinks that stay outside their middle piece for `patience` ticks without a break (one
+ * sample period when never called). Costs nothing where no mode changes. */
+void engine_watch(engine *self, int64_t patience);
+
+/* For each kink the first tick, since engine_watch, at which it had been outside for so long; -1 where it has not. */
+void engine_get_overdue(const engine *self, int64_t *tick);
+
 void engine_get_counts(const engine *self, struct engine_counts *counts);
 
 /* Solves a x = b in place by Gaussian elimination with partial pivoting (a: n x n, b: n x columns, row-major; both

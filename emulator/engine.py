@@ -72,7 +72,9 @@ class Engine:
         if not self._handle:
             raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
         weakref.finalize(self, self._library.engine_free, self._handle)
+        self._kinks = len(system.kinks)
         self._recorded = 0
+        self._now_tick = -1
         self.set_system(system)
 
     @property
@@ -129,8 +131,13 @@ class Engine:
         volts = np.empty((samples, len(self._outputs)))
         trains = self._merge(edges or {})
         self._run_until((self._recorded + samples - 1) * TICKS_PER_SAMPLE, trains, volts)
-        self._recorded += samples
+        self._note(samples)
         return volts
+
+    def _note(self, samples: int) -> None:
+        self._recorded += samples
+        if samples:
+            self._now_tick = (self._recorded - 1) * TICKS_PER_SAMPLE
 
     def _run_until(self, tick: int, trains: _Trains, volts: NDArray[np.float64]) -> None:
         addresses = [array.ctypes.data for array in (*trains, volts)]
@@ -166,13 +173,38 @@ class Engine:
             recorded = self.counts.samples
             self._run_until(stop, (ticks[now], inputs[now], levels_v[now]), volts[recorded - self._recorded :])
             first_edge = next_edge
-        self._recorded += samples
+        self._note(samples)
         return volts
+
+    def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
+        """Goes to an instant before the next sample's and records nothing; it takes the edges up to it.
+
+        So the circuit can be changed between two samples. Raises EngineError, as run does, and for another instant.
+        """
+        if not self._now_tick <= tick < self._recorded * TICKS_PER_SAMPLE:
+            raise EngineError(f"after {self._recorded} samples: tick {tick} is past, or not before the next sample's")
+        self._run_until(tick, self._merge(edges or {}), np.empty((0, len(self._outputs))))
+        self._now_tick = tick
+
+    def watch(self, patience_ticks: int) -> None:
+        """Looks out, from here on, for kinks that stay outside their middle piece for so long without a break."""
+        self._library.engine_watch(self._handle, patience_ticks)
+
+    @property
+    def overdue_ticks(self) -> NDArray[np.int64]:
+        """For each kink the first tick at which it had been outside for the ticks of watch(); -1 where it has not."""
+        ticks = np.empty(self._kinks, np.int64)
+        self._library.engine_get_overdue(self._handle, ticks.ctypes.data)
+        return ticks
+
+    @property
+    def now_tick(self) -> int:
+        """Where the engine stands: the instant of the last sample, or of advance(); -1 before either."""
+        return self._now_tick
 
     def window(self, samples: int) -> tuple[int, int]:
         """The ticks (start, stop) of the edges that run(samples) takes next: start <= tick < stop."""
-        start = (self._recorded - 1) * TICKS_PER_SAMPLE + 1 if self._recorded else 0
-        return start, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
+        return self._now_tick + 1, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
 
     def _merge(self, edges: Mapping[str, Edges]) -> _Trains:
         """All edges in order of time; at the same tick in order of input."""

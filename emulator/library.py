@@ -41,6 +41,8 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_get_state", None, (c_void_p, c_void_p)),
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
+    ("engine_watch", None, (c_void_p, c_int64)),
+    ("engine_get_overdue", None, (c_void_p, c_void_p)),
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
 )
