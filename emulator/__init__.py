@@ -5,8 +5,9 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 
 from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .engine import Engine
-from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
+from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, ModeError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
+from .machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from .nodal import PiecewiseLinear, piecewise_linear
 from .opamp import IDEAL, OpAmpModel
 from .sampler import Card, Sampler
@@ -17,9 +18,12 @@ __all__ = [
     "CHANNELS",
     "FRONT",
     "IDEAL",
+    "LAMP_DELAY_S",
     "PROGRAMS",
+    "REFERENCE_V",
     "SHOCK",
     "TICKS_PER_SAMPLE",
+    "AnalogComputer",
     "Capacitor",
     "Card",
     "Circuit",
@@ -31,6 +35,8 @@ __all__ = [
     "EngineError",
     "Excitation",
     "ExcitationError",
+    "Mode",
+    "ModeError",
     "OpAmp",
     "OpAmpModel",
     "PiecewiseLinear",

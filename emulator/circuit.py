@@ -27,6 +27,7 @@ __all__ = [
     "Resistor",
     "Switch",
     "VoltageSource",
+    "label",
 ]
 
 GROUND = "0"
@@ -266,27 +267,27 @@ def _check_names(elements: tuple[Element, ...]) -> None:
             if nodes.get(node.lower()) == node:
                 continue
             if not _NAME.fullmatch(node):
-                raise CircuitError(f"{_label(element)}: node name {node!r}: only letters, digits and _ are allowed")
+                raise CircuitError(f"{label(element)}: node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
-                raise CircuitError(f"{_label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+                raise CircuitError(f"{label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
 
 
 def _check_element(element: Element) -> None:
     for a, b in element.bonds:
         if a == b:
-            raise CircuitError(f"{_label(element)}: both ends are on node {a}")
+            raise CircuitError(f"{label(element)}: both ends are on node {a}")
     for field in _POSITIVE.get(type(element), ()):
         value = getattr(element, field)
         if not (math.isfinite(value) and value > 0):
-            raise CircuitError(f"{_label(element)}: {field} must be positive and finite, got {value!r}")
+            raise CircuitError(f"{label(element)}: {field} must be positive and finite, got {value!r}")
     if isinstance(element, Pot):
         checked_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter) and not math.isfinite(element.threshold_v):
-        raise CircuitError(f"{_label(element)}: threshold_v must be finite, got {element.threshold_v!r}")
+        raise CircuitError(f"{label(element)}: threshold_v must be finite, got {element.threshold_v!r}")
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
-        raise CircuitError(f"{_label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+        raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
     if isinstance(element, VoltageSource) and element.dc_v is not None and not math.isfinite(element.dc_v):
-        raise CircuitError(f"{_label(element)}: dc_v must be finite, got {element.dc_v!r}")
+        raise CircuitError(f"{label(element)}: dc_v must be finite, got {element.dc_v!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
@@ -301,8 +302,9 @@ def _check_nodes(elements: tuple[Element, ...]) -> None:
     for element in elements:
         for node in element.nodes:
             if node not in grounded:
-                raise CircuitError(f"{_label(element)}: node {node} floats: no path to ground holds its voltage")
+                raise CircuitError(f"{label(element)}: node {node} floats: no path to ground holds its voltage")
 
 
-def _label(element: Element) -> str:
+def label(element: Element) -> str:
+    """How errors name an element: kind, name and nodes."""
     return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ class Kink:
     lower: float
     upper: float
     slopes: tuple[float, float, float]
+    element: str = ""
+    """The name of the element that it limits."""
 
     @classmethod
     def clip(cls, limit: float) -> Kink:
@@ -99,6 +101,25 @@ class PiecewiseLinear:
             missing = next(node for node in nodes if node not in self.nodes)
             raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
 
+    def rest(self, levels_v: Matrix) -> Matrix:
+        """The state (n,) at which nothing moves, with the inputs held at levels_v (m,) and no kink at its limit.
+
+        Amplifiers neither slew nor clamp then, and limiters do not conduct.
+        Raises CircuitError naming a state that nothing brings to rest.
+        """
+        size = len(self.states)
+        slopes = np.array([kink.slopes[1] for kink in self.kinks])
+        flow = self.abc.copy()
+        for k, slope in enumerate(slopes):
+            flow += np.outer(self.g[:, k] * slope, self.cde[k])
+        left = np.ascontiguousarray(flow[:, :size])
+        right = -(flow[:, size:] * np.append(levels_v, 1.0)).sum(axis=1, keepdims=True)
+        failed = library.load().engine_solve(size, 1, left.ctypes.data, right.ctypes.data)
+        if failed >= 0:
+            raise CircuitError(f"nothing brings {self.states[failed]} to rest")
+        state: Matrix = right[:, 0]
+        return state
+
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
     """The state space of a circuit, its pots as they are set.
@@ -134,8 +155,10 @@ class Nodal:
         holders: list[Capacitor | OpAmp] = [*self._capacitors, *self._poles]
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + 1
-        self._kinks = tuple(kink for amp in self._poles for kink in _kinks(amp))
-        self._kinks += tuple(Kink.deadzone(-math.inf, limiter.threshold_v) for limiter in self._limiters)
+        self._kinks = tuple(replace(kink, element=amp.name) for amp in self._poles for kink in _kinks(amp))
+        self._kinks += tuple(
+            replace(Kink.deadzone(-math.inf, limiter.threshold_v), element=limiter.name) for limiter in self._limiters
+        )
         self._check_size()
 
         size = len(self._unknowns) + 1

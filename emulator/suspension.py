@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, VoltageSource
-from .engine import Engine
 from .errors import CircuitError, EngineError, PotError
 from .excitation import Excitation
-from .nodal import Nodal
+from .machine import AnalogComputer, Mode
 from .opamp import OpAmpModel, preset
 from .pot import checked_dial, coefficient_under_load, dial_for
 
@@ -49,6 +48,9 @@ CHANNELS = ("force", "displacement", "velocity", "net_force")
 _NODES = ("in", "u5", "u2", "u1")
 # U1 puts out -e_N: the card's differential input for the net force is wired the other way round.
 _SIGNS = np.array((1.0, 1.0, 1.0, -1.0))
+
+# The integrators: velocity and displacement.
+_AT_REST_V = MappingProxyType({"U2": 0.0, "U3": 0.0})
 
 SOURCE = "F"
 """Name of the circuit's input, and its node is "in"."""
@@ -150,6 +152,8 @@ class SuspensionComputer:
     load connected.
     rng, offset_v: when an rng is given, each op-amp has an offset of its own, uniform within +-offset_v (drawn U1 to
     U5).
+    machine: the AnalogComputer on which it is patched, to be operated by hand: U2 and U3 are integrators, at +velocity
+    and -displacement, and its lamps are those of the last play.
     Raises CircuitError, PotError.
     """
 
@@ -168,18 +172,17 @@ class SuspensionComputer:
         self.sample_rate_hz = sample_rate_hz
         model = preset(opamp) if isinstance(opamp, str) else opamp
         models = [model] * 5 if rng is None else [_offset(model, rng.uniform(-offset_v, offset_v)) for _ in range(5)]
-        self._dials: dict[str, float] = {}
-        self._dials |= self._resolve(
+        dials = self._resolve(
             {"M_kg": self.program.M_kg, "B_n_s_per_m": self.program.B_n_s_per_m, "K_n_per_m": self.program.K_n_per_m}
         )
-        self._circuit = Circuit(_netlist(self.parts, models, self._dials))
-        self._nodal = Nodal(self._circuit)
-        self._engine: Engine | None = None
+        circuit = Circuit(_netlist(self.parts, models, dials))
+        self.machine = AnalogComputer(circuit, _NODES, initial_v=_AT_REST_V, sample_rate_hz=sample_rate_hz)
+        self._plays = 0
 
     @property
     def circuit(self) -> Circuit:
         """The netlist, its pots as they are set now."""
-        return self._circuit.with_dials(self._dials)
+        return self.machine.circuit
 
     @property
     def scales(self) -> Scales:
@@ -189,12 +192,12 @@ class SuspensionComputer:
     @property
     def dials(self) -> dict[str, float]:
         """Where the pots M, B and K stand, 0..1."""
-        return dict(self._dials)
+        return self.machine.dials
 
     @property
     def coefficients(self) -> dict[str, float]:
         """What the pots M, B and K pass under their load."""
-        return {pot: coefficient_under_load(dial, *self._track_and_load_ohm(pot)) for pot, dial in self._dials.items()}
+        return {pot: coefficient_under_load(dial, *self._track_and_load_ohm(pot)) for pot, dial in self.dials.items()}
 
     def set(self, **settings: float) -> None:
         """Turns pots to show M_kg, B_n_s_per_m, K_n_per_m, or to stand at M_dial, B_dial, K_dial (0..1).
@@ -202,7 +205,7 @@ class SuspensionComputer:
         The former set the coefficient under load, as an operator in pot-set mode does. A running machine keeps its
         voltages. Raises PotError naming the pot, with nothing turned.
         """
-        self._turn(self._resolve(settings))
+        self.machine.turn(self._resolve(settings))
 
     def dials_for(self, **settings: float) -> dict[str, float]:
         """The dials to which set(**settings) would turn the pots."""
@@ -222,8 +225,9 @@ class SuspensionComputer:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         turns = self._plan(tweaks, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
-        self._engine = Engine(self._nodal.at(self._dials), _NODES, self.sample_rate_hz)
-        return self._blocks(self._engine, excitation, samples, turns, block_samples)
+        self.machine.restart(Mode.OPERATE)
+        self._plays += 1
+        return self._blocks(self._plays, excitation, samples, turns, block_samples)
 
     # ---- playing
 
@@ -240,7 +244,7 @@ class SuspensionComputer:
 
     def _blocks(
         self,
-        engine: Engine,
+        play: int,
         excitation: Excitation,
         samples: int,
         turns: list[tuple[int, dict[str, float]]],
@@ -249,27 +253,22 @@ class SuspensionComputer:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)
             parts = []
-            while engine.recorded < stop:
-                if engine is not self._engine:
-                    raise EngineError("this play was ended by a newer one on the same machine")
+            while play == self._plays and self.machine.recorded < stop:
                 until = min(stop, turns[0][0]) if turns else stop
-                parts.append(self._advance(engine, excitation, until - engine.recorded))
-                while turns and turns[0][0] == engine.recorded:
-                    self._turn(turns.pop(0)[1])
+                parts.append(self._advance(excitation, until - self.machine.recorded))
+                while turns and turns[0][0] == self.machine.recorded:
+                    self.machine.turn(turns.pop(0)[1])
+            if play != self._plays:
+                raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, engine: Engine, excitation: Excitation, samples: int) -> NDArray[np.float64]:
-        edges = excitation.edges(*engine.window(samples), self.sample_rate_hz)
-        volts = engine.run(samples, {SOURCE: edges})
+    def _advance(self, excitation: Excitation, samples: int) -> NDArray[np.float64]:
+        edges = excitation.edges(*self.machine.window(samples), self.sample_rate_hz)
+        volts = self.machine.run(samples, {SOURCE: edges})
         volts *= _SIGNS
         return volts
 
     # ---- pots
-
-    def _turn(self, dials: Mapping[str, float]) -> None:
-        self._dials |= dials
-        if self._engine is not None:
-            self._engine.set_system(self._nodal.at(self._dials))
 
     def _resolve(self, settings: Mapping[str, float]) -> dict[str, float]:
         dials: dict[str, float] = {}
