@@ -220,7 +220,7 @@ class Nodal:
             if source.dc_v is None:
                 self._right[row, len(self._state) + self._inputs.index(source)] = 1.0
             else:
-                self._right[row, -1] = source.dc_v
+                self._right[row, self._columns - 1] = source.dc_v
         for amp in circuit.of(OpAmp):
             self._enter_opamp(amp)
         for i, limiter in enumerate(self._limiters):
@@ -271,7 +271,7 @@ class Nodal:
             self._left[row, row] -= model.rout_ohm / model.avol
             self._left[row, self._row[amp.plus]] -= 1.0
             self._left[row, self._row[amp.minus]] += 1.0
-            self._right[row, -1] = model.vos_v
+            self._right[row, self._columns - 1] = model.vos_v
         elif model.rout_ohm > 0:
             self._conductance(self._left, amp.out, GROUND, 1.0 / model.rout_ohm)
             self._right[out, self._state[amp.name]] += 1.0 / model.rout_ohm
