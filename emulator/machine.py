@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, VoltageSource, label
+from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
 from .engine import Engine
 from .errors import CircuitError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
@@ -105,6 +105,7 @@ class AnalogComputer:
         self._sample_rate_hz = sample_rate_hz
         self._lamp_delay_ticks = round(lamp_delay_s * sample_rate_hz * TICKS_PER_SAMPLE)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
+        self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
         self._nodals: dict[Mode, Nodal] = {}
         self._check_integrators(self._initial_v)
         self.restart()
@@ -118,13 +119,17 @@ class AnalogComputer:
 
     @property
     def circuit(self) -> Circuit:
-        """The circuit as patched, its pots as they are set now."""
-        return self._patched.with_dials(self._dials)
+        """The circuit as patched, its pots and switches as they are set now."""
+        return self._as_set(self._patched)
 
     @property
     def wiring(self) -> Circuit:
-        """The circuit with the relays, and the pots, as they stand now; to_spice writes it as any other."""
-        return self._wired(self._mode).with_dials(self._dials)
+        """The circuit with the relays, pots and switches as they stand now; to_spice writes it as any other."""
+        return self._as_set(self._wired(self._mode))
+
+    def _as_set(self, circuit: Circuit) -> Circuit:
+        circuit = circuit.with_dials(self._dials)
+        return circuit.with_switches(self._closed) if self._closed else circuit
 
     @property
     def dials(self) -> dict[str, float]:
@@ -170,6 +175,12 @@ class AnalogComputer:
                 raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._dials)) or 'none'}")
             checked_dial(dial, pot)
         self._dials |= dials
+        self._change()
+
+    def throw(self, closed: Mapping[str, bool]) -> None:
+        """Throws switches of the circuit, in any mode. Raises CircuitError for one that is not there."""
+        self._patched.with_switches(closed)
+        self._closed |= closed
         self._change()
 
     def coefficient(self, pot: str) -> float:
@@ -286,7 +297,7 @@ class AnalogComputer:
             nodal = self._nodals.get(self._mode)
             if nodal is None:
                 nodal = self._nodals[self._mode] = Nodal(self._wired(self._mode))
-            self._solved = nodal.at(self._dials)
+            self._solved = nodal.at(self._dials, self._closed)
         return self._solved
 
     def _play_to(self, tick: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
@@ -331,7 +342,7 @@ class AnalogComputer:
             self._charge_at_once(engine)
 
     def _change(self) -> None:
-        """Relays, pots or initial voltages have another position."""
+        """Relays, pots, switches or initial voltages have another position."""
         self._solved = None
         if self._powered is not None:
             self._powered.set_system(self._system)
@@ -398,7 +409,7 @@ class AnalogComputer:
         return inner
 
     def _reading(self, nodal: Nodal, pot: str, dial: float) -> float:
-        system = nodal.at(self._dials | {pot: dial})
+        system = nodal.at(self._dials | {pot: dial}, self._closed)
         levels_v = np.array([self._levels_v[name] for name in system.inputs])
         z = np.concatenate((system.rest(levels_v), levels_v, (1.0,)))
         return float((system.readings([self._terminal(pot, "wiper")])[0] * z).sum()) / REFERENCE_V

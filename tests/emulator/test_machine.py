@@ -19,6 +19,7 @@ from emulator import (
     Capacitor,
     Circuit,
     CircuitError,
+    DiodeLimiter,
     Edges,
     EngineError,
     Excitation,
@@ -30,6 +31,7 @@ from emulator import (
     PotError,
     Resistor,
     SuspensionComputer,
+    Switch,
     VoltageSource,
     to_spice,
 )
@@ -175,6 +177,33 @@ def check_against_ngspice(ngspice: NgSpice, computer: AnalogComputer, excitation
         volts[k] = [shown[node] for node in nodes]
     assert np.abs(volts - reference)[1:].max() < 0.05 * LSB_V
     return volts
+
+
+def test_a_limiter_across_the_capacitor_stays_there_and_readings_show_what_it_does() -> None:
+    """It conducts from 5 V on, through 1 k: an initial 10 V, asked for through 10 k, ends at the divider of both."""
+    limiter = DiodeLimiter("D1", "out", "s", 5.0, 1e3, 1e9)
+    computer = machine(integrator([limiter]), 10.0, ic_ohm=10e3)
+    last_v = computer.run(200)[-1, 0]
+    through_limiter_s = 1e-3 - 1e-9
+    settled_v = (10.0 / 10e3 + 5.0 * through_limiter_s) / (1 / 10e3 + 1e-9 + through_limiter_s)
+    assert last_v == pytest.approx(settled_v, abs=1e-9)
+    assert computer.read()["out"] == pytest.approx(settled_v, abs=1e-9)
+    assert set(computer.lamps.values()) == {None}
+
+
+def test_a_switch_of_the_circuit_can_be_thrown() -> None:
+    computer = machine(integrator([Switch("S1", "in", "s", 100e3, 1e12, closed=False)]), ic_ohm=None)
+    computer.switch(OPERATE)
+    coefficient = coefficient_under_load(0.5, 10e3, 100e3)
+    slopes = []
+    for closed in (False, True):
+        computer.throw({"S1": closed})
+        slopes.append(np.diff(computer.run(5, level(2.0) if not closed else None)[:, 0])[-1])
+    assert slopes[0] == pytest.approx(-2.0 * coefficient * SAMPLE_S / 1e-3, abs=1e-6)
+    assert slopes[1] == pytest.approx(-2.0 * (1.0 + coefficient) * SAMPLE_S / 1e-3, abs=1e-6)
+    assert computer.circuit.of(Switch)[0].closed
+    with pytest.raises(CircuitError, match="no switch is called 'S2'; there are S1"):
+        computer.throw({"S2": True})
 
 
 # ---- the suspension, operated by hand
