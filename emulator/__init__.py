@@ -4,19 +4,35 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
 from .circuit import Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
+from .components import (
+    COMPONENTS,
+    DIELECTRICS,
+    NOMINAL,
+    OP_AMP_GRADES,
+    Components,
+    Dielectric,
+    Grade,
+    OpAmpGrade,
+    PotGrade,
+)
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
 from .nodal import PiecewiseLinear, piecewise_linear
 from .opamp import IDEAL, OpAmpModel
+from .pot import PotModel
 from .sampler import Card, Sampler
 from .spice import to_spice
 from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
 
 __all__ = [
     "CHANNELS",
+    "COMPONENTS",
+    "DIELECTRICS",
     "FRONT",
     "IDEAL",
+    "NOMINAL",
+    "OP_AMP_GRADES",
     "PROGRAMS",
     "SHOCK",
     "TICKS_PER_SAMPLE",
@@ -24,17 +40,23 @@ __all__ = [
     "Card",
     "Circuit",
     "CircuitError",
+    "Components",
+    "Dielectric",
     "Edges",
     "EmulatorError",
     "Engine",
     "EngineError",
     "Excitation",
     "ExcitationError",
+    "Grade",
     "OpAmp",
+    "OpAmpGrade",
     "OpAmpModel",
     "PiecewiseLinear",
     "Pot",
     "PotError",
+    "PotGrade",
+    "PotModel",
     "Program",
     "Resistor",
     "Sampler",
