@@ -3,6 +3,7 @@
 README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
+from .acquisition import acquired, probes_per_sample
 from .circuit import Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
 from .components import (
     COMPONENTS,
@@ -21,11 +22,12 @@ from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
 from .nodal import PiecewiseLinear, piecewise_linear
 from .opamp import IDEAL, OpAmpModel
 from .pot import PotModel
-from .sampler import Card, Sampler
+from .sampler import CARDS, Card, Sampler, drawn_levels
 from .spice import to_spice
 from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
 
 __all__ = [
+    "CARDS",
     "CHANNELS",
     "COMPONENTS",
     "DIELECTRICS",
@@ -65,6 +67,9 @@ __all__ = [
     "SuspensionComputer",
     "SuspensionParts",
     "VoltageSource",
+    "acquired",
+    "drawn_levels",
     "piecewise_linear",
+    "probes_per_sample",
     "to_spice",
 ]
