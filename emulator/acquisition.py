@@ -67,16 +67,15 @@ def acquired(
     """Plays a machine that was made with sample_rate_hz = card.true_rate_hz probes_per_sample(card).
 
     Yields what the sample-and-holds see, in blocks, float64 (block_samples or, last, fewer; channels), V. rng: of the
-    jitter. The conventions of Excitation and of SuspensionComputer.play hold for the nominal instants; a tweak after
-    sample k comes when all channels of that sample have been taken. Raises what play raises.
+    jitter. The conventions of Excitation and of SuspensionComputer.play hold for the nominal instants: a channel that
+    is taken later can show a tweak after sample k in sample k already. Raises what play raises.
     """
     count = probes_per_sample(card)
     if count == 1 and card.clock_drift_ppm == 0:
         return machine.play(excitation, samples, tweaks, block_samples)
     clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
     slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
-    last = math.ceil(_offsets(card, count).max())
-    turns = [(min(k * count + last, samples * count - 1), settings) for k, settings in tweaks]
+    turns = [(k * count, settings) for k, settings in tweaks]
     probed = machine.play(slow, samples * count, turns, block_samples * count)
     return _picked(probed, card, count, rng)
 

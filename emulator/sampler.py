@@ -184,6 +184,13 @@ class Sampler:
         converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
         Raises SamplerError for a voltage that is not a number, or another shape.
         """
+        return self.converted(self.seen_lsb(volts))
+
+    def seen_lsb(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
+
+        Raises SamplerError for a voltage that is not a number, or another shape.
+        """
         if volts.ndim != 2 or volts.shape[1] != self.card.channels:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
         if np.isnan(volts).any():
@@ -191,7 +198,10 @@ class Sampler:
             raise SamplerError(f"sample {sample} of the block, channel {channel}: the voltage is not a number")
         noise = self._rng.standard_normal(volts.shape) * self._noise_lsb + self._offset_lsb
         held_v = self._acquired(volts) * self._gain - self._droop_v
-        seen_lsb = (held_v - self._low_v) / self._lsb_v + noise
+        return np.asarray((held_v - self._low_v) / self._lsb_v + noise)
+
+    def converted(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+        """Codes and clipping flags, as of sample, of what the converter sees."""
         unlimited = np.floor(seen_lsb + 0.5)
         limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
         codes = limited.astype(np.uint16) if self._levels is None else _approximated(seen_lsb, self._levels)
