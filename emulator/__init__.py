@@ -20,6 +20,7 @@ from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
 from .nodal import PiecewiseLinear, piecewise_linear
+from .noise import CircuitNoise, NoisySuspension
 from .opamp import IDEAL, OpAmpModel
 from .pot import PotModel
 from .sampler import CARDS, Card, Sampler, drawn_levels
@@ -42,6 +43,7 @@ __all__ = [
     "Card",
     "Circuit",
     "CircuitError",
+    "CircuitNoise",
     "Components",
     "Dielectric",
     "Edges",
@@ -51,6 +53,7 @@ __all__ = [
     "Excitation",
     "ExcitationError",
     "Grade",
+    "NoisySuspension",
     "OpAmp",
     "OpAmpGrade",
     "OpAmpModel",

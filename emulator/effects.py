@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from .acquisition import acquired, probes_per_sample
 from .components import DIELECTRICS, NOMINAL, OP_AMP_GRADES, Components, Dielectric, Grade, OpAmpGrade, PotGrade
 from .excitation import Excitation
+from .noise import NoisySuspension
 from .opamp import IDEAL, PRESETS, OpAmpModel
 from .sampler import Card, Sampler, drawn_levels
 from .suspension import CHANNELS, PROGRAMS, Program, SuspensionComputer, Tweak
@@ -81,9 +82,17 @@ class _Setup:
 
     op_amp: OpAmpModel = IDEAL
     components: Components = NOMINAL
+    noise: OpAmpGrade | None = None
     card: Card = _CARD
     operator: _Operator = _careful
     quantised: bool = False
+
+    def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
+        """How far the displacement is from the ideal machine's; that of noise, from the same machine's without."""
+        reference_lsb = ideal_lsb
+        if self.noise is not None:
+            reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
+        return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
 
     def displacement_lsb(self, program: Program, seed: int) -> NDArray[np.float64]:
         """What the converter sees, or says, of the displacement at every sample, (SAMPLES,)."""
@@ -94,7 +103,8 @@ class _Setup:
         given = {"M_kg": program.M_kg, "B_n_s_per_m": program.B_n_s_per_m, "K_n_per_m": program.K_n_per_m}
         machine.set(**self.operator(machine, given, rng))
         tweaks = [(sample, self.operator(machine, wanted, rng)) for sample, wanted in _CHANGES[program.name]]
-        volts = np.concatenate(list(acquired(machine, self.card, Excitation(), SAMPLES, tweaks, rng=rng)))
+        played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
+        volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, tweaks, rng=rng)))
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.converted(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
@@ -109,7 +119,7 @@ def measured_effects(program: str) -> Iterator[Effect]:
     chosen = PROGRAMS[program]
     ideal_lsb = _Setup().displacement_lsb(chosen, 0)
     for name, draws, make in _rows():
-        figures = [float(np.abs(make(seed).displacement_lsb(chosen, seed) - ideal_lsb).max()) for seed in range(draws)]
+        figures = [make(seed).figure_lsb(chosen, seed, ideal_lsb) for seed in range(draws)]
         yield Effect(name, float(np.median(figures)), max(figures), draws)
 
 
@@ -161,6 +171,7 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
     }
     for name, model in models.items():
         yield name, 1, _fixed(_Setup(op_amp=model))
+    yield "noise of TL07x and resistors", DRAWS, _fixed(_Setup(op_amp=tl07x, noise=OP_AMP_GRADES["tl07x"]))
     for name in ("tl07x", "741"):
         grade = OP_AMP_GRADES[name]
         bias = OpAmpGrade(bias_a=grade.bias_a, input_ohm=grade.input_ohm)

@@ -47,9 +47,9 @@ Tweak = tuple[int, Mapping[str, float]]
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """What the card's four channels read, in order."""
 
-_NODES = ("in", "u5", "u2", "u1")
+CHANNEL_NODES = ("in", "u5", "u2", "u1")
 # U1 puts out -e_N: the card's differential input for the net force is wired the other way round.
-_SIGNS = np.array((1.0, 1.0, 1.0, -1.0))
+CHANNEL_SIGNS = np.array((1.0, 1.0, 1.0, -1.0))
 
 SOURCE = "F"
 """Name of the circuit's input, and its node is "in"."""
@@ -227,7 +227,7 @@ class SuspensionComputer:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         turns = self._plan(tweaks, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
-        self._engine = Engine(self._nodal.at(self._dials), _NODES, self.sample_rate_hz)
+        self._engine = Engine(self._nodal.at(self._dials), CHANNEL_NODES, self.sample_rate_hz)
         return self._blocks(self._engine, excitation, samples, turns, block_samples)
 
     # ---- playing
@@ -266,7 +266,7 @@ class SuspensionComputer:
     def _advance(self, engine: Engine, excitation: Excitation, samples: int) -> NDArray[np.float64]:
         edges = excitation.edges(*engine.window(samples), self.sample_rate_hz)
         volts = engine.run(samples, {SOURCE: edges})
-        volts *= _SIGNS
+        volts *= CHANNEL_SIGNS
         return volts
 
     # ---- pots
