@@ -25,6 +25,8 @@ from emulator import (
     Card,
     Components,
     EmulatorError,
+    NoisySuspension,
+    OpAmpGrade,
     Sampler,
     SuspensionComputer,
     acquired,
@@ -121,6 +123,8 @@ class ComputerDescription:
     """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
     temperature_c: float = 25.0
     age_h: float = 0.0
+    noise: bool = False
+    """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
 
     def fitted(self, seed: int) -> Components:
         """The components of the machine that the seed gives.
@@ -191,6 +195,7 @@ class _Stream(enum.IntEnum):
     COMPONENTS = 1
     CARD = 2
     APERTURE = 3
+    NOISE = 4
 
     def generator(self, seed: int) -> np.random.Generator:
         return np.random.default_rng([seed, int(self)])
@@ -221,9 +226,10 @@ class EmulatorRig:
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings))
         with _emulator_errors(f"scenario {scenario.name}: "):
+            machine = self._noisy(computer, seed) if self._description.computer.noise else computer
             jitter = _Stream.APERTURE.generator(seed)
             volts = acquired(
-                computer, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=BLOCK_SAMPLES
+                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=BLOCK_SAMPLES
             )
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
@@ -245,6 +251,13 @@ class EmulatorRig:
         )
         computer.set(**_settings(scenario.plant.given()))
         return computer
+
+    def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
+        drawn = self._description.computer
+        grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
+        return NoisySuspension(
+            computer, _Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c
+        )
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {

@@ -46,6 +46,17 @@ def test_a_fault_in_the_description_reaches_the_codes(tmp_path: Path) -> None:
     assert np.all(codes(described(tmp_path, "faults = { stuck_high = 1 }")) & 1)
 
 
+def test_noise_of_the_machine_moves_a_code_now_and_then_by_one(tmp_path: Path) -> None:
+    """0.027 LSB rms: nearly all codes stay as they are, and the force, which no amplifier carries, all of them."""
+    noisy = tmp_path / "noisy.toml"
+    text = config.locate("rigs", "emulator").read_text()
+    noisy.write_text(text.replace("[computer]", "[computer]\nnoise = true"))
+    differences = codes(str(noisy)).astype(int) - codes("emulator")
+    displacement = np.abs(differences[:, CHANNELS.index("displacement")])
+    assert not differences[:, CHANNELS.index("force")].any()
+    assert displacement.max() == 1 and displacement.mean() < 0.05
+
+
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
