@@ -250,10 +250,21 @@ class Components:
         there, or a deviation that leaves no value.
         """
         elements = tuple(elements)
+        if self._perfect:
+            return elements
         unknown = set(self.given) - {element.name for element in elements}
         if unknown:
             raise CircuitError(f"components: given: no element is called {min(unknown)!r}")
         return tuple(part for element in elements for part in self._parts(element))
+
+    @property
+    def _perfect(self) -> bool:
+        """Whether nothing would change: most machines are nominal, and drawing takes longer than solving them."""
+        return not self.given and self._kinds == NOMINAL._kinds
+
+    @property
+    def _kinds(self) -> tuple[object, ...]:
+        return self.resistors, self.capacitors, self.dielectric, self.op_amps, self.pots
 
     def _parts(self, element: Element) -> Iterator[Element]:
         draws = self._draws(element.name)
