@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emulator import (
+    COMPONENTS,
     IDEAL,
     TICKS_PER_SAMPLE,
     AnalogComputer,
@@ -527,3 +528,20 @@ def test_an_overload_shorter_than_the_delay_lights_nothing() -> None:
         computer = machine(Circuit([*elements, *inverter]), lamp_delay_s=delay_s)
         computer.run(3, level(10.0, ticks(0.5)))
         assert computer.lamps == {"U1": None, "U2": sample}
+
+
+@pytest.mark.parametrize("stock", ["polyester", "polypropylene"])
+def test_a_machine_of_real_components_is_set_charged_and_held(stock: str) -> None:
+    """Coefficients as pot.py has them; HOLD loses less than an LSB in 100 samples but does lose."""
+    computer = SuspensionComputer("front", components=COMPONENTS[stock])
+    by_hand = computer.machine
+    by_hand.set_initial({"U2": 5.0, "U3": -5.0})
+    by_hand.switch(POT_SET)
+    for pot, expected in computer.coefficients.items():
+        assert by_hand.coefficient(pot) == pytest.approx(expected, abs=1e-6)
+    by_hand.switch(IC)
+    by_hand.run(30000)
+    assert by_hand.read()["u3"] == pytest.approx(-5.0, abs=0.12)
+    by_hand.switch(HOLD)
+    held = by_hand.run(101)[:, 1]
+    assert 1e-6 < abs(held[-1] - held[0]) < LSB_V
