@@ -3,38 +3,72 @@
 README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
-from .circuit import Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
+from .acquisition import acquired, probes_per_sample
+from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
+from .components import (
+    COMPONENTS,
+    DIELECTRICS,
+    NOMINAL,
+    OP_AMP_GRADES,
+    Components,
+    Dielectric,
+    Grade,
+    OpAmpGrade,
+    PotGrade,
+)
 from .engine import Engine
-from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
+from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, ModeError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
+from .machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from .nodal import PiecewiseLinear, piecewise_linear
+from .noise import CircuitNoise, NoisySuspension
 from .opamp import IDEAL, OpAmpModel
-from .sampler import Card, Sampler
+from .pot import PotModel
+from .sampler import CARDS, Card, Sampler, drawn_levels
 from .spice import to_spice
 from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
 
 __all__ = [
+    "CARDS",
     "CHANNELS",
+    "COMPONENTS",
+    "DIELECTRICS",
     "FRONT",
     "IDEAL",
+    "LAMP_DELAY_S",
+    "NOMINAL",
+    "OP_AMP_GRADES",
     "PROGRAMS",
+    "REFERENCE_V",
     "SHOCK",
     "TICKS_PER_SAMPLE",
+    "AnalogComputer",
     "Capacitor",
     "Card",
     "Circuit",
     "CircuitError",
+    "CircuitNoise",
+    "Components",
+    "Dielectric",
+    "DiodeLimiter",
     "Edges",
     "EmulatorError",
     "Engine",
     "EngineError",
     "Excitation",
     "ExcitationError",
+    "Grade",
+    "Mode",
+    "ModeError",
+    "NoisySuspension",
     "OpAmp",
+    "OpAmpGrade",
     "OpAmpModel",
     "PiecewiseLinear",
     "Pot",
     "PotError",
+    "PotGrade",
+    "PotModel",
     "Program",
     "Resistor",
     "Sampler",
@@ -42,7 +76,11 @@ __all__ = [
     "Scales",
     "SuspensionComputer",
     "SuspensionParts",
+    "Switch",
     "VoltageSource",
+    "acquired",
+    "drawn_levels",
     "piecewise_linear",
+    "probes_per_sample",
     "to_spice",
 ]

@@ -16,7 +16,19 @@ from .errors import CircuitError
 from .opamp import OpAmpModel
 from .pot import checked_dial
 
-__all__ = ["GROUND", "Capacitor", "Circuit", "Element", "OpAmp", "Pot", "Resistor", "VoltageSource"]
+__all__ = [
+    "GROUND",
+    "Capacitor",
+    "Circuit",
+    "DiodeLimiter",
+    "Element",
+    "OpAmp",
+    "Pot",
+    "Resistor",
+    "Switch",
+    "VoltageSource",
+    "label",
+]
 
 GROUND = "0"
 
@@ -117,10 +129,72 @@ class VoltageSource:
         return ((self.plus, self.minus),)
 
 
-Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource
-_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource)
+@dataclass(frozen=True)
+class DiodeLimiter:
+    """A diode of straight pieces from a to b.
 
-_POSITIVE: Mapping[type, str] = {Resistor: "ohm", Capacitor: "farad", Pot: "track_ohm"}
+    With v = v(a) - v(b) it passes, in A,
+
+        v / off_ohm + (1 / on_ohm - 1 / off_ohm) max(0, v - threshold_v)
+
+    Two of them back to back, from a to b and from b to a, limit both ways.
+    """
+
+    name: str
+    a: str
+    b: str
+    threshold_v: float
+    on_ohm: float
+    off_ohm: float
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.a, self.b
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ((self.a, self.b),)
+
+    @property
+    def excess_siemens(self) -> float:
+        """By how much its conductance grows at the threshold."""
+        return 1.0 / self.on_ohm - 1.0 / self.off_ohm
+
+
+@dataclass(frozen=True)
+class Switch:
+    """on_ohm between nodes a and b when closed, off_ohm when open."""
+
+    name: str
+    a: str
+    b: str
+    on_ohm: float
+    off_ohm: float
+    closed: bool
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.a, self.b
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ((self.a, self.b),)
+
+    def ohm(self, *, closed: bool) -> float:
+        """Its resistance in that position."""
+        return self.on_ohm if closed else self.off_ohm
+
+
+Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | DiodeLimiter | Switch
+_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, DiodeLimiter, Switch)
+
+_POSITIVE: Mapping[type, tuple[str, ...]] = {
+    Resistor: ("ohm",),
+    Capacitor: ("farad",),
+    Pot: ("track_ohm",),
+    DiodeLimiter: ("on_ohm", "off_ohm"),
+    Switch: ("on_ohm", "off_ohm"),
+}
 
 
 @dataclass(frozen=True)
@@ -150,6 +224,22 @@ class Circuit:
         """The elements of one kind, in netlist order."""
         return tuple(element for element in self.elements if isinstance(element, kind))
 
+    def with_switches(self, closed: Mapping[str, bool]) -> Circuit:
+        """The same circuit with the switches named in closed thrown so.
+
+        Raises CircuitError for a switch that is not there.
+        """
+        known = {switch.name for switch in self.of(Switch)}
+        for name in closed:
+            if name not in known:
+                raise CircuitError(f"no switch is called {name!r}; there are {', '.join(sorted(known)) or 'none'}")
+        return Circuit(
+            replace(element, closed=closed[element.name])
+            if isinstance(element, Switch) and element.name in closed
+            else element
+            for element in self.elements
+        )
+
     def with_dials(self, dials: Mapping[str, float]) -> Circuit:
         """The same circuit with the pots named in dials set anew. Raises CircuitError for a pot that is not there."""
         known = {pot.name for pot in self.of(Pot)}
@@ -174,25 +264,30 @@ def _check_names(elements: tuple[Element, ...]) -> None:
             raise CircuitError(f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
+            if nodes.get(node.lower()) == node:
+                continue
             if not _NAME.fullmatch(node):
-                raise CircuitError(f"{_label(element)}: node name {node!r}: only letters, digits and _ are allowed")
+                raise CircuitError(f"{label(element)}: node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
-                raise CircuitError(f"{_label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+                raise CircuitError(f"{label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
 
 
 def _check_element(element: Element) -> None:
     for a, b in element.bonds:
         if a == b:
-            raise CircuitError(f"{_label(element)}: both ends are on node {a}")
-    field = _POSITIVE.get(type(element))
-    if field is not None:
+            raise CircuitError(f"{label(element)}: both ends are on node {a}")
+    for field in _POSITIVE.get(type(element), ()):
         value = getattr(element, field)
         if not (math.isfinite(value) and value > 0):
-            raise CircuitError(f"{_label(element)}: {field} must be positive and finite, got {value!r}")
+            raise CircuitError(f"{label(element)}: {field} must be positive and finite, got {value!r}")
     if isinstance(element, Pot):
         checked_dial(element.dial, element.name)
+    if isinstance(element, DiodeLimiter) and not math.isfinite(element.threshold_v):
+        raise CircuitError(f"{label(element)}: threshold_v must be finite, got {element.threshold_v!r}")
+    if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
+        raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
     if isinstance(element, VoltageSource) and element.dc_v is not None and not math.isfinite(element.dc_v):
-        raise CircuitError(f"{_label(element)}: dc_v must be finite, got {element.dc_v!r}")
+        raise CircuitError(f"{label(element)}: dc_v must be finite, got {element.dc_v!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
@@ -207,8 +302,9 @@ def _check_nodes(elements: tuple[Element, ...]) -> None:
     for element in elements:
         for node in element.nodes:
             if node not in grounded:
-                raise CircuitError(f"{_label(element)}: node {node} floats: no path to ground holds its voltage")
+                raise CircuitError(f"{label(element)}: node {node} floats: no path to ground holds its voltage")
 
 
-def _label(element: Element) -> str:
+def label(element: Element) -> str:
+    """How errors name an element: kind, name and nodes."""
     return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ from .nodal import Kink, PiecewiseLinear
 
 __all__ = ["Engine", "EngineCounts"]
 
+_Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
+"""Ticks, inputs and levels of all edges, in order of time."""
+
 _REASONS = {
     1: "out of memory",
     2: "the circuit is too stiff: it has a time constant below a femtosecond",
@@ -25,6 +29,7 @@ _REASONS = {
     4: "the state is no longer finite: the circuit is unstable",
     5: "the edges are out of order, not after the last sample recorded, or beyond the last sample of the run",
     6: "no circuit was set",
+    7: "limiters and amplifiers feed one another so that there is no unique solution: is there positive feedback?",
 }
 
 
@@ -32,12 +37,14 @@ _REASONS = {
 class EngineCounts:
     """What an engine has done so far.
 
-    samples: recorded; events: changes of mode found between edges; steps: matrix products; modes_built: ladders.
+    samples: recorded; events: changes of mode found between edges; steps: matrix products; quiet: samples stepped with
+    the slow states alone; modes_built: ladders.
     """
 
     samples: int
     events: int
     steps: int
+    quiet: int
     modes_built: int
 
 
@@ -65,7 +72,9 @@ class Engine:
         if not self._handle:
             raise EngineError("cannot make an engine for {} states, {} inputs, {} kinks, {} outputs".format(*sizes))
         weakref.finalize(self, self._library.engine_free, self._handle)
+        self._kinks = len(system.kinks)
         self._recorded = 0
+        self._now_tick = -1
         self.set_system(system)
 
     @property
@@ -78,7 +87,7 @@ class Engine:
         """Events, steps and modes so far."""
         counts = library.Counts()
         self._library.engine_get_counts(self._handle, ctypes.byref(counts))
-        return EngineCounts(counts.samples, counts.events, counts.steps, counts.modes_built)
+        return EngineCounts(counts.samples, counts.events, counts.steps, counts.quiet, counts.modes_built)
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -104,10 +113,13 @@ class Engine:
             raise EngineError(
                 f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
             )
-        arrays = (system.abc, system.g, system.cde, system.readings(self._outputs), _kink_table(system.kinks))
-        # The list keeps the arrays alive during the call.
-        blocks = [np.ascontiguousarray(array, np.float64) for array in arrays]
-        self._check(self._library.engine_set_system(self._handle, *(block.ctypes.data for block in blocks)))
+        rows = system.rows(self._outputs)
+        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
+        # One block of memory, with the arrays in the order of the structure's fields.
+        parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
+        block = np.concatenate(parts)
+        starts = itertools.accumulate((part.nbytes for part in parts[:-1]), initial=block.ctypes.data)
+        self._check(self._library.engine_set_system(self._handle, ctypes.byref(library.System(*starts))))
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
@@ -117,34 +129,100 @@ class Engine:
         further use.
         """
         volts = np.empty((samples, len(self._outputs)))
-        ticks, inputs, levels_v = self._merge(edges or {})
-        arguments = (ticks.ctypes.data, inputs.ctypes.data, levels_v.ctypes.data, volts.ctypes.data)
-        self._check(self._library.engine_run(self._handle, samples, ticks.size, *arguments))
-        self._recorded += samples
+        trains = self._merge(edges or {})
+        self._run_until((self._recorded + samples - 1) * TICKS_PER_SAMPLE, trains, volts)
+        self._note(samples)
         return volts
+
+    def _note(self, samples: int) -> None:
+        self._recorded += samples
+        if samples:
+            self._now_tick = (self._recorded - 1) * TICKS_PER_SAMPLE
+
+    def _run_until(self, tick: int, trains: _Trains, volts: NDArray[np.float64]) -> None:
+        addresses = [array.ctypes.data for array in (*trains, volts)]
+        self._check(self._library.engine_run(self._handle, tick, trains[0].size, *addresses))
+
+    def run_turning(
+        self,
+        samples: int,
+        turning: Callable[[float], PiecewiseLinear],
+        edges: Mapping[str, Edges] | None = None,
+        pieces_per_sample: int = 1,
+    ) -> NDArray[np.float64]:
+        """As run(), while pots are being turned: turning(t) is the circuit at t sample periods after sample 0.
+
+        Each of the pieces of 1/pieces_per_sample is stepped exactly, with the circuit of its middle; every sample is in
+        the middle of one, so it shows the circuit of its very instant. Afterwards the circuit is that of the last
+        sample. Cutting a run into several calls gives the same bits.
+
+        Error: for a piece of h seconds and a dial that moves at r per second, at most r h^2 / 8 times the largest
+        |d(dx/dt)/d(dial)|, in V/s per unit of the dial, and again r h^2 / 12 times what its rate of change adds up to
+        over the memory of the circuit: four times as many pieces per sample, a sixteenth of the error.
+        """
+        if pieces_per_sample < 1:
+            raise EngineError(f"pieces_per_sample must be at least 1, got {pieces_per_sample}")
+        volts = np.empty((samples, len(self._outputs)))
+        ticks, inputs, levels_v = self._merge(edges or {})
+        last, first_edge = self._recorded + samples - 1, 0
+        for piece in range(max(self._recorded - 1, 0) * pieces_per_sample, last * pieces_per_sample + 1):
+            self.set_system(turning(piece / pieces_per_sample))
+            stop = min((2 * piece + 1) * TICKS_PER_SAMPLE // (2 * pieces_per_sample), last * TICKS_PER_SAMPLE)
+            next_edge = int(np.searchsorted(ticks, stop, "right"))
+            now = slice(first_edge, next_edge if piece < last * pieces_per_sample else None)
+            recorded = self.counts.samples
+            self._run_until(stop, (ticks[now], inputs[now], levels_v[now]), volts[recorded - self._recorded :])
+            first_edge = next_edge
+        self._note(samples)
+        return volts
+
+    def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
+        """Goes to an instant before the next sample's and records nothing; it takes the edges up to it.
+
+        So the circuit can be changed between two samples. Raises EngineError, as run does, and for another instant.
+        """
+        if not self._now_tick <= tick < self._recorded * TICKS_PER_SAMPLE:
+            raise EngineError(f"after {self._recorded} samples: tick {tick} is past, or not before the next sample's")
+        self._run_until(tick, self._merge(edges or {}), np.empty((0, len(self._outputs))))
+        self._now_tick = tick
+
+    def watch(self, patience_ticks: int) -> None:
+        """Looks out, from here on, for kinks that stay outside their middle piece for so long without a break."""
+        self._library.engine_watch(self._handle, patience_ticks)
+
+    @property
+    def overdue_ticks(self) -> NDArray[np.int64]:
+        """For each kink the first tick at which it had been outside for the ticks of watch(); -1 where it has not."""
+        ticks = np.empty(self._kinks, np.int64)
+        self._library.engine_get_overdue(self._handle, ticks.ctypes.data)
+        return ticks
+
+    @property
+    def now_tick(self) -> int:
+        """Where the engine stands: the instant of the last sample, or of advance(); -1 before either."""
+        return self._now_tick
 
     def window(self, samples: int) -> tuple[int, int]:
         """The ticks (start, stop) of the edges that run(samples) takes next: start <= tick < stop."""
-        start = (self._recorded - 1) * TICKS_PER_SAMPLE + 1 if self._recorded else 0
-        return start, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
+        return self._now_tick + 1, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
 
-    def _merge(self, edges: Mapping[str, Edges]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+    def _merge(self, edges: Mapping[str, Edges]) -> _Trains:
         """All edges in order of time; at the same tick in order of input."""
         for name, train in edges.items():
             if name not in self._names[1]:
                 raise EngineError(f"no input is called {name!r}; there are {', '.join(self._names[1]) or 'none'}")
             if train.ticks.shape != train.levels_v.shape or not np.isfinite(train.levels_v).all():
                 raise EngineError(f"the edges of {name} need as many finite levels as ticks")
-        trains = [(self._names[1].index(name), train) for name, train in edges.items()]
-        ticks = np.concatenate([np.empty(0, np.int64), *(train.ticks for _, train in trains)])
-        inputs = np.concatenate(
-            [np.empty(0, np.int32), *(np.full(train.ticks.size, i, np.int32) for i, train in trains)]
-        )
-        levels_v = np.concatenate([np.empty(0), *(train.levels_v for _, train in trains)])
+        trains = [(self._names[1].index(name), train) for name, train in edges.items() if train.ticks.size]
+        if not trains:
+            return np.empty(0, np.int64), np.empty(0, np.int32), np.empty(0)
+        ticks = np.concatenate([train.ticks for _, train in trains], dtype=np.int64)
+        levels_v = np.concatenate([train.levels_v for _, train in trains], dtype=np.float64)
+        inputs = np.repeat(np.array([i for i, _ in trains], np.int32), [train.ticks.size for _, train in trains])
         if len(trains) > 1:
             order = np.lexsort((inputs, ticks))
             ticks, inputs, levels_v = ticks[order], inputs[order], levels_v[order]
-        return np.ascontiguousarray(ticks), np.ascontiguousarray(inputs), np.ascontiguousarray(levels_v)
+        return ticks, inputs, levels_v
 
     def _check(self, status: int) -> None:
         if status:

@@ -4,13 +4,14 @@
   x CircuitError      a netlist that cannot be: duplicate name, bad value, floating node, singular matrix
   x PotError          a setting beyond the track of a pot
   x ExcitationError   a generator setting that cannot be
+  x ModeError         a machine asked for what its mode does not allow
   x SamplerError      a card description or a voltage that cannot be
   x EngineError       the engine is missing, or a run cannot go on
 """
 
 from __future__ import annotations
 
-__all__ = ["CircuitError", "EmulatorError", "EngineError", "ExcitationError", "PotError", "SamplerError"]
+__all__ = ["CircuitError", "EmulatorError", "EngineError", "ExcitationError", "ModeError", "PotError", "SamplerError"]
 
 
 class EmulatorError(Exception):
@@ -27,6 +28,10 @@ class PotError(EmulatorError):
 
 class ExcitationError(EmulatorError):
     """A field of an Excitation is out of range; the message names the field."""
+
+
+class ModeError(EmulatorError):
+    """A change of mode that makes no sense, or a request in the wrong mode; the message names the mode."""
 
 
 class SamplerError(EmulatorError):

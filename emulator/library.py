@@ -9,7 +9,7 @@ from pathlib import Path
 
 from .errors import EngineError
 
-__all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "load"]
+__all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "System", "load"]
 
 # The limits of engine.h.
 MAX_STATES = 32
@@ -25,16 +25,24 @@ _BUILD = "cc -std=c99 -O2 -ffp-contract=off -shared -fPIC -o emulator/_engine.so
 class Counts(ctypes.Structure):
     """struct engine_counts."""
 
-    _fields_ = (("samples", c_int64), ("events", c_int64), ("steps", c_int64), ("modes_built", c_int64))
+    _fields_ = tuple((name, c_int64) for name in ("samples", "events", "steps", "quiet", "modes_built"))
+
+
+class System(ctypes.Structure):
+    """struct engine_system."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
 
 
 _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
     ("engine_free", None, (c_void_p,)),
-    ("engine_set_system", c_int, (c_void_p,) * 6),
+    ("engine_set_system", c_int, (c_void_p, POINTER(System))),
     ("engine_get_state", None, (c_void_p, c_void_p)),
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
+    ("engine_watch", None, (c_void_p, c_int64)),
+    ("engine_get_overdue", None, (c_void_p, c_void_p)),
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
 )

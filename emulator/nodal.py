@@ -1,30 +1,31 @@
 """From a circuit to its piecewise-linear state space, by modified nodal analysis.
 
-    dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e,   v = L x + M u + n
+    dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e + P phi(w),   v = L x + M u + n + R phi(w)
 
 x: the voltage of every capacitor, then the voltage behind the output resistance of every op-amp that has a pole
 (netlist order each).
 u: the voltage sources that are inputs. v: every node voltage. phi: one Kink per element of w: for each op-amp its slew
-limit, then its clamp.
+limit, then its clamp; then, for each diode limiter, by how many volts it is beyond its threshold.
 
 How: with x and u held, the circuit is resistive. Capacitors become voltage sources x, op-amp poles voltage sources x
 behind their output resistance. Kirchhoff's current law at every node, and one equation per branch whose current is
-unknown, give one linear system with right-hand side columns [x | u | 1]; its solution is [L M n] and the branch
-currents, and the rest is read off it: a capacitor's dx/dt is its current over its capacitance, an op-amp's is its law
-(opamp.py). Only elementwise arithmetic and engine_solve are used, no BLAS, so a circuit has the same bits on every
-machine.
+unknown, give one linear system with right-hand side columns [x | u | 1 | phi of the limiters]; its solution is
+[L M n R] and the branch currents, and the rest is read off it: a capacitor's dx/dt is its current over its
+capacitance, an op-amp's is its law (opamp.py). Only elementwise arithmetic and engine_solve are used, no BLAS,
+so a circuit has the same bits on every machine.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import library
-from .circuit import GROUND, Capacitor, Circuit, OpAmp, Pot, Resistor, VoltageSource
+from .circuit import GROUND, Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .errors import CircuitError
 from .opamp import CLAMP_RATE
 from .pot import checked_dial, legs_ohm
@@ -44,6 +45,8 @@ class Kink:
     lower: float
     upper: float
     slopes: tuple[float, float, float]
+    element: str = ""
+    """The name of the element that it limits."""
 
     @classmethod
     def clip(cls, limit: float) -> Kink:
@@ -70,8 +73,8 @@ class PiecewiseLinear:
 
     Columns of abc, cde and lmn: states, inputs, constant.
 
-    abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); lmn: (nodes, n+m+1), dimensionless but for its last
-    column in V.
+    abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); w_phi: P, (q, q); lmn: (nodes, n+m+1), dimensionless but
+    for its last column in V; v_phi: R, (nodes, q).
     states, inputs, nodes: names; ground is not among the nodes.
     """
 
@@ -82,15 +85,40 @@ class PiecewiseLinear:
     abc: Matrix
     g: Matrix
     cde: Matrix
+    w_phi: Matrix
     lmn: Matrix
+    v_phi: Matrix
 
     def readings(self, nodes: Sequence[str]) -> Matrix:
         """The rows of lmn for these nodes, in this order. Raises CircuitError for a node that is not there."""
+        return self.lmn[self.rows(nodes)]
+
+    def rows(self, nodes: Sequence[str]) -> list[int]:
+        """Which rows of lmn and v_phi belong to these nodes. Raises CircuitError for a node that is not there."""
         try:
-            return self.lmn[[self.nodes.index(node) for node in nodes]]
+            return [self.nodes.index(node) for node in nodes]
         except ValueError:
             missing = next(node for node in nodes if node not in self.nodes)
             raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
+
+    def rest(self, levels_v: Matrix) -> Matrix:
+        """The state (n,) at which nothing moves, with the inputs held at levels_v (m,) and no kink at its limit.
+
+        Amplifiers neither slew nor clamp then, and limiters do not conduct.
+        Raises CircuitError naming a state that nothing brings to rest.
+        """
+        size = len(self.states)
+        slopes = np.array([kink.slopes[1] for kink in self.kinks])
+        flow = self.abc.copy()
+        for k, slope in enumerate(slopes):
+            flow += np.outer(self.g[:, k] * slope, self.cde[k])
+        left = np.ascontiguousarray(flow[:, :size])
+        right = -(flow[:, size:] * np.append(levels_v, 1.0)).sum(axis=1, keepdims=True)
+        failed = library.load().engine_solve(size, 1, left.ctypes.data, right.ctypes.data)
+        if failed >= 0:
+            raise CircuitError(f"nothing brings {self.states[failed]} to rest")
+        state: Matrix = right[:, 0]
+        return state
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
@@ -102,13 +130,15 @@ def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
 
 
 class Nodal:
-    """The equations of one circuit, with everything but the pots already entered: turning a pot costs little.
+    """The equations of one circuit, with everything but pots and switches already entered: turning a pot costs little.
 
     Raises CircuitError when the circuit exceeds what the engine takes.
     """
 
     def __init__(self, circuit: Circuit) -> None:
         self._pots = circuit.of(Pot)
+        self._switches = circuit.of(Switch)
+        self._limiters = circuit.of(DiodeLimiter)
         self._capacitors = circuit.of(Capacitor)
         self._inputs = tuple(source for source in circuit.of(VoltageSource) if source.dc_v is None)
         self._poles = tuple(amp for amp in circuit.of(OpAmp) if amp.model.has_state)
@@ -125,24 +155,32 @@ class Nodal:
         holders: list[Capacitor | OpAmp] = [*self._capacitors, *self._poles]
         self._state = {element.name: i for i, element in enumerate(holders)}
         self._columns = len(self._state) + len(self._inputs) + 1
+        self._kinks = tuple(replace(kink, element=amp.name) for amp in self._poles for kink in _kinks(amp))
+        self._kinks += tuple(
+            replace(Kink.deadzone(-math.inf, limiter.threshold_v), element=limiter.name) for limiter in self._limiters
+        )
         self._check_size()
 
         size = len(self._unknowns) + 1
         self._left = np.zeros((size, size))
-        self._right = np.zeros((size, self._columns))
+        self._right = np.zeros((size, self._columns + len(self._limiters)))
+        ends = [(switch.a, switch.b) for switch in self._switches]
+        self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
+        self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
         self._enter(circuit)
-        self._kinks = tuple(kink for amp in self._poles for kink in _kinks(amp))
 
-    def at(self, dials: Mapping[str, float]) -> PiecewiseLinear:
-        """The state space with the pots named in dials set so, and the others as in the netlist.
+    def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
+        """The state space with the pots named in dials and the switches named in closed set so.
+
+        The others are as in the netlist.
 
         Raises PotError for a dial off its track, CircuitError for a singular circuit.
         """
         left = self._left.copy()
-        for pot in self._pots:
-            self._enter_pot(left, pot, checked_dial(dials.get(pot.name, pot.dial), pot.name))
+        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, closed or {}), _STAMP).ravel())
         solution = self._solve(left)
-        abc, g, cde = self._flow(solution)
+        abc, g, cde, w_phi = self._flow(solution)
+        voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(
             states=tuple(self._state),
             inputs=tuple(source.name for source in self._inputs),
@@ -151,7 +189,9 @@ class Nodal:
             abc=abc,
             g=g,
             cde=cde,
-            lmn=solution[: len(self._nodes)],
+            w_phi=w_phi,
+            lmn=voltages[:, : self._columns],
+            v_phi=self._spread(voltages),
         )
 
     # ---- entering the elements
@@ -160,6 +200,7 @@ class Nodal:
         sizes = (
             ("states", len(self._state), library.MAX_STATES),
             ("inputs", len(self._inputs), library.MAX_INPUTS),
+            ("slew limits, clamps and diode limiters", len(self._kinks), library.MAX_KINKS),
             ("nodes and branches", len(self._unknowns), library.MAX_UNKNOWNS),
         )
         for what, count, limit in sizes:
@@ -167,8 +208,10 @@ class Nodal:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
     def _enter(self, circuit: Circuit) -> None:
-        for resistor in circuit.of(Resistor):
-            self._conductance(self._left, resistor.a, resistor.b, 1.0 / resistor.ohm)
+        resistors = circuit.of(Resistor)
+        places = self._places([(resistor.a, resistor.b) for resistor in resistors])
+        siemens = [1.0 / resistor.ohm for resistor in resistors]
+        np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
         for capacitor in self._capacitors:
             row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
             self._right[row, self._state[capacitor.name]] = 1.0
@@ -177,9 +220,13 @@ class Nodal:
             if source.dc_v is None:
                 self._right[row, len(self._state) + self._inputs.index(source)] = 1.0
             else:
-                self._right[row, -1] = source.dc_v
+                self._right[row, self._columns - 1] = source.dc_v
         for amp in circuit.of(OpAmp):
             self._enter_opamp(amp)
+        for i, limiter in enumerate(self._limiters):
+            self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
+            self._right[self._row[limiter.a], self._columns + i] -= limiter.excess_siemens
+            self._right[self._row[limiter.b], self._columns + i] += limiter.excess_siemens
 
     def _conductance(self, left: Matrix, a: str, b: str, siemens: float) -> None:
         i, j = self._row[a], self._row[b]
@@ -188,10 +235,18 @@ class Nodal:
         left[i, j] -= siemens
         left[j, i] -= siemens
 
-    def _enter_pot(self, left: Matrix, pot: Pot, dial: float) -> None:
-        upper_ohm, lower_ohm = legs_ohm(dial, pot.track_ohm)
-        self._conductance(left, pot.top, pot.wiper, 1.0 / upper_ohm)
-        self._conductance(left, pot.wiper, pot.bottom, 1.0 / lower_ohm)
+    def _leg_siemens(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> list[float]:
+        """Conductances of the switches, then of both legs of every pot."""
+        ohms = [switch.ohm(closed=closed.get(switch.name, switch.closed)) for switch in self._switches]
+        for pot in self._pots:
+            ohms += legs_ohm(checked_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
+        return [1.0 / ohm for ohm in ohms]
+
+    def _places(self, ends: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
+        """Where conductances between these nodes enter the flattened matrix, four places each."""
+        size = len(self._unknowns) + 1
+        rows = [(self._row[a], self._row[b]) for a, b in ends]
+        return np.array([(i * size + i, j * size + j, i * size + j, j * size + i) for i, j in rows], np.intp).ravel()
 
     def _voltage_branch(self, name: str, plus: str, minus: str) -> int:
         """Enters a branch whose current flows from node plus through it to node minus.
@@ -216,7 +271,7 @@ class Nodal:
             self._left[row, row] -= model.rout_ohm / model.avol
             self._left[row, self._row[amp.plus]] -= 1.0
             self._left[row, self._row[amp.minus]] += 1.0
-            self._right[row, -1] = model.vos_v
+            self._right[row, self._columns - 1] = model.vos_v
         elif model.rout_ohm > 0:
             self._conductance(self._left, amp.out, GROUND, 1.0 / model.rout_ohm)
             self._right[out, self._state[amp.name]] += 1.0 / model.rout_ohm
@@ -227,49 +282,113 @@ class Nodal:
     # ---- reading the solution
 
     def _solve(self, left: Matrix) -> Matrix:
-        """Every unknown as a function of [x | u | 1]: (unknowns + 1, columns), the last row being ground's zeros."""
+        """Every unknown as a function of [x | u | 1 | phi of the limiters], and a last row for ground, of zeros."""
         size = len(self._unknowns)
         matrix = np.ascontiguousarray(left[:size, :size])
-        solution = np.zeros((size + 1, self._columns))
+        solution = np.zeros((size + 1, self._right.shape[1]))
         solution[:size] = self._right[:size]
-        failed = library.load().engine_solve(size, self._columns, matrix.ctypes.data, solution.ctypes.data)
+        failed = library.load().engine_solve(size, self._right.shape[1], matrix.ctypes.data, solution.ctypes.data)
         if failed >= 0:
             raise CircuitError(f"the circuit is singular: nothing determines the {self._unknowns[failed]}")
         return solution
 
-    def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-        abc = np.zeros((len(self._state), self._columns))
-        g = np.zeros((len(self._state), len(self._kinks)))
-        cde = np.zeros((len(self._kinks), self._columns))
-        for capacitor in self._capacitors:
-            abc[self._state[capacitor.name]] = solution[self._branch[capacitor.name]] / capacitor.farad
-        kink = 0
-        for amp in self._poles:
-            state = self._state[amp.name]
-            demand = self._demand(amp, solution)
-            if amp.model.slews:
-                cde[kink] = demand
-                g[state, kink] = 1.0
-                kink += 1
-            else:
-                abc[state] = demand
-            if amp.model.clamps:
-                cde[kink, state] = 1.0
-                g[state, kink] = -CLAMP_RATE
-                kink += 1
-        return abc, g, cde
+    def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """[A B c], G, [C D e] and P."""
+        laws, states = self._laws, len(self._state)
+        drives = laws.drives(solution, self._columns - 1)
+        w = drives[laws.drive_of_kink]
+        w[laws.clamps] = 0.0
+        w[laws.clamps, laws.drive_of_kink[laws.clamps]] = 1.0
+        slopes = drives[:states]
+        slopes[laws.drive_of_kink[laws.slews]] = 0.0
+        g = laws.g.copy()
+        g[:, g.shape[1] - len(self._limiters) :] = slopes[:, self._columns :]
+        return slopes[:, : self._columns], g, w[:, : self._columns], self._spread(w)
 
-    def _demand(self, amp: OpAmp, solution: Matrix) -> Matrix:
-        """The slope in V/s that the inputs ask of the op-amp, before any limit, as a row over [x | u | 1]."""
-        difference: Matrix = solution[self._row[amp.plus]] - solution[self._row[amp.minus]]
-        difference[-1] += amp.model.vos_v
-        demand: Matrix = amp.model.gain_rate * difference
-        demand[self._state[amp.name]] -= amp.model.leak_rate
-        return demand
+    def _spread(self, solution: Matrix) -> Matrix:
+        """The columns of the limiters' phi at the places of their kinks: (rows, kinks)."""
+        spread = np.zeros((solution.shape[0], len(self._kinks)))
+        spread[:, len(self._kinks) - len(self._limiters) :] = solution[:, self._columns :]
+        return spread
+
+
+_STAMP = np.array((1.0, 1.0, -1.0, -1.0))
+"""How a conductance enters: at both ends' own places, then across."""
+
+
+@dataclass(frozen=True)
+class _Laws:
+    """What makes states and kinks move, as arrays: capacitors by their currents, then op-amps and limiters by voltages.
+
+    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less what leaks. Of the kinks, in the order
+    of _kinks(), drive_of_kink says whose they are; slews and clamps say which are which. g: G without the limiters.
+    """
+
+    plus: NDArray[np.intp]
+    minus: NDArray[np.intp]
+    offset: Matrix
+    gain: Matrix
+    capacity: Matrix
+    poles: NDArray[np.intp]
+    leak: Matrix
+    drive_of_kink: NDArray[np.intp]
+    slews: NDArray[np.intp]
+    clamps: NDArray[np.intp]
+    g: Matrix
+
+    @classmethod
+    def of(
+        cls,
+        row: Mapping[str, int],
+        branch: Mapping[str, int],
+        capacitors: Sequence[Capacitor],
+        poles: Sequence[OpAmp],
+        limiters: Sequence[DiodeLimiter],
+    ) -> _Laws:
+        """The laws of the circuit whose nodes and branches have been numbered."""
+        ends = [(branch[capacitor.name], row[GROUND]) for capacitor in capacitors]
+        ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
+        ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
+        plus, minus = np.array(ends, np.intp).reshape(-1, 2).T
+        first, states = len(capacitors), len(capacitors) + len(poles)
+        kinds = [
+            (i, slews) for i, amp in enumerate(poles, first) for slews in (True, False) if _limits(amp, slews=slews)
+        ]
+        ones, zeros = np.ones(len(capacitors)), np.zeros(len(capacitors))
+        tail = np.ones(len(limiters))
+        laws = cls(
+            plus=plus,
+            minus=minus,
+            offset=np.concatenate((zeros, [amp.model.vos_v for amp in poles], 0.0 * tail)),
+            gain=np.concatenate((ones, [amp.model.gain_rate for amp in poles], tail)).reshape(-1, 1),
+            capacity=np.concatenate(([c.farad for c in capacitors], np.ones(len(poles)), tail)).reshape(-1, 1),
+            poles=np.arange(first, states),
+            leak=np.array([amp.model.leak_rate for amp in poles]),
+            drive_of_kink=np.array([i for i, _ in kinds] + list(range(states, states + len(limiters))), np.intp),
+            slews=np.array([kink for kink, (_, slews) in enumerate(kinds) if slews], np.intp),
+            clamps=np.array([kink for kink, (_, slews) in enumerate(kinds) if not slews], np.intp),
+            g=np.zeros((states, len(kinds) + len(limiters))),
+        )
+        laws.g[laws.drive_of_kink[laws.slews], laws.slews] = 1.0
+        laws.g[laws.drive_of_kink[laws.clamps], laws.clamps] = -CLAMP_RATE
+        return laws
+
+    def drives(self, solution: Matrix, constant: int) -> Matrix:
+        """A row for each capacitor (V/s), op-amp with a pole (V/s, before any limit) and limiter (V)."""
+        drives: Matrix = solution[self.plus] - solution[self.minus]
+        drives[:, constant] += self.offset
+        drives *= self.gain
+        drives /= self.capacity
+        drives[self.poles, self.poles] -= self.leak
+        return drives
+
+
+def _limits(amp: OpAmp, *, slews: bool) -> bool:
+    return amp.model.slews if slews else amp.model.clamps
 
 
 def _kinks(amp: OpAmp) -> list[Kink]:
-    """In the order in which Nodal._flow enters them."""
+    """The slew limit, then the clamp."""
     kinks = []
     if amp.model.slews:
         kinks.append(Kink.clip(amp.model.slew_v_per_s))

@@ -91,9 +91,10 @@ PRESETS: Mapping[str, OpAmpModel] = MappingProxyType(
         "ideal": IDEAL,
         "tl07x": OpAmpModel(avol=2e5, gbw_hz=3e6, slew_v_per_s=13e6, swing_v=(-13.5, 13.5), rout_ohm=100.0),
         "741": OpAmpModel(avol=2e5, gbw_hz=1e6, slew_v_per_s=0.5e6, swing_v=(-13.5, 13.5), rout_ohm=75.0),
+        "opa627": OpAmpModel(avol=1e6, gbw_hz=16e6, slew_v_per_s=55e6, swing_v=(-12.3, 12.3), rout_ohm=55.0),
     }
 )
-"""Typical values on +-15 V, from the datasheets of the TL071 family and of the uA741."""
+"""Typical values on +-15 V, from the datasheets of the TL071 family, of the uA741, and of the OPA627."""
 
 
 def preset(name: str) -> OpAmpModel:

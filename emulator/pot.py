@@ -11,10 +11,11 @@ which is less than its dial shows. An operator either sets the dial, or sets the
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from .errors import PotError
+from .errors import CircuitError, PotError
 
-__all__ = ["END_FRACTION", "checked_dial", "coefficient_under_load", "dial_for", "legs_ohm"]
+__all__ = ["END_FRACTION", "PotModel", "checked_dial", "coefficient_under_load", "dial_for", "legs_ohm"]
 
 END_FRACTION = 1e-6
 """Part of the track that stays between wiper and terminal at an end stop, so that no leg is ever a short circuit."""
@@ -48,3 +49,53 @@ def legs_ohm(dial: float, track_ohm: float) -> tuple[float, float]:
     """Resistance in ohm from the top to the wiper and from the wiper to the bottom."""
     end_ohm = END_FRACTION * track_ohm
     return max((1.0 - dial) * track_ohm, end_ohm), max(dial * track_ohm, end_ohm)
+
+
+@dataclass(frozen=True)
+class PotModel:
+    """A real pot: what it passes at a dial into a load, and where it must stand to pass that.
+
+    track_ohm: between the end stops, dial 0 to dial 1; end_ohm: what lies beyond either stop; wiper_ohm: of the wiper's
+    contact, in series with the load. windings: turns of wire on which the wiper can rest, so that the dial acts in
+    steps of 1 / windings; 0 for a continuous track.
+    Raises CircuitError naming the field.
+    """
+
+    track_ohm: float
+    wiper_ohm: float = 0.0
+    end_ohm: float = 0.0
+    windings: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.track_ohm < math.inf:
+            raise CircuitError(f"pot: track_ohm must be positive and finite, got {self.track_ohm!r}")
+        for field in ("wiper_ohm", "end_ohm", "windings"):
+            value = getattr(self, field)
+            if not 0 <= value < math.inf:
+                raise CircuitError(f"pot: {field} must be finite and not negative, got {value!r}")
+
+    @property
+    def _total_ohm(self) -> float:
+        return self.track_ohm + 2.0 * self.end_ohm
+
+    def coefficient(self, dial: float, load_ohm: float) -> float:
+        """What the pot passes (V/V) at that dial into load_ohm, from a stiff source."""
+        fraction = self.end_ohm / self._total_ohm + dial * (self.track_ohm / self._total_ohm)
+        driven_ohm = load_ohm + self.wiper_ohm
+        return coefficient_under_load(fraction, self._total_ohm, driven_ohm) * (load_ohm / driven_ohm)
+
+    def dial(self, coefficient: float, load_ohm: float, name: str = "pot") -> float:
+        """The dial that passes the coefficient into load_ohm, were the track continuous.
+
+        Raises PotError naming the pot when there is none between the end stops.
+        """
+        driven_ohm = load_ohm + self.wiper_ohm
+        fraction = dial_for(coefficient * (driven_ohm / load_ohm), self._total_ohm, driven_ohm, name)
+        dial = fraction * (self._total_ohm / self.track_ohm) - self.end_ohm / self.track_ohm
+        if not 0.0 <= dial <= 1.0:
+            raise PotError(f"pot {name}: coefficient {coefficient:.6g} lies beyond an end stop")
+        return dial
+
+    def resting(self, dial: float) -> float:
+        """Where the wiper comes to rest when the dial is turned there: on the nearest winding."""
+        return round(dial * self.windings) / self.windings if self.windings else dial

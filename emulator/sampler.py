@@ -1,26 +1,52 @@
-"""The card: four channels, sampled at the same instant, to codes."""
+"""The card: channels, sampled together or one after the other, to codes.
+
+A channel's way to its code, each step exact where its fault is left at its default:
+
+    instant    k / rate + skew of the channel + aperture delay + jitter          (acquisition.py asks the engine there)
+    hold       acquired to within exp(-acquisition) of the step from the sample before; droop while conversions wait
+    amplifier  u = ((1 + gain error) held - low) / LSB + offset + noise, in LSB
+    converter  successive approximation on the levels of linearity.py; stuck bits
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SamplerError
 
-__all__ = ["Card", "Sampler"]
+__all__ = ["CARDS", "RANGES_V", "Card", "Sampler", "drawn_levels"]
 
 _MAX_BITS = 16
+
+RANGES_V: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"0..10": (0.0, 10.0), "+-10": (-10.0, 10.0), "0..5": (0.0, 5.0), "+-5": (-5.0, 5.0)}
+)
+"""The unipolar and bipolar ranges that cards of the DT2821 class can be set to."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """An analogue-to-digital card; the defaults are 12 bits at 20 kHz, +-10 V on each of four channels, without noise.
+    """An analogue-to-digital card; the defaults are 12 bits at 20 kHz, +-10 V on each of four channels, without faults.
+
+    A field of one number per channel may be left empty for zeros.
 
     ranges_v: (low, high) of each channel in V; code 0 is low, and high is one LSB above the last code.
     noise_lsb: rms of the white Gaussian noise of each channel, added before quantisation.
+    throughput_hz: conversions per second of the converter that all channels share.
+    skew_s: by how much each channel is sampled after the nominal instant. clock_drift_ppm: by how much its clock is
+    fast.
+    aperture_delay_s, aperture_jitter_s: of every sample-and-hold, and its rms.
+    acquisition: time constants that the sample-and-hold has to acquire; droop_v_per_s: loss of a held voltage (towards
+    low) while the conversions of the channels before are waited for, 1 / throughput_hz each.
+    gain_error: of each channel, a fraction; offset_lsb: of each channel.
+    levels_lsb: where the converter steps from code c - 1 to code c, for c = 1 .. 2^bits - 1 (ideal: c - 1/2), in LSB;
+    empty: ideal. missing_codes: never given. stuck_high, stuck_low: masks of bits that always read 1 or 0.
     Raises SamplerError naming the field.
     """
 
@@ -28,22 +54,31 @@ class Card:
     rate_hz: float = 20e3
     ranges_v: tuple[tuple[float, float], ...] = ((-10.0, 10.0),) * 4
     noise_lsb: tuple[float, ...] = (0.0,) * 4
+    throughput_hz: float = math.inf
+    skew_s: tuple[float, ...] = ()
+    clock_drift_ppm: float = 0.0
+    aperture_delay_s: float = 0.0
+    aperture_jitter_s: float = 0.0
+    acquisition: float = math.inf
+    droop_v_per_s: float = 0.0
+    gain_error: tuple[float, ...] = ()
+    offset_lsb: tuple[float, ...] = ()
+    levels_lsb: tuple[float, ...] = ()
+    missing_codes: tuple[int, ...] = ()
+    stuck_high: int = 0
+    stuck_low: int = 0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.bits <= _MAX_BITS:
-            raise SamplerError(f"card: bits must be 1 to {_MAX_BITS}, got {self.bits!r}")
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise SamplerError(f"card: rate_hz must be positive and finite, got {self.rate_hz!r}")
+        self._require("bits", 1 <= self.bits <= _MAX_BITS, f"must be 1 to {_MAX_BITS}")
+        self._require("rate_hz", math.isfinite(self.rate_hz) and self.rate_hz > 0, "must be positive and finite")
         for channel, (low, high) in enumerate(self.ranges_v):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise SamplerError(f"card: ranges_v of channel {channel} must be (low, high), got {(low, high)!r}")
         if len(self.noise_lsb) != len(self.ranges_v):
             raise SamplerError(f"card: noise_lsb has {len(self.noise_lsb)} channels, ranges_v has {len(self.ranges_v)}")
-        for channel, noise in enumerate(self.noise_lsb):
-            if not (math.isfinite(noise) and noise >= 0):
-                raise SamplerError(
-                    f"card: noise_lsb of channel {channel} must be finite and not negative, got {noise!r}"
-                )
+        self._check_channels()
+        self._check_timing()
+        self._check_converter()
 
     @property
     def channels(self) -> int:
@@ -56,10 +91,70 @@ class Card:
         low, high = np.array(self.ranges_v).T
         return np.asarray((high - low) / (1 << self.bits))
 
+    @property
+    def true_rate_hz(self) -> float:
+        """Samples per second of true time, which rate_hz is by the card's own clock."""
+        return self.rate_hz * (1.0 + 1e-6 * self.clock_drift_ppm)
+
+    def per_channel(self, field: str) -> NDArray[np.float64]:
+        """A field of one number per channel, (channels,)."""
+        return np.array(getattr(self, field) or (0.0,) * self.channels)
+
     def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
         """The voltages at the centres of the codes: (n, channels)."""
         low = np.array(self.ranges_v)[:, 0]
         return np.asarray(low + codes * self.lsb_v)
+
+    def levels(self) -> NDArray[np.float64] | None:
+        """levels_lsb with level 0 before it and the missing codes left no width, (2^bits,); None for an ideal one."""
+        if not self.levels_lsb and not self.missing_codes:
+            return None
+        levels: NDArray[np.float64] = np.arange(1 << self.bits, dtype=np.float64) - 0.5
+        if self.levels_lsb:
+            levels[1:] = self.levels_lsb
+        for code in sorted(self.missing_codes, reverse=True):
+            levels[code] = levels[code + 1]
+        return levels
+
+    def _check_channels(self) -> None:
+        for field, least in (("noise_lsb", 0.0), ("skew_s", 0.0), ("gain_error", -0.5), ("offset_lsb", -math.inf)):
+            numbers = getattr(self, field)
+            self._require(field, len(numbers) in (0, self.channels), f"must have {self.channels} channels or none")
+            for channel, number in enumerate(numbers):
+                if not (math.isfinite(number) and number >= least):
+                    what = "not negative" if least == 0 else f"at least {least:g}"
+                    raise SamplerError(f"card: {field} of channel {channel} must be finite and {what}, got {number!r}")
+
+    def _check_timing(self) -> None:
+        self._require("throughput_hz", self.throughput_hz > 0, "must be positive")
+        if self.channels * self.rate_hz > self.throughput_hz:
+            raise SamplerError(
+                f"card: throughput_hz {self.throughput_hz:g} does not carry {self.channels} channels at "
+                f"{self.rate_hz:g} Hz ({self.channels * self.rate_hz:g} conversions/s)"
+            )
+        self._require("clock_drift_ppm", abs(self.clock_drift_ppm) <= 10_000, "must be within +-10000 ppm")
+        for field in ("aperture_delay_s", "aperture_jitter_s"):
+            self._require(field, 0 <= getattr(self, field) <= 1e-6, "must be 0 to 1 us")
+        latest_s = max(self.skew_s, default=0.0) + self.aperture_delay_s
+        self._require("skew_s", latest_s <= 0.9 / self.rate_hz, "with the aperture delay exceeds 0.9 sample periods")
+        self._require("acquisition", self.acquisition > 0, "must be positive")
+        self._require("droop_v_per_s", math.isfinite(self.droop_v_per_s), "must be finite")
+        if self.droop_v_per_s and not math.isfinite(self.throughput_hz):
+            raise SamplerError("card: droop_v_per_s needs a finite throughput_hz: nothing waits otherwise")
+
+    def _check_converter(self) -> None:
+        codes = 1 << self.bits
+        count = len(self.levels_lsb)
+        if count not in (0, codes - 1) or not all(map(math.isfinite, self.levels_lsb)):
+            raise SamplerError(f"card: levels_lsb must be {codes - 1} finite numbers or none, got {count}")
+        self._require("missing_codes", all(0 < c < codes - 1 for c in self.missing_codes), f"must be 1 to {codes - 2}")
+        for field in ("stuck_high", "stuck_low"):
+            self._require(field, 0 <= getattr(self, field) < codes, f"must be a mask of {self.bits} bits")
+        self._require("stuck_high", not self.stuck_high & self.stuck_low, "has a bit that stuck_low has too")
+
+    def _require(self, field: str, holds: object, what: str) -> None:
+        if not holds:
+            raise SamplerError(f"card: {field} {what}, got {getattr(self, field)!r}")
 
 
 class Sampler:
@@ -75,11 +170,25 @@ class Sampler:
         self._low_v = np.array(card.ranges_v)[:, 0]
         self._lsb_v = card.lsb_v
         self._noise_lsb = np.array(card.noise_lsb)
+        self._gain = 1.0 + card.per_channel("gain_error")
+        self._offset_lsb = card.per_channel("offset_lsb")
+        self._droop_v = card.droop_v_per_s / card.throughput_hz * np.arange(card.channels)
+        self._left_over = math.exp(-card.acquisition)
+        self._held_v: NDArray[np.float64] | None = None
+        self._levels = card.levels()
 
     def sample(self, volts: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts (n, channels) to codes, uint16 (n, channels), and whether each was clipped, bool (n, channels).
 
-        code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1; clipped says that the limit was needed.
+        Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. Clipped says that what the
+        converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
+        Raises SamplerError for a voltage that is not a number, or another shape.
+        """
+        return self.converted(self.seen_lsb(volts))
+
+    def seen_lsb(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
+
         Raises SamplerError for a voltage that is not a number, or another shape.
         """
         if volts.ndim != 2 or volts.shape[1] != self.card.channels:
@@ -87,7 +196,74 @@ class Sampler:
         if np.isnan(volts).any():
             sample, channel = np.argwhere(np.isnan(volts))[0]
             raise SamplerError(f"sample {sample} of the block, channel {channel}: the voltage is not a number")
-        noise = self._rng.standard_normal(volts.shape) * self._noise_lsb
-        unlimited = np.floor((volts - self._low_v) / self._lsb_v + noise + 0.5)
+        noise = self._rng.standard_normal(volts.shape) * self._noise_lsb + self._offset_lsb
+        held_v = self._acquired(volts) * self._gain - self._droop_v
+        return np.asarray((held_v - self._low_v) / self._lsb_v + noise)
+
+    def converted(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+        """Codes and clipping flags, as of sample, of what the converter sees."""
+        unlimited = np.floor(seen_lsb + 0.5)
         limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
-        return limited.astype(np.uint16), limited != unlimited
+        codes = limited.astype(np.uint16) if self._levels is None else _approximated(seen_lsb, self._levels)
+        codes = (codes | np.uint16(self.card.stuck_high)) & ~np.uint16(self.card.stuck_low)
+        return codes, limited != unlimited
+
+    def _acquired(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the sample-and-holds hold: each step from one sample to the next lacks its last part."""
+        if self._left_over == 0.0 or not len(volts):
+            return volts
+        held_v = np.empty_like(volts)
+        before = volts[0] if self._held_v is None else self._held_v
+        for k, target in enumerate(volts):
+            before = target + self._left_over * (before - target)
+            held_v[k] = before
+        self._held_v = before
+        return held_v
+
+
+def _approximated(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Successive approximation: from the highest bit down, keep a bit when what is seen reaches the level with it."""
+    codes = np.zeros(seen_lsb.shape, np.uint16)
+    for bit in reversed(range(levels.size.bit_length() - 1)):
+        tried = codes | np.uint16(1 << bit)
+        codes = np.where(seen_lsb >= levels[tried], tried, codes)
+    return codes
+
+
+def drawn_levels(bits: int, rng: np.random.Generator, inl_lsb: float, *, monotonic: bool = True) -> tuple[float, ...]:
+    """Levels of a converter whose bits have drawn weights, for Card.levels_lsb; its largest INL is inl_lsb.
+
+    The error of bit b is normal, in proportion to 2^(b/2) as that of 2^b equal elements; INL is counted from the
+    straight line through the ends. Where a major carry would step back, monotonic holds the level instead.
+    """
+    weights_lsb = rng.standard_normal(bits) * 2.0 ** (0.5 * np.arange(bits))
+    codes = np.arange(1 << bits)
+    errors = ((codes[:, None] >> np.arange(bits)) & 1).astype(np.float64) @ weights_lsb
+    line = errors[1] + (errors[-1] - errors[1]) * (codes - 1) / max(codes[-1] - 1, 1)
+    inl = (errors - line)[1:]
+    largest = float(np.abs(inl).max())
+    levels = codes[1:] - 0.5 + (inl * (inl_lsb / largest) if largest > 0 else 0.0)
+    return tuple(np.maximum.accumulate(levels).tolist() if monotonic else levels.tolist())
+
+
+_DT2821 = Card(
+    throughput_hz=100e3,
+    noise_lsb=(0.3,) * 4,
+    aperture_delay_s=50e-9,
+    aperture_jitter_s=1e-9,
+    acquisition=12.0,
+    droop_v_per_s=0.5,
+    gain_error=(2e-4, -1e-4, 1e-4, -2e-4),
+    offset_lsb=(0.3, -0.4, 0.2, -0.2),
+    levels_lsb=drawn_levels(12, np.random.default_rng(2821), inl_lsb=0.5),
+)
+
+CARDS: Mapping[str, Card] = MappingProxyType(
+    {
+        "ideal": Card(),
+        "dt2821": _DT2821,
+        "skewed": Card(throughput_hz=100e3, skew_s=(0.0, 10e-6, 20e-6, 30e-6)),
+    }
+)
+"""ideal; dt2821: the class of the thesis's card, four simultaneous sample-and-holds on one 100 kHz converter; skewed:
+the same converter without them, so that each channel is taken one conversion after the one before."""

@@ -15,7 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, VoltageSource
+from .circuit import (
+    GROUND,
+    Capacitor,
+    Circuit,
+    DiodeLimiter,
+    Element,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
 from .errors import CircuitError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .opamp import CLAMP_RATE, OpAmpModel
@@ -119,6 +130,12 @@ def _element(
             yield from _pot(element, [(sample, dials[name]) for sample, dials in turns if name in dials], period_s)
         case OpAmp():
             yield from _opamp(element)
+        case DiodeLimiter(a=a, b=b, threshold_v=threshold_v, off_ohm=off_ohm):
+            beyond = f"max(0, {_difference(a, b)} - ({_number(threshold_v)}))"
+            yield f"R_{name}_off {a} {b} {_number(off_ohm)}"
+            yield f"B_{name} {a} {b} I = {_number(element.excess_siemens)} * {beyond}"
+        case Switch(a=a, b=b, closed=closed):
+            yield f"R_{name} {a} {b} {_number(element.ohm(closed=closed))}"
 
 
 def _pot(pot: Pot, turns: list[tuple[int, float]], period_s: float) -> Iterator[str]:

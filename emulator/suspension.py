@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, VoltageSource
-from .engine import Engine
+from .components import NOMINAL, Components
 from .errors import CircuitError, EngineError, PotError
 from .excitation import Excitation
-from .nodal import Nodal
+from .machine import AnalogComputer, Mode
 from .opamp import OpAmpModel, preset
-from .pot import checked_dial, coefficient_under_load, dial_for
+from .pot import PotModel, checked_dial
 
 __all__ = [
     "CHANNELS",
@@ -46,9 +46,12 @@ Tweak = tuple[int, Mapping[str, float]]
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """What the card's four channels read, in order."""
 
-_NODES = ("in", "u5", "u2", "u1")
+CHANNEL_NODES = ("in", "u5", "u2", "u1")
 # U1 puts out -e_N: the card's differential input for the net force is wired the other way round.
-_SIGNS = np.array((1.0, 1.0, 1.0, -1.0))
+CHANNEL_SIGNS = np.array((1.0, 1.0, 1.0, -1.0))
+
+# The integrators: velocity and displacement.
+_AT_REST_V = MappingProxyType({"U2": 0.0, "U3": 0.0})
 
 SOURCE = "F"
 """Name of the circuit's input, and its node is "in"."""
@@ -57,6 +60,8 @@ BLOCK_SAMPLES = 4096
 
 _PARAMETERS = {"M_kg": "M", "B_n_s_per_m": "B", "K_n_per_m": "K"}
 _DIALS = {"M_dial": "M", "B_dial": "B", "K_dial": "K"}
+_LOADS = {"M": "R1", "B": "RB", "K": "RK"}
+"""Which resistor each pot drives, its far end being at virtual ground."""
 
 
 @dataclass(frozen=True)
@@ -146,10 +151,12 @@ class SuspensionComputer:
     """The wired machine: it knows M, B and K, sets pots, and is played.
 
     program: "front", "shock" or a Program. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
-    parts: the real components, the program's nominal ones when None; pots are set from the nominal ones, with the real
-    load connected.
+    parts: the component values of the diagram, the program's own when None; components: what is fitted for them.
+    Pots are set from the program's own values, with the real load connected.
     rng, offset_v: when an rng is given, each op-amp has an offset of its own, uniform within +-offset_v (drawn U1 to
     U5).
+    machine: the AnalogComputer on which it is patched, to be operated by hand: U2 and U3 are integrators, at +velocity
+    and -displacement, and its lamps are those of the last play.
     Raises CircuitError, PotError.
     """
 
@@ -159,6 +166,7 @@ class SuspensionComputer:
         *,
         opamp: str | OpAmpModel = "tl07x",
         parts: SuspensionParts | None = None,
+        components: Components = NOMINAL,
         rng: np.random.Generator | None = None,
         offset_v: float = 3e-3,
         sample_rate_hz: float = 20e3,
@@ -168,18 +176,16 @@ class SuspensionComputer:
         self.sample_rate_hz = sample_rate_hz
         model = preset(opamp) if isinstance(opamp, str) else opamp
         models = [model] * 5 if rng is None else [_offset(model, rng.uniform(-offset_v, offset_v)) for _ in range(5)]
-        self._dials: dict[str, float] = {}
-        self._dials |= self._resolve(
-            {"M_kg": self.program.M_kg, "B_n_s_per_m": self.program.B_n_s_per_m, "K_n_per_m": self.program.K_n_per_m}
-        )
-        self._circuit = Circuit(_netlist(self.parts, models, self._dials))
-        self._nodal = Nodal(self._circuit)
-        self._engine: Engine | None = None
+        circuit = Circuit(components.fitted(_netlist(self.parts, models)))
+        self._pots = _pots(circuit, components)
+        self.machine = AnalogComputer(circuit, CHANNEL_NODES, initial_v=_AT_REST_V, sample_rate_hz=sample_rate_hz)
+        self.set(M_kg=self.program.M_kg, B_n_s_per_m=self.program.B_n_s_per_m, K_n_per_m=self.program.K_n_per_m)
+        self._plays = 0
 
     @property
     def circuit(self) -> Circuit:
         """The netlist, its pots as they are set now."""
-        return self._circuit.with_dials(self._dials)
+        return self.machine.circuit
 
     @property
     def scales(self) -> Scales:
@@ -189,12 +195,12 @@ class SuspensionComputer:
     @property
     def dials(self) -> dict[str, float]:
         """Where the pots M, B and K stand, 0..1."""
-        return dict(self._dials)
+        return self.machine.dials
 
     @property
     def coefficients(self) -> dict[str, float]:
         """What the pots M, B and K pass under their load."""
-        return {pot: coefficient_under_load(dial, *self._track_and_load_ohm(pot)) for pot, dial in self._dials.items()}
+        return {pot: self._pots[pot].coefficient(dial) for pot, dial in self.dials.items()}
 
     def set(self, **settings: float) -> None:
         """Turns pots to show M_kg, B_n_s_per_m, K_n_per_m, or to stand at M_dial, B_dial, K_dial (0..1).
@@ -202,7 +208,7 @@ class SuspensionComputer:
         The former set the coefficient under load, as an operator in pot-set mode does. A running machine keeps its
         voltages. Raises PotError naming the pot, with nothing turned.
         """
-        self._turn(self._resolve(settings))
+        self.machine.turn(self._resolve(settings))
 
     def dials_for(self, **settings: float) -> dict[str, float]:
         """The dials to which set(**settings) would turn the pots."""
@@ -222,8 +228,9 @@ class SuspensionComputer:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
         turns = self._plan(tweaks, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
-        self._engine = Engine(self._nodal.at(self._dials), _NODES, self.sample_rate_hz)
-        return self._blocks(self._engine, excitation, samples, turns, block_samples)
+        self.machine.restart(Mode.OPERATE)
+        self._plays += 1
+        return self._blocks(self._plays, excitation, samples, turns, block_samples)
 
     # ---- playing
 
@@ -240,7 +247,7 @@ class SuspensionComputer:
 
     def _blocks(
         self,
-        engine: Engine,
+        play: int,
         excitation: Excitation,
         samples: int,
         turns: list[tuple[int, dict[str, float]]],
@@ -249,27 +256,22 @@ class SuspensionComputer:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)
             parts = []
-            while engine.recorded < stop:
-                if engine is not self._engine:
-                    raise EngineError("this play was ended by a newer one on the same machine")
+            while play == self._plays and self.machine.recorded < stop:
                 until = min(stop, turns[0][0]) if turns else stop
-                parts.append(self._advance(engine, excitation, until - engine.recorded))
-                while turns and turns[0][0] == engine.recorded:
-                    self._turn(turns.pop(0)[1])
+                parts.append(self._advance(excitation, until - self.machine.recorded))
+                while turns and turns[0][0] == self.machine.recorded:
+                    self.machine.turn(turns.pop(0)[1])
+            if play != self._plays:
+                raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, engine: Engine, excitation: Excitation, samples: int) -> NDArray[np.float64]:
-        edges = excitation.edges(*engine.window(samples), self.sample_rate_hz)
-        volts = engine.run(samples, {SOURCE: edges})
-        volts *= _SIGNS
+    def _advance(self, excitation: Excitation, samples: int) -> NDArray[np.float64]:
+        edges = excitation.edges(*self.machine.window(samples), self.sample_rate_hz)
+        volts = self.machine.run(samples, {SOURCE: edges})
+        volts *= CHANNEL_SIGNS
         return volts
 
     # ---- pots
-
-    def _turn(self, dials: Mapping[str, float]) -> None:
-        self._dials |= dials
-        if self._engine is not None:
-            self._engine.set_system(self._nodal.at(self._dials))
 
     def _resolve(self, settings: Mapping[str, float]) -> dict[str, float]:
         dials: dict[str, float] = {}
@@ -279,22 +281,38 @@ class SuspensionComputer:
                 raise PotError(f"unknown setting {key!r}; there are {', '.join((*_PARAMETERS, *_DIALS))}")
             if pot in dials:
                 raise PotError(f"pot {pot}: set twice at the same time")
-            dials[pot] = checked_dial(value, pot) if key in _DIALS else self._dial_showing(pot, key, value)
+            dial = checked_dial(value, pot) if key in _DIALS else self._dial_showing(pot, key, value)
+            dials[pot] = self._pots[pot].model.resting(dial)
         return dials
 
     def _dial_showing(self, pot: str, key: str, value: float) -> float:
         try:
-            return dial_for(self.program.coefficient(pot, value), *self._track_and_load_ohm(pot), name=pot)
+            return self._pots[pot].dial(self.program.coefficient(pot, value))
         except PotError as cause:
             raise PotError(f"{cause}; {key} = {value:g} cannot be set on program {self.program.name}") from cause
 
-    def _track_and_load_ohm(self, pot: str) -> tuple[float, float]:
-        parts = self.parts
-        return {
-            "M": (parts.pot_m_ohm, parts.r1_ohm),
-            "B": (parts.pot_b_ohm, parts.rb_ohm),
-            "K": (parts.pot_k_ohm, parts.rk_ohm),
-        }[pot]
+
+@dataclass(frozen=True)
+class _LoadedPot:
+    """A pot in its place: model, name, and the ohms to a virtual ground that it drives."""
+
+    model: PotModel
+    name: str
+    load_ohm: float
+
+    def coefficient(self, dial: float) -> float:
+        return self.model.coefficient(dial, self.load_ohm)
+
+    def dial(self, coefficient: float) -> float:
+        return self.model.dial(coefficient, self.load_ohm, self.name)
+
+
+def _pots(circuit: Circuit, components: Components) -> dict[str, _LoadedPot]:
+    loads_ohm = {resistor.name: resistor.ohm for resistor in circuit.of(Resistor)}
+    return {
+        pot.name: _LoadedPot(components.pots.model(pot.track_ohm), pot.name, loads_ohm[_LOADS[pot.name]])
+        for pot in circuit.of(Pot)
+    }
 
 
 def _program(program: str | Program) -> Program:
@@ -309,7 +327,8 @@ def _offset(model: OpAmpModel, vos_v: float) -> OpAmpModel:
     return replace(model, vos_v=model.vos_v + vos_v)
 
 
-def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel], dials: Mapping[str, float]) -> list[Element]:
+def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel]) -> list[Element]:
+    """The diagram, its pots at 0."""
     u1, u2, u3, u4, u5 = models
     return [
         VoltageSource(SOURCE, "in"),
@@ -318,7 +337,7 @@ def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel], dials: Mappin
         Resistor("RB", "wb", "s1", parts.rb_ohm),
         Resistor("RK", "wk", "s1", parts.rk_ohm),
         OpAmp("U1", GROUND, "s1", "u1", u1),
-        Pot("M", "u1", "wm", GROUND, parts.pot_m_ohm, dials["M"]),
+        Pot("M", "u1", "wm", GROUND, parts.pot_m_ohm, 0.0),
         Resistor("R1", "wm", "s2", parts.r1_ohm),
         Capacitor("C1", "s2", "u2", parts.c1_farad),
         OpAmp("U2", GROUND, "s2", "u2", u2),
@@ -328,8 +347,8 @@ def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel], dials: Mappin
         Resistor("R4", "u2", "s4", parts.r4_in_ohm),
         Resistor("R4FB", "s4", "u4", parts.r4_fb_ohm),
         OpAmp("U4", GROUND, "s4", "u4", u4),
-        Pot("B", "u4", "wb", GROUND, parts.pot_b_ohm, dials["B"]),
-        Pot("K", "u3", "wk", GROUND, parts.pot_k_ohm, dials["K"]),
+        Pot("B", "u4", "wb", GROUND, parts.pot_b_ohm, 0.0),
+        Pot("K", "u3", "wk", GROUND, parts.pot_k_ohm, 0.0),
         Resistor("R5", "u3", "s5", parts.r5_in_ohm),
         Resistor("R5FB", "s5", "u5", parts.r5_fb_ohm),
         OpAmp("U5", GROUND, "s5", "u5", u5),

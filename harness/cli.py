@@ -90,6 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_replay(commands)
     _add_emulate(commands)
+    _add_effects(commands)
     return parser
 
 
@@ -141,6 +142,14 @@ def _add_emulate(commands: Any) -> None:
     )
     command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     command.set_defaults(command=_emulate)
+
+
+def _add_effects(commands: Any) -> None:
+    command = commands.add_parser("effects", help="what matters at 12 bits: each fault of the machine by itself")
+    command.add_argument("--set", choices=("shock", "front"), help="one parameter set instead of both")
+    command.add_argument("--out", type=Path, metavar="FILE", help="also draw it, as an .svg file")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    command.set_defaults(command=_effects)
 
 
 def _add_what_to_play(command: argparse.ArgumentParser) -> None:
@@ -292,6 +301,20 @@ def _emulate(arguments: argparse.Namespace) -> int:
         _print(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
     else:
         _print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
+    return PASSED
+
+
+def _effects(arguments: argparse.Namespace) -> int:
+    from harness import effects
+
+    if arguments.out is not None and arguments.out.suffix != ".svg":
+        from harness.errors import ConfigurationError
+
+        raise ConfigurationError(f"{arguments.out}: the file's name must end with .svg")
+    table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
+    if arguments.out is not None:
+        effects.write_picture(table, arguments.out)
+    print(json.dumps(effects.as_json(table)) if arguments.json else effects.text(table))
     return PASSED
 
 

@@ -18,7 +18,20 @@ from typing import Any, Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator import Card, EmulatorError, Sampler, SuspensionComputer
+from emulator import (
+    CARDS,
+    COMPONENTS,
+    OP_AMP_GRADES,
+    Card,
+    Components,
+    EmulatorError,
+    NoisySuspension,
+    OpAmpGrade,
+    Sampler,
+    SuspensionComputer,
+    acquired,
+    probes_per_sample,
+)
 from emulator.opamp import preset
 from harness import config
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, RigError
@@ -104,11 +117,28 @@ def open_rig(name: str) -> Rig:
 
 @dataclass(frozen=True)
 class ComputerDescription:
-    """The ``[computer]`` table: which amplifiers the machine has."""
+    """The ``[computer]`` table: what the machine is built of, and how warm and old that is."""
 
     op_amp: str = "tl07x"
     offset_v: float = 0.0
     """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
+    components: Literal["nominal", "polyester", "polypropylene"] = "nominal"
+    """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
+    temperature_c: float = 25.0
+    age_h: float = 0.0
+    noise: bool = False
+    """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
+
+    def fitted(self, seed: int) -> Components:
+        """The components of the machine that the seed gives.
+
+        :raises CircuitError: a value is out of range.
+        """
+        stock = dataclasses.replace(
+            COMPONENTS[self.components], temperature_c=self.temperature_c, age_h=self.age_h, seed=seed
+        )
+        graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
+        return dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
@@ -122,10 +152,17 @@ class CardDescription:
     range_v: Mapping[str, tuple[float, float]]
     bits: int = 12
     rate_hz: float = 20e3
-    noise_lsb: float = 0.0
-    """rms on every channel, before quantisation."""
+    noise_lsb: float | None = None
+    """rms on every channel, before quantisation; that of the model when it is not given."""
+    model: Literal["ideal", "dt2821", "skewed"] = "ideal"
+    faults: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of ``emulator.Card`` that differ from the model's: ``skew_s``, ``stuck_high``, ``clock_drift_ppm``, ..."""
 
     def __post_init__(self) -> None:
+        known = {field.name for field in dataclasses.fields(Card)} - {"bits", "rate_hz", "ranges_v", "noise_lsb"}
+        for fault in self.faults:
+            if fault not in known:
+                raise ValueError(f"faults: unknown key {fault!r} (known: {', '.join(sorted(known))})")
         if set(self.range_v) != set(CHANNELS):
             raise ValueError(f"range_v must give the channels {', '.join(CHANNELS)}, not {', '.join(self.range_v)}")
         for name, (low, high) in self.range_v.items():
@@ -139,9 +176,21 @@ class CardDescription:
             raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {self.noise_lsb:g}")
 
     def card(self) -> Card:
-        """:raises SamplerError: a value is out of range."""
-        ranges_v = tuple(self.range_v[channel] for channel in CHANNELS)
-        return Card(self.bits, self.rate_hz, ranges_v, (self.noise_lsb,) * len(CHANNELS))
+        """:raises SamplerError: a value is out of range.
+        :raises ConfigurationError: a fault is of the wrong type.
+        """
+        model = CARDS[self.model]
+        fields: dict[str, Any] = {
+            "bits": self.bits,
+            "rate_hz": self.rate_hz,
+            "ranges_v": tuple(self.range_v[channel] for channel in CHANNELS),
+            "noise_lsb": model.noise_lsb if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS),
+        }
+        fields |= {name: tuple(value) if isinstance(value, list) else value for name, value in self.faults.items()}
+        try:
+            return dataclasses.replace(model, **fields)
+        except TypeError as error:
+            raise ConfigurationError(f"card: faults: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -161,6 +210,8 @@ class _Stream(enum.IntEnum):
     EXCITATION = 0
     COMPONENTS = 1
     CARD = 2
+    APERTURE = 3
+    NOISE = 4
 
     def generator(self, seed: int) -> np.random.Generator:
         return np.random.default_rng([seed, int(self)])
@@ -191,7 +242,11 @@ class EmulatorRig:
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings))
         with _emulator_errors(f"scenario {scenario.name}: "):
-            volts = computer.play(excitation, scenario.samples, tweaks, BLOCK_SAMPLES)
+            machine = self._noisy(computer, seed) if self._description.computer.noise else computer
+            jitter = _Stream.APERTURE.generator(seed)
+            volts = acquired(
+                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=BLOCK_SAMPLES
+            )
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
@@ -207,10 +262,18 @@ class EmulatorRig:
             opamp=self._amplifier,
             rng=_Stream.COMPONENTS.generator(seed),
             offset_v=drawn.offset_v,
-            sample_rate_hz=self._card.rate_hz,
+            components=drawn.fitted(seed),
+            sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
         )
         computer.set(**_settings(scenario.plant.given()))
         return computer
+
+    def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
+        drawn = self._description.computer
+        grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
+        return NoisySuspension(
+            computer, _Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c
+        )
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {

@@ -1,16 +1,43 @@
-"""How fast the emulator is: lines of name, value, unit.
+"""How fast the emulator is, beside ngspice on the same deck.
 
-python tests/benchmarks/bench_engine.py
+Prints lines of name, value, unit, and, where there is one, what it is compared with and the ratio.
+
+python -m tests.benchmarks.bench_engine
+
+The figures go to build/bench.json too. Times are of the processor, not of the clock on the wall: the machine is shared.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
+import json
+import resource
+import shutil
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
-from emulator import Excitation, SuspensionComputer
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator import (
+    TICKS_PER_SAMPLE,
+    Capacitor,
+    Circuit,
+    Engine,
+    Excitation,
+    Resistor,
+    SuspensionComputer,
+    piecewise_linear,
+    to_spice,
+)
+from emulator.spice import Accuracy
 from emulator.suspension import Tweak
+from tests.emulator.conftest import _read_raw
 
 THESIS_TWEAKS: tuple[Tweak, ...] = (
     (200, {"K_n_per_m": 18000.0}),
@@ -19,21 +46,54 @@ THESIS_TWEAKS: tuple[Tweak, ...] = (
     (600, {"M_kg": 30.0}),
 )
 
+RESULTS = Path("build/bench.json")
 REPEATS = 5
-"""The best of so many is reported: the machine is shared."""
+"""The best of so many is reported."""
+
+BLOCK_SAMPLES = 32768
+RATE_HZ = 20e3
+LSB_V = 10.0 / 4096
+TOLERATED_LSB = 0.2
+
+ACCURACIES = (
+    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=5e-5),
+    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=1e-5),
+    Accuracy(reltol=1e-4, vntol_v=1e-6, trtol=7.0, max_step_s=5e-6),
+    Accuracy(reltol=1e-6, vntol_v=1e-7, trtol=1.0, max_step_s=1e-4),
+)
+"""What ngspice is offered; each is tried with and without time points on the samples."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the report; ratio says how many times better the value is than what it is compared with."""
+
+    name: str
+    value: float
+    unit: str
+    compared_with: str = ""
+    ratio: float | None = None
+
+    def __str__(self) -> str:
+        """Tab-separated, as all benchmarks print."""
+        line = f"{self.name}\t{self.value:.4g}\t{self.unit}"
+        return line if self.ratio is None else f"{line}\t{self.compared_with}\t{self.ratio:.1f}"
 
 
 def best_s(job: Callable[[], object]) -> float:
     def once() -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         job()
-        return time.perf_counter() - start
+        return time.process_time() - start
 
     return min(once() for _ in range(REPEATS))
 
 
+# ---- the emulator
+
+
 def play(excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = ()) -> None:
-    for _ in SuspensionComputer("front").play(excitation, samples, tweaks):
+    for _ in SuspensionComputer("front").play(excitation, samples, tweaks, BLOCK_SAMPLES):
         pass
 
 
@@ -50,22 +110,113 @@ def turn(computer: SuspensionComputer, count: int) -> None:
 
 def streams() -> Iterator[tuple[str, Excitation]]:
     yield "quiet", Excitation(low_v=5.0, high_v=5.0)
-    yield "200 Hz square wave", Excitation()
     yield "200 Hz square wave, free-running", Excitation(clock="free", phase=0.137, drift_ppm=20.0)
     yield "10 kHz PRBS", Excitation(shape="prbs", frequency_hz=10e3)
 
 
-def main() -> None:
+def with_states(states: int) -> Circuit:
+    """The front suspension with low-passes behind its output, one state each."""
+    ends = ["u5", *(f"x{i}" for i in range(states - 7))]
+    elements = list(SuspensionComputer("front").circuit.elements)
+    for i, (a, b) in enumerate(itertools.pairwise(ends)):
+        elements += [Resistor(f"RX{i}", a, b, 10e3), Capacitor(f"CX{i}", b, "0", 2e-9)]
+    return Circuit(elements)
+
+
+def run_states(states: int, samples: int) -> None:
+    engine, excitation = Engine(piecewise_linear(with_states(states)), ["in", "u5", "u2", "u1"]), Excitation()
+    while engine.recorded < samples:
+        count = min(BLOCK_SAMPLES, samples - engine.recorded)
+        engine.run(count, {"F": excitation.edges(*engine.window(count), RATE_HZ)})
+
+
+def emulator_figures() -> Iterator[Figure]:
     samples = 500_000
     for name, excitation in streams():
         rate = samples / best_s(functools.partial(play, excitation, samples))
-        print(f"emulator, {name}\t{rate:.0f}\tsamples/s")
-    trials = 50
-    trial_s = best_s(functools.partial(run_trials, trials)) / trials
-    print(f"emulator, trial of 800 samples with 4 tweaks\t{1e3 * trial_s:.2f}\tms")
+        yield Figure(f"emulator, {name}", rate, "samples/s")
     turns = 200
     turn_s = best_s(functools.partial(turn, SuspensionComputer("front"), turns)) / turns
-    print(f"emulator, pot turned\t{1e6 * turn_s:.0f}\tus")
+    yield Figure("emulator, pot turned", 1e6 * turn_s, "us")
+    for states in (7, 12, 16, 32):
+        spent_s = best_s(functools.partial(run_states, states, 100_000)) / 100_000
+        yield Figure(f"emulator, square wave, {states} states", 1e9 * spent_s, "ns/sample")
+        yield Figure(f"emulator, square wave, {states} states, each", 1e9 * spent_s / states, "ns/sample/state")
+    few, many = (best_s(functools.partial(run_states, 7, count)) for count in (100_000, 800_000))
+    yield Figure("emulator, 8 times as many samples", many / few, "times as long")
+
+
+def trial_s() -> float:
+    trials = 50
+    return best_s(functools.partial(run_trials, trials)) / trials
+
+
+# ---- ngspice
+
+
+def decks(samples: int, tweaks: Sequence[Tweak]) -> Iterator[str]:
+    computer = SuspensionComputer("front")
+    edges = {"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)}
+    turns = [(sample, computer.dials_for(**settings)) for sample, settings in tweaks]
+    for accuracy in ACCURACIES:
+        deck = to_spice(computer.circuit, samples=samples, edges=edges, turns=turns, nodes=["u5"], accuracy=accuracy)
+        yield deck
+        yield "".join(line for line in deck.splitlines(keepends=True) if not line.startswith("Vtimepoints"))
+
+
+def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:
+    """Seconds of processor, and the displacement at the samples in V."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "deck.cir").write_text(deck)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(["ngspice", "-b", "-r", "out.raw", "deck.cir"], cwd=folder, capture_output=True, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        names, table = _read_raw(Path(folder, "out.raw"))
+    spent_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return spent_s, np.interp(np.arange(samples) / RATE_HZ, table[:, 0], table[:, names.index("v(u5)")])
+
+
+def fastest_ngspice_s(samples: int, tweaks: Sequence[Tweak]) -> float:
+    """Of the decks that come within TOLERATED_LSB of the displacement at every sample."""
+    exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
+    runs = [simulate(deck, samples) for deck in decks(samples, tweaks)]
+    return min(spent_s for spent_s, volts in runs if np.abs(volts - exact).max() <= TOLERATED_LSB * LSB_V)
+
+
+def compared(name: str, own_s: float, value: float, unit: str, ngspice_s: float | None) -> Figure:
+    if ngspice_s is None:
+        return Figure(name, value, unit)
+    what = f"ngspice within {TOLERATED_LSB} LSB: {ngspice_s:.3g} s"
+    return Figure(name, value, unit, what, ngspice_s / own_s)
+
+
+def figures() -> Iterator[Figure]:
+    yield from emulator_figures()
+    found = shutil.which("ngspice") is not None
+    spent_s = trial_s()
+    reference_s = fastest_ngspice_s(800, THESIS_TWEAKS) if found else None
+    name = "emulator, trial of 800 samples with 4 tweaks"
+    yield compared(name, spent_s, 1e3 * spent_s, "ms", reference_s)
+    spent_s = best_s(functools.partial(play, Excitation(), 500_000)) * 800 / 500_000
+    reference_s = fastest_ngspice_s(800, ()) if found else None
+    yield compared("emulator, 200 Hz square wave", spent_s, 800 / spent_s, "samples/s", reference_s)
+
+
+def keep(measured: Sequence[Figure]) -> None:
+    """Put the figures into RESULTS, in place of older ones of the same name."""
+    older = json.loads(RESULTS.read_text()) if RESULTS.exists() else []
+    names = {figure.name for figure in measured}
+    RESULTS.parent.mkdir(exist_ok=True)
+    kept = [entry for entry in older if entry["name"] not in names]
+    RESULTS.write_text(json.dumps(kept + [asdict(figure) for figure in measured], indent=1) + "\n")
+
+
+def main() -> None:
+    measured = []
+    for figure in figures():
+        print(figure, flush=True)
+        measured.append(figure)
+    keep(measured)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from emulator import (
     Capacitor,
     Circuit,
     CircuitError,
+    DiodeLimiter,
     OpAmp,
     OpAmpModel,
     Pot,
@@ -133,3 +134,13 @@ def test_more_than_the_engine_takes_is_refused_with_the_number() -> None:
     links = [Resistor(f"R{i}", f"n{i}", "0", 1e3) for i in range(33)]
     with pytest.raises(CircuitError, match="33 states; the engine takes at most 32"):
         piecewise_linear(Circuit([*ladder, *links]))
+
+
+def test_a_constant_source_and_an_offset_are_constants_beside_a_limiter_too() -> None:
+    elements = [
+        VoltageSource("V1", "in", dc_v=3.0),
+        *inverter(OpAmpModel(vos_v=2e-3), gain=1.0).elements[1:],
+        DiodeLimiter("D1", "out", "0", 20.0, 1e3, 1e9),
+    ]
+    system = piecewise_linear(Circuit(elements))
+    np.testing.assert_allclose(system.readings(["in", "n", "out"])[:, -1], [3.0, 2e-3, -3.0 + 4e-3], rtol=1e-12)

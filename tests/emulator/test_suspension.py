@@ -239,3 +239,20 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
         computer.play(Excitation(), -1)
     with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock"):
         SuspensionComputer("rear")
+
+
+@pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
+def test_a_healthy_play_lights_no_lamp(program: str, tweaks: Sequence[Tweak]) -> None:
+    computer = SuspensionComputer(program, rng=np.random.default_rng(1))
+    played(computer, 800, tweaks)
+    assert computer.machine.lamps == dict.fromkeys(("U1", "U2", "U3", "U4", "U5"))
+
+
+def test_a_play_that_overloads_the_summer_lights_its_lamp() -> None:
+    """A force that falls from +10 to -10 V asks -20 V of it at sample 50; 10 us later its lamp is lit."""
+    computer = SuspensionComputer("front")
+    volts = played(computer, 100, excitation=Excitation(low_v=-10.0))
+    assert volts[:, 3].min() == pytest.approx(-13.5, abs=0.2)
+    assert computer.machine.lamps == {"U1": 51, "U2": None, "U3": None, "U4": None, "U5": None}
+    played(computer, 100)
+    assert computer.machine.lamps["U1"] is None

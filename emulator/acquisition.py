@@ -1,0 +1,125 @@
+"""When the card samples: the engine is asked at the instants at which each channel is really taken.
+
+The machine runs at a multiple of the card's rate, and each channel takes its own of these *probes*: skew costs no
+accuracy. Aperture delay and jitter, tens of nanoseconds, lie between two probes no more than PROBE_S apart; there the
+voltage is taken on the chord, which for the suspension is wrong by less than 0.003 LSB on the displacement.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import SamplerError
+from .excitation import Edges, Excitation
+from .sampler import Card
+from .suspension import Tweak
+
+__all__ = ["PROBE_S", "Playable", "acquired", "probes_per_sample"]
+
+PROBE_S = 1e-6
+"""Longest time between probes when there is an aperture delay or jitter."""
+
+_MAX_PROBES = 1000
+
+_EARLIEST_PROBES = 1
+"""So many probes before the nominal instant are at hand, for jitter that comes early."""
+
+
+class Playable(Protocol):
+    """A machine that can be played, at the rate it was made for (SuspensionComputer)."""
+
+    def play(
+        self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = ..., block_samples: int = ...
+    ) -> Iterator[NDArray[np.float64]]: ...
+
+
+def probes_per_sample(card: Card) -> int:
+    """How many times the card's rate the machine must run.
+
+    Raises SamplerError for a skew that is no multiple of a thousandth of the sample period.
+    """
+    parts = card.per_channel("skew_s") * card.rate_hz
+    count = next((n for n in range(1, _MAX_PROBES + 1) if np.abs(parts * n - np.rint(parts * n)).max() < 1e-6), None)
+    if count is None:
+        raise SamplerError(f"card: skew_s {card.skew_s!r}: no grid of {_MAX_PROBES} instants a sample holds them")
+    if card.aperture_delay_s or card.aperture_jitter_s:
+        count *= math.ceil(1.0 / (card.rate_hz * count * PROBE_S))
+    return count
+
+
+def acquired(
+    machine: Playable,
+    card: Card,
+    excitation: Excitation,
+    samples: int,
+    tweaks: Sequence[Tweak] = (),
+    *,
+    rng: np.random.Generator,
+    block_samples: int = 256,
+) -> Iterator[NDArray[np.float64]]:
+    """Plays a machine that was made with sample_rate_hz = card.true_rate_hz probes_per_sample(card).
+
+    Yields what the sample-and-holds see, in blocks, float64 (block_samples or, last, fewer; channels), V. rng: of the
+    jitter. The conventions of Excitation and of SuspensionComputer.play hold for the nominal instants: a channel that
+    is taken later can show a tweak after sample k in sample k already. Raises what play raises.
+    """
+    count = probes_per_sample(card)
+    if count == 1 and card.clock_drift_ppm == 0:
+        return machine.play(excitation, samples, tweaks, block_samples)
+    clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
+    slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
+    turns = [(k * count, settings) for k, settings in tweaks]
+    probed = machine.play(slow, samples * count, turns, block_samples * count)
+    return _picked(probed, card, count, rng)
+
+
+def _offsets(card: Card, count: int) -> NDArray[np.float64]:
+    """By how many probes each channel is taken after the nominal instant, without jitter: (channels,)."""
+    per_s = card.rate_hz * count
+    return np.asarray(np.rint(card.per_channel("skew_s") * per_s) + card.aperture_delay_s * per_s)
+
+
+def _picked(
+    probed: Iterator[NDArray[np.float64]], card: Card, count: int, rng: np.random.Generator
+) -> Iterator[NDArray[np.float64]]:
+    """Of each block its samples' voltages; the last probes of a block are kept, for what the next takes early."""
+    before: NDArray[np.float64] | None = None
+    for block in probed:
+        before = np.repeat(block[:1], _EARLIEST_PROBES, axis=0) if before is None else before
+        probes = np.concatenate((before, block))
+        before = block[-_EARLIEST_PROBES:]
+        nominal = np.arange(_EARLIEST_PROBES, len(block) + _EARLIEST_PROBES, count)[:, None]
+        jitter = rng.standard_normal((len(nominal), card.channels)) * (card.aperture_jitter_s * card.rate_hz * count)
+        yield _on_chord(probes, nominal, np.clip(_offsets(card, count) + jitter, -_EARLIEST_PROBES, count - 1.0))
+
+
+def _on_chord(probes: NDArray[np.float64], nominal: NDArray[np.intp], late: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Voltages so many probes after the nominal rows: at a probe its own, else between two."""
+    left = np.floor(late)
+    part = late - left
+    rows, columns = nominal + left.astype(np.intp), np.arange(probes.shape[1])
+    early_v, late_v = probes[rows, columns], probes[np.minimum(rows + 1, len(probes) - 1), columns]
+    return np.where(part > 0, early_v + part * (late_v - early_v), early_v)
+
+
+@dataclass(frozen=True)
+class _OnCardClock(Excitation):
+    """An excitation whose edges fall where they would if the machine ran at the card's rate, `probes` times slower.
+
+    clock_hz: the card's rate by the clock that the generator goes by.
+    """
+
+    probes: int = 1
+    clock_hz: float = 20e3
+
+    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
+        del sample_rate_hz  # the machine's, of which the generator knows nothing
+        slow = super().edges(-(-start_tick // self.probes), -(-stop_tick // self.probes), self.clock_hz)
+        return Edges(slow.ticks * self.probes, slow.levels_v)

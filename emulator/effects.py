@@ -1,0 +1,208 @@
+"""What matters at 12 bits: each non-ideality by itself, and how far it moves the displacement from the ideal machine's.
+
+The figure of a row is max |x - x_ideal| over SAMPLES samples of a 200 Hz square wave of 0..10 V, as the converter sees
+it, in LSB of 10 V / 4096; for what is drawn, the median over DRAWS seeds. Everything else is ideal. The front
+suspension plays the four changes of the thesis meanwhile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .acquisition import acquired, probes_per_sample
+from .components import DIELECTRICS, NOMINAL, OP_AMP_GRADES, Components, Dielectric, Grade, OpAmpGrade, PotGrade
+from .excitation import Excitation
+from .noise import NoisySuspension
+from .opamp import IDEAL, PRESETS, OpAmpModel
+from .sampler import Card, Sampler, drawn_levels
+from .suspension import CHANNELS, PROGRAMS, Program, SuspensionComputer, Tweak
+
+__all__ = ["DRAWS", "SAMPLES", "Effect", "measured_effects"]
+
+SAMPLES = 800
+DRAWS = 25
+
+_CARD = Card(ranges_v=((-1.0, 9.0),) * len(CHANNELS))
+_DISPLACEMENT = CHANNELS.index("displacement")
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A row of the table: the median and the largest of `draws` figures, in LSB."""
+
+    name: str
+    median_lsb: float
+    largest_lsb: float
+    draws: int
+
+
+_CHANGES: Mapping[str, Sequence[Tweak]] = {
+    "shock": (),
+    "front": (
+        (200, {"K_n_per_m": 18000.0}),
+        (400, {"B_n_s_per_m": 3453.0}),
+        (500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+        (600, {"M_kg": 30.0}),
+    ),
+}
+
+_Operator = Callable[[SuspensionComputer, Mapping[str, float], np.random.Generator], Mapping[str, float]]
+"""What somebody does who is told to set M_kg, B_n_s_per_m or K_n_per_m: other settings, perhaps."""
+
+
+def _careful(
+    _machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
+) -> Mapping[str, float]:
+    return wanted
+
+
+def _without_load(
+    machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
+) -> dict[str, float]:
+    """Turns the dial to the coefficient that the pot should give under load."""
+    return {f"{key[0]}_dial": machine.program.coefficient(key[0], value) for key, value in wanted.items()}
+
+
+def _to_a_thousandth(
+    machine: SuspensionComputer, wanted: Mapping[str, float], rng: np.random.Generator
+) -> dict[str, float]:
+    """Misses the dial by up to 0.1 % of full scale."""
+    dials = machine.dials_for(**wanted)
+    return {f"{pot}_dial": min(dial + rng.uniform(-1e-3, 1e-3), 1.0) for pot, dial in dials.items()}
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """A machine, ideal but for what is said here. quantised: compare codes and not what the converter sees."""
+
+    op_amp: OpAmpModel = IDEAL
+    components: Components = NOMINAL
+    noise: OpAmpGrade | None = None
+    card: Card = _CARD
+    operator: _Operator = _careful
+    quantised: bool = False
+
+    def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
+        """How far the displacement is from the ideal machine's; that of noise, from the same machine's without."""
+        reference_lsb = ideal_lsb
+        if self.noise is not None:
+            reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
+        return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
+
+    def displacement_lsb(self, program: Program, seed: int) -> NDArray[np.float64]:
+        """What the converter sees, or says, of the displacement at every sample, (SAMPLES,)."""
+        rate_hz = self.card.true_rate_hz * probes_per_sample(self.card)
+        components = dataclasses.replace(self.components, seed=seed)
+        machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
+        rng = np.random.default_rng(seed)
+        given = {"M_kg": program.M_kg, "B_n_s_per_m": program.B_n_s_per_m, "K_n_per_m": program.K_n_per_m}
+        machine.set(**self.operator(machine, given, rng))
+        tweaks = [(sample, self.operator(machine, wanted, rng)) for sample, wanted in _CHANGES[program.name]]
+        played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
+        volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, tweaks, rng=rng)))
+        sampler = Sampler(self.card, rng)
+        seen_lsb = sampler.seen_lsb(volts)
+        return (sampler.converted(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
+
+
+_Make = Callable[[int], _Setup]
+"""By the number of the draw."""
+
+
+def measured_effects(program: str) -> Iterator[Effect]:
+    """The table for a program ("shock" or "front"), row by row as they are measured (about 2 s in all)."""
+    chosen = PROGRAMS[program]
+    ideal_lsb = _Setup().displacement_lsb(chosen, 0)
+    for name, draws, make in _rows():
+        figures = [make(seed).figure_lsb(chosen, seed, ideal_lsb) for seed in range(draws)]
+        yield Effect(name, float(np.median(figures)), max(figures), draws)
+
+
+def _rows() -> Iterator[tuple[str, int, _Make]]:
+    yield from _value_rows()
+    yield from _pot_rows()
+    yield from _op_amp_rows()
+    yield from _dielectric_rows()
+    yield from _card_rows()
+
+
+def _fixed(setup: _Setup) -> _Make:
+    return lambda _seed: setup
+
+
+def _built_of(components: Components) -> _Make:
+    return _fixed(_Setup(components=components))
+
+
+def _value_rows() -> Iterator[tuple[str, int, _Make]]:
+    for percent in (5, 1):
+        parts = Components(resistors=Grade(0.01), capacitors=Grade(percent / 100))
+        yield f"R 1 %, C {percent} %, not calibrated", DRAWS, _built_of(parts)
+    film = Grade(temperature_spread_per_k=50e-6)
+    for name, per_k, spread_per_k in (("polyester", 400e-6, 100e-6), ("polypropylene", -200e-6, 50e-6)):
+        warm = Components(
+            resistors=film,
+            capacitors=Grade(temperature_per_k=per_k, temperature_spread_per_k=spread_per_k),
+            temperature_c=35.0,
+        )
+        yield f"+10 C, {name}", DRAWS, _built_of(warm)
+
+
+def _pot_rows() -> Iterator[tuple[str, int, _Make]]:
+    yield "pot loading ignored", 1, _fixed(_Setup(operator=_without_load))
+    yield "pots set to 0.1 % of full scale", DRAWS, _fixed(_Setup(operator=_to_a_thousandth))
+    yield "pots of 5000 windings", 1, _built_of(Components(pots=PotGrade(windings=5000)))
+
+
+def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
+    tl07x, offset = PRESETS["tl07x"], OpAmpGrade(offset_v=3e-3)
+    yield "offsets of +-3 mV", DRAWS, _built_of(Components(op_amps=offset))
+    models = {
+        "GBW 3 MHz": OpAmpModel(gbw_hz=tl07x.gbw_hz),
+        "GBW 3 MHz, slew 13 V/us": OpAmpModel(gbw_hz=tl07x.gbw_hz, slew_v_per_s=tl07x.slew_v_per_s),
+        "Avol 106 dB": OpAmpModel(avol=2e5),
+        "741": PRESETS["741"],
+        "OPA627": PRESETS["opa627"],
+    }
+    for name, model in models.items():
+        yield name, 1, _fixed(_Setup(op_amp=model))
+    yield "noise of TL07x and resistors", DRAWS, _fixed(_Setup(op_amp=tl07x, noise=OP_AMP_GRADES["tl07x"]))
+    for name in ("tl07x", "741"):
+        grade = OP_AMP_GRADES[name]
+        bias = OpAmpGrade(bias_a=grade.bias_a, input_ohm=grade.input_ohm)
+        yield f"bias current, {name} ({1e9 * grade.bias_a:g} nA)", 1, _built_of(Components(op_amps=bias))
+
+
+def _dielectric_rows() -> Iterator[tuple[str, int, _Make]]:
+    for name in ("polyester", "polypropylene"):
+        absorption = Dielectric(absorption=DIELECTRICS[name].absorption)
+        yield f"dielectric absorption, {name}", 1, _built_of(Components(dielectric=absorption))
+    leakage = Dielectric(leakage_s=DIELECTRICS["polyester"].leakage_s)
+    yield "capacitor leakage, polyester", 1, _built_of(Components(dielectric=leakage))
+
+
+def _card_rows() -> Iterator[tuple[str, int, _Make]]:
+    channels = (0.0,) * len(CHANNELS)
+    faults: dict[str, Card] = {
+        "10 us channel skew": dataclasses.replace(_CARD, skew_s=tuple(10e-6 * (i == _DISPLACEMENT) for i in range(4))),
+        "aperture delay 50 ns": dataclasses.replace(_CARD, aperture_delay_s=50e-9),
+        "acquisition to 12 time constants": dataclasses.replace(_CARD, acquisition=12.0),
+        "droop 0.5 V/s, one conversion": dataclasses.replace(_CARD, throughput_hz=100e3, droop_v_per_s=0.5),
+        "gain error 0.01 %": dataclasses.replace(_CARD, gain_error=tuple(1e-4 for _ in channels)),
+    }
+    for name, card in faults.items():
+        yield name, 1, _fixed(_Setup(card=card))
+    yield "jitter 1 ns", DRAWS, _fixed(_Setup(card=dataclasses.replace(_CARD, aperture_jitter_s=1e-9)))
+    yield "card noise 1 LSB rms", DRAWS, _fixed(_Setup(card=dataclasses.replace(_CARD, noise_lsb=(1.0,) * 4)))
+    yield "quantisation", 1, _fixed(_Setup(quantised=True))
+    yield "INL 1/2 LSB, and quantisation", DRAWS, lambda seed: _Setup(card=_bent(seed), quantised=True)
+
+
+def _bent(seed: int) -> Card:
+    levels_lsb = drawn_levels(_CARD.bits, np.random.default_rng(seed), inl_lsb=0.5)
+    return dataclasses.replace(_CARD, levels_lsb=levels_lsb)

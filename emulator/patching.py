@@ -1,0 +1,161 @@
+"""What is wrong with a patch panel, and which cords lead into which amplifier.
+
+A Circuit may be any netlist, a comparator and a lone RC ladder included. On an analogue computer every amplifier works
+with feedback on a summing junction, and every cord leads from an output to an input; what breaks that is refused here.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, VoltageSource, label
+from .errors import CircuitError
+
+__all__ = ["Patch", "is_part_of", "patches"]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """How one amplifier is patched.
+
+    junction: the node of its inverting input; out: of its output; inputs: the names of the elements that bring current
+    to the junction from elsewhere, empty for a follower; capacitors: of those straight from junction to out. What else
+    is at the junction, a capacitor's leakage or an input capacitance, belongs to the amplifier, and so does all that
+    is_part_of says.
+    """
+
+    amplifier: str
+    junction: str
+    out: str
+    inputs: tuple[str, ...]
+    capacitors: tuple[str, ...]
+
+
+def is_part_of(element: Element, owner: str) -> bool:
+    """Whether an element is one of those that make another real, whose names follow its own: E_... is part of E."""
+    return element.name.startswith(f"{owner}_")
+
+
+def patches(circuit: Circuit) -> dict[str, Patch]:
+    """How each amplifier of the circuit is patched, by name.
+
+    Raises CircuitError, naming the element and the node, for two outputs joined, a wiper or an end of an element left
+    open, an amplifier without feedback of its own (a loop through other amplifiers does not count), and an input or an
+    amplifier that nothing feeds. (An amplifier's input left open is refused by Circuit already: its node floats.)
+    """
+    wires = tuple((type(element), element.name, element.nodes) for element in circuit.elements)
+    return dict(_patches(_Panel(wires, circuit)))
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A circuit that counts as equal to one of the same wiring, whatever its component values."""
+
+    wires: tuple[tuple[type, str, tuple[str, ...]], ...]
+    circuit: Circuit = field(compare=False)
+
+
+@functools.lru_cache(maxsize=64)
+def _patches(panel: _Panel) -> dict[str, Patch]:
+    circuit = panel.circuit
+    drivers = _drivers(circuit)
+    _check_ends(circuit)
+    _check_feeds(circuit, drivers)
+    for amp in circuit.of(OpAmp):
+        _check_feedback(circuit, amp, drivers)
+    found = {amp.name: _patch(circuit, amp) for amp in circuit.of(OpAmp)}
+    for amp in circuit.of(OpAmp):
+        if amp.plus == GROUND and not found[amp.name].inputs:
+            raise CircuitError(f"{label(amp)}: nothing feeds its input at node {amp.minus}")
+    return found
+
+
+def _drivers(circuit: Circuit) -> set[str]:
+    """The nodes that an output holds."""
+    holder: dict[str, Element] = {}
+    for element in circuit.elements:
+        node = _output(element)
+        if node is not None and holder.setdefault(node, element) is not element:
+            raise CircuitError(
+                f"{label(element)}: its output at node {node} is joined to that of {label(holder[node])}"
+            )
+    return set(holder)
+
+
+def _output(element: Element) -> str | None:
+    if isinstance(element, OpAmp):
+        return element.out
+    if isinstance(element, VoltageSource):
+        return element.minus if element.plus == GROUND else element.plus
+    return None
+
+
+def _check_ends(circuit: Circuit) -> None:
+    """Every node joins two ends at least; only an output may lead nowhere."""
+    ends = Counter(node for element in circuit.elements for node in element.nodes)
+    for element in circuit.elements:
+        for node in element.nodes:
+            if ends[node] == 1 and node not in (GROUND, _output(element)):
+                raise CircuitError(f"{label(element)}: {_open_end(element, node)}")
+
+
+def _open_end(element: Element, node: str) -> str:
+    if isinstance(element, Pot) and node == element.wiper:
+        return f"its wiper, node {node}, is left open"
+    if isinstance(element, Pot) and node == element.bottom:
+        return f"its bottom, node {node}, is left open"
+    return f"nothing feeds its node {node}"
+
+
+def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
+    """Cords and passive elements that hang together must lead to an output somewhere, or rest an input on ground."""
+    junctions = {amp.minus for amp in circuit.of(OpAmp)}
+    rests = {amp.plus for amp in circuit.of(OpAmp)}
+    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+    for element in circuit.elements:
+        for node in element.nodes:
+            if node in drivers | junctions | {GROUND}:
+                continue
+            reached = _reached(node, bonds, drivers | junctions | {GROUND})
+            if not reached & drivers and not (GROUND in reached and reached & rests):
+                raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
+
+
+def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
+    bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
+    if amp.minus != amp.out and amp.out not in _reached(amp.minus, bonds, drivers | {GROUND}):
+        raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
+
+
+def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
+    capacitors = tuple(part.name for part in circuit.of(Capacitor) if {part.a, part.b} == {amp.minus, amp.out})
+    inputs = () if amp.minus == amp.out else tuple(part.name for part in _inputs(circuit, amp))
+    return Patch(amp.name, amp.minus, amp.out, inputs, capacitors)
+
+
+def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
+    """What is at the junction and leads elsewhere than, by a way of its own, to the amplifier's output."""
+    bonds = [bond for element in circuit.elements for bond in element.bonds]
+    elsewhere = _reached(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
+    for element in circuit.elements:
+        if isinstance(element, OpAmp | VoltageSource | Capacitor) or amp.minus not in element.nodes:
+            continue
+        if not is_part_of(element, amp.name) and elsewhere.intersection(element.nodes):
+            yield element
+
+
+def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
+    return () if isinstance(element, OpAmp | VoltageSource) else element.bonds
+
+
+def _reached(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:
+    """The nodes that bonds join to start, borders included but not passed."""
+    reached, fresh = {start}, {start}
+    while fresh:
+        fresh = {node for bond in bonds if fresh.intersection(bond) for node in bond} - reached
+        reached |= fresh
+        fresh = fresh - borders
+    return reached

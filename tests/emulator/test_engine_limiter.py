@@ -1,0 +1,173 @@
+"""Diode limiters and switches: kinks that feed one another, against circuits solved by hand and against ngspice."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emulator import (
+    TICKS_PER_SAMPLE,
+    Capacitor,
+    Circuit,
+    CircuitError,
+    DiodeLimiter,
+    Edges,
+    Engine,
+    EngineError,
+    OpAmp,
+    OpAmpModel,
+    Resistor,
+    Switch,
+    VoltageSource,
+    piecewise_linear,
+    to_spice,
+)
+from emulator.nodal import Nodal
+from emulator.opamp import preset
+
+NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
+
+LSB_V = 10.0 / 4096
+SOURCE = VoltageSource("V1", "in")
+
+
+def steps(*changes: tuple[float, float]) -> dict[str, Edges]:
+    """Edges of V1 at (instant in samples, level)."""
+    instants, levels_v = np.array(changes).T
+    return {"V1": Edges(np.rint(instants * TICKS_PER_SAMPLE).astype(np.int64), levels_v)}
+
+
+def back_to_back(name: str, a: str, b: str, threshold_v: float, on_ohm: float = 50.0) -> list[DiodeLimiter]:
+    return [
+        DiodeLimiter(f"{name}p", a, b, threshold_v, on_ohm, 1e8),
+        DiodeLimiter(f"{name}n", b, a, threshold_v, on_ohm, 1e8),
+    ]
+
+
+def staircase(levels_v: Sequence[float]) -> dict[str, Edges]:
+    return steps(*enumerate(levels_v))
+
+
+def test_a_resistive_limiter_follows_its_law() -> None:
+    """1 k into a limiter of 2 V, 1 k on, 9 k off: v = 0.9 u up to u = 2.222 V, then 2 v = u + 2 (8/9)."""
+    circuit = Circuit([SOURCE, Resistor("R1", "in", "o", 1e3), DiodeLimiter("D1", "o", "0", 2.0, 1e3, 9e3)])
+    levels_v = np.linspace(-10.0, 10.0, 41)
+    volts = Engine(piecewise_linear(circuit), ["o"]).run(41, staircase(levels_v.tolist()))[:, 0]
+    expected = np.where(levels_v < 2.0 / 0.9, 0.9 * levels_v, (levels_v + 2.0 * 8.0 / 9.0) / 2.0)
+    np.testing.assert_allclose(volts, expected, rtol=1e-13)
+
+
+def test_a_bridge_of_four_limiters_rectifies() -> None:
+    """All four are coupled; solved by trying the 16 combinations with plain linear algebra."""
+    ends = [("in", "p"), ("0", "p"), ("m", "in"), ("m", "0")]
+    limiters = [DiodeLimiter(f"D{i}", a, b, 0.6, 20.0, 1e6) for i, (a, b) in enumerate(ends)]
+    circuit = Circuit([SOURCE, *limiters, Resistor("RL", "p", "m", 1e3), Resistor("RG", "m", "0", 1e7)])
+    levels_v = [-8.0, -1.0, -0.3, 0.0, 0.4, 1.3, 9.0]
+    volts = Engine(piecewise_linear(circuit), ["p", "m"]).run(len(levels_v), staircase(levels_v))
+    np.testing.assert_allclose(volts, [bridge(level) for level in levels_v], rtol=0, atol=1e-9)
+
+
+def bridge(u: float) -> NDArray[np.float64]:
+    """v(p), v(m) of the bridge above."""
+    for on in itertools.product((False, True), repeat=4):
+        matrix = np.array([[1e-3, -1e-3], [-1e-3, 1e-3 + 1e-7]])
+        right = np.zeros(2)
+        # (row, sign of that node's voltage in v(a) - v(b), the fixed other end)
+        for (row, sign, fixed), conducts in zip(((0, -1, u), (0, -1, 0.0), (1, 1, u), (1, 1, 0.0)), on, strict=True):
+            siemens = 1 / 20 if conducts else 1e-6
+            offset = 0.6 * (1 / 20 - 1e-6) if conducts else 0.0
+            # Current a -> b: siemens (v(a) - v(b)) - offset, leaving node row when sign is +1.
+            matrix[row, row] += siemens
+            right[row] += siemens * fixed + sign * offset
+        v = np.linalg.solve(matrix, right)
+        beyond = [u - v[0], -v[0], v[1] - u, v[1]]
+        if all((x > 0.6) == conducts for x, conducts in zip(beyond, on, strict=True)):
+            return v
+    raise AssertionError("no combination is consistent")
+
+
+def limited_inverter(amp: str | OpAmpModel = "tl07x") -> Circuit:
+    """Gain -2, its output limited by 4 V limiters across the feedback, then a low-pass and a limiter on a capacitor."""
+    model = preset(amp) if isinstance(amp, str) else amp
+    return Circuit(
+        [
+            SOURCE,
+            *(Resistor("R1", "in", "s", 10e3), Resistor("R2", "s", "o", 20e3), OpAmp("U1", "0", "s", "o", model)),
+            *back_to_back("DF", "s", "o", 4.0),
+            *(Resistor("R3", "o", "m", 5e3), Resistor("R4", "m", "c", 5e3), Capacitor("C1", "c", "0", 10e-9)),
+            *back_to_back("DM", "m", "0", 2.5, 200.0),
+            *(DiodeLimiter("DC", "c", "0", 1.5, 300.0, 1e7), OpAmp("U2", "c", "p", "p", model)),
+        ]
+    )
+
+
+@pytest.mark.parametrize("amp", ["tl07x", "741"])
+def test_limiters_agree_with_ngspice_at_every_output_and_sample(ngspice: NgSpice, amp: str) -> None:
+    edges = steps((0.0, 1.0), (3.3, 9.0), (9.71, -7.0), (15.2, 2.6), (22.5, -10.0), (30.25, 10.0), (36.6, 0.0))
+    circuit, nodes = limited_inverter(amp), ("o", "m", "c", "p")
+    reference = ngspice(to_spice(circuit, samples=60, edges=edges), nodes, 60)
+    engine = Engine(piecewise_linear(circuit), nodes)
+    volts = engine.run(60, edges)
+    # At ngspice's first time point, 10 ps late, a fast amplifier has moved already.
+    assert np.abs(volts - reference)[1:].max() < 0.05 * LSB_V
+    assert engine.counts.events > 20
+
+
+def test_an_ideal_amplifier_limits_at_the_threshold() -> None:
+    """1 mA into 20 k beside 4 V, 50 ohm: v/20k + v/1e8 * 2 + (1/50 - 1/1e8)(v - 4) = 1 mA."""
+    circuit = limited_inverter(OpAmpModel())
+    volts = Engine(piecewise_linear(circuit), ["o"]).run(3, steps((0.0, -10.0), (1.0, 10.0), (2.0, 1.0)))[:, 0]
+    v = (1e-3 + (1 / 50 - 1e-8) * 4.0) / (1 / 20e3 + 1 / 50 + 1e-8)
+    np.testing.assert_allclose(volts[:2], [v, -v], rtol=1e-9)
+    assert volts[2] == pytest.approx(-1e-4 / (1 / 20e3 + 2e-8), rel=1e-12)
+
+
+def test_limiters_with_positive_feedback_have_no_unique_solution_and_are_refused() -> None:
+    """An amplifier of gain +3 drives the limiter's own node: beyond the threshold its conductance looks negative."""
+    latch = (
+        *(
+            Resistor("R1", "in", "a", 10e3),
+            Resistor("R2", "a", "o", 10e3),
+            DiodeLimiter("D1", "a", "g", 1.0, 10.0, 1e9),
+        ),
+        *(Resistor("R3", "g", "0", 1e3), OpAmp("U1", "g", "n", "o", OpAmpModel())),
+        *(Resistor("R4", "o", "n", 40e3), Resistor("R5", "n", "0", 1e3)),
+    )
+    with pytest.raises(EngineError, match="no unique solution"):
+        Engine(piecewise_linear(Circuit([SOURCE, *latch])), ["o"])
+
+
+def test_a_switch_is_its_resistance_and_is_thrown_like_a_pot() -> None:
+    circuit = Circuit([SOURCE, Resistor("R1", "in", "o", 1e3), Switch("S1", "o", "0", 1e3, 3e3, closed=False)])
+    nodal = Nodal(circuit)
+    engine = Engine(nodal.at({}), ["o"])
+    before = engine.run(2, steps((0.0, 8.0)))
+    engine.set_system(nodal.at({}, {"S1": True}))
+    assert [*before[:, 0], *engine.run(1)[:, 0]] == pytest.approx([6.0, 6.0, 4.0], rel=1e-14)
+    closed = piecewise_linear(circuit.with_switches({"S1": True}))
+    assert np.array_equal(closed.lmn, nodal.at({}, {"S1": True}).lmn)
+    assert "R_S1 o 0 1000.0" in to_spice(circuit.with_switches({"S1": True}), samples=2)
+
+
+@pytest.mark.parametrize(
+    ("element", "message"),
+    [
+        (DiodeLimiter("D1", "in", "0", float("nan"), 1.0, 2.0), "threshold_v must be finite"),
+        (DiodeLimiter("D1", "in", "0", 1.0, 3.0, 2.0), "on_ohm 3.0 exceeds off_ohm 2.0"),
+        (DiodeLimiter("D1", "in", "0", 1.0, 0.0, 2.0), "on_ohm must be positive"),
+        (Switch("S1", "in", "in", 1.0, 2.0, closed=True), "both ends are on node in"),
+        (Switch("S1", "in", "0", 1.0, float("inf"), closed=True), "off_ohm must be positive and finite"),
+    ],
+)
+def test_bad_values_are_refused_naming_element_and_field(element: DiodeLimiter | Switch, message: str) -> None:
+    with pytest.raises(CircuitError, match=message):
+        Circuit([SOURCE, element])
+
+
+def test_an_unknown_switch_is_refused() -> None:
+    with pytest.raises(CircuitError, match="no switch is called 'S2'; there are none"):
+        Circuit([SOURCE, Resistor("R1", "in", "0", 1.0)]).with_switches({"S2": True})

@@ -1,0 +1,547 @@
+"""The machine in its modes, against exponentials by hand, scipy and ngspice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from emulator import (
+    COMPONENTS,
+    IDEAL,
+    TICKS_PER_SAMPLE,
+    AnalogComputer,
+    Capacitor,
+    Circuit,
+    CircuitError,
+    DiodeLimiter,
+    Edges,
+    EngineError,
+    Excitation,
+    Mode,
+    ModeError,
+    OpAmp,
+    OpAmpModel,
+    Pot,
+    PotError,
+    Resistor,
+    SuspensionComputer,
+    Switch,
+    VoltageSource,
+    to_spice,
+)
+from emulator.circuit import Element
+from emulator.machine import RelaySwitch
+from emulator.opamp import preset
+from emulator.pot import coefficient_under_load
+
+NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
+Volts = NDArray[np.float64]
+
+SAMPLE_S = 50e-6
+LSB_V = 10.0 / 4096
+UNLOCKED = Excitation(clock="free", phase=0.637, frequency_hz=317.0)
+POT_SET, IC, HOLD, OPERATE = Mode.POT_SET, Mode.INITIAL_CONDITION, Mode.HOLD, Mode.OPERATE
+
+_ALLOWED = {(POT_SET, IC), (IC, POT_SET), (IC, HOLD), (IC, OPERATE)} | {
+    *((HOLD, mode) for mode in (POT_SET, IC, OPERATE)),
+    *((OPERATE, mode) for mode in (IC, HOLD)),
+}
+
+
+def integrator(more: Iterable[Element] = (), model: OpAmpModel = IDEAL) -> Circuit:
+    """Pot P1 (0.5) -> 100 k, 10 nF: tau = 1 ms."""
+    return Circuit(
+        [
+            VoltageSource("V1", "in"),
+            Pot("P1", "in", "w", "0", 10e3, 0.5),
+            Resistor("R1", "w", "s", 100e3),
+            Capacitor("C1", "s", "out", 10e-9),
+            OpAmp("U1", "0", "s", "out", model),
+            *more,
+        ]
+    )
+
+
+def machine(circuit: Circuit | None = None, initial_v: float = 4.0, **settings: float | None) -> AnalogComputer:
+    return AnalogComputer(circuit or integrator(), ["out"], initial_v={"U1": initial_v}, **settings)  # type: ignore[arg-type]
+
+
+def level(volts: float, tick: int = 0) -> dict[str, Edges]:
+    return {"V1": Edges(np.array([tick]), np.array([volts]))}
+
+
+def ticks(samples: float) -> int:
+    return round(samples * TICKS_PER_SAMPLE)
+
+
+# ---- modes
+
+
+def test_initial_condition_charges_with_the_time_constant_of_its_resistor() -> None:
+    volts = machine(ic_ohm=20e3).run(100)[:, 0]
+    np.testing.assert_allclose(volts, 4.0 * (1 - np.exp(-np.arange(100) * SAMPLE_S / 200e-6)), rtol=0, atol=1e-12)
+
+
+def test_initial_condition_charges_at_once_when_told_so() -> None:
+    assert machine(ic_ohm=None).run(3)[:, 0].tolist() == pytest.approx([4.0] * 3, abs=1e-12)
+
+
+def test_initial_condition_leaves_the_inputs_out() -> None:
+    volts = machine(ic_ohm=None).run(50, level(10.0))[:, 0]
+    np.testing.assert_allclose(volts, 4.0, atol=1e-12)
+
+
+def test_another_initial_voltage_is_taken_at_once_or_with_the_time_constant() -> None:
+    at_once, slowly = machine(ic_ohm=None), machine(ic_ohm=10e3)
+    slowly.run(100)
+    for computer in (at_once, slowly):
+        computer.set_initial({"U1": -2.0})
+    assert at_once.read()["out"] == pytest.approx(-2.0, abs=1e-12)
+    assert slowly.run(2)[-1, 0] == pytest.approx(-2.0 + 6.0 * math.exp(-2 * SAMPLE_S / 100e-6), abs=1e-9)
+
+
+def test_operate_integrates_from_the_initial_voltage() -> None:
+    computer = machine(ic_ohm=None)
+    computer.switch(OPERATE)
+    volts = computer.run(10, level(2.0))[:, 0]
+    coefficient = coefficient_under_load(0.5, 10e3, 100e3)
+    np.testing.assert_allclose(volts, 4.0 - 2.0 * coefficient * np.arange(10) * SAMPLE_S / 1e-3, rtol=0, atol=1e-9)
+
+
+def test_hold_holds_whatever_the_inputs_do() -> None:
+    computer = machine(ic_ohm=None)
+    computer.switch(HOLD)
+    np.testing.assert_allclose(computer.run(1000, level(10.0))[:, 0], 4.0, rtol=0, atol=1e-12)
+
+
+def test_hold_droops_by_the_leakage_of_the_capacitor() -> None:
+    computer = machine(integrator([Resistor("RLEAK", "s", "out", 1e8)]), ic_ohm=None)
+    computer.switch(HOLD)
+    volts = computer.run(1000, level(10.0))[:, 0]
+    start_v = 4.0 * 1e8 / (1e8 + 10e3)  # in INITIAL CONDITION the leak is across the resistor
+    np.testing.assert_allclose(volts, start_v * np.exp(-np.arange(1000) * SAMPLE_S / 1.0), rtol=0, atol=1e-9)
+
+
+def test_hold_droops_by_the_gain_of_the_amplifier() -> None:
+    """An input resistance to ground drains the capacitor through a junction that stands at -v / Avol."""
+    circuit = integrator([Resistor("RIN", "s", "0", 1e6)], OpAmpModel(avol=1e4))
+    computer = machine(circuit, ic_ohm=None)
+    computer.switch(HOLD)
+    volts = computer.run(2000)[:, 0]
+    tau_s = 1e6 * 10e-9 * (1e4 + 1)
+    np.testing.assert_allclose(volts, volts[0] * np.exp(-np.arange(2000) * SAMPLE_S / tau_s), rtol=0, atol=1e-9)
+    assert volts[0] - volts[-1] > 1e-3
+
+
+def test_the_relays_may_switch_at_any_tick() -> None:
+    """OPERATE from 1.25 to 7.75 samples: 6.5 samples of ramp."""
+    switches = [(ticks(1.25), OPERATE), (ticks(7.75), HOLD)]
+    volts = machine(ic_ohm=None).run(12, level(2.0), switches)[:, 0]
+    slope = -2.0 * coefficient_under_load(0.5, 10e3, 100e3) * SAMPLE_S / 1e-3
+    np.testing.assert_allclose(volts, 4.0 + slope * np.clip(np.arange(12) - 1.25, 0.0, 6.5), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", [IC, POT_SET])
+def test_every_mode_can_be_exported_and_agrees_with_ngspice(ngspice: NgSpice, mode: Mode) -> None:
+    computer = SuspensionComputer("front", rng=np.random.default_rng(1)).machine
+    computer.set_initial({"U2": -5.0, "U3": 7.0})
+    computer.switch(mode)
+    check_against_ngspice(ngspice, computer, UNLOCKED, 60)
+
+
+def test_hold_drifts_by_the_offsets_as_in_ngspice(ngspice: NgSpice) -> None:
+    """10 M from each junction to ground let an offset of 3 mV drift at 0.3 V/s on 1 nF."""
+    front = SuspensionComputer("front", rng=np.random.default_rng(1)).circuit
+    leaks = [Resistor(f"RIN{i}", f"s{i}", "0", 10e6) for i in (2, 3)]
+    computer = AnalogComputer(Circuit([*front.elements, *leaks]), ["u2"], initial_v={"U2": 0.0, "U3": 0.0})
+    computer.restart(HOLD)
+    drift_v = check_against_ngspice(ngspice, computer, UNLOCKED, 200)[-1, 1]
+    assert abs(drift_v) > LSB_V
+
+
+def check_against_ngspice(ngspice: NgSpice, computer: AnalogComputer, excitation: Excitation, samples: int) -> Volts:
+    nodes = ("u1", "u2", "u3", "u4", "u5")
+    edges = {"F": excitation.edges(0, ticks(samples), 20e3)}
+    deck = to_spice(computer.wiring, samples=samples, edges=edges)
+    reference = ngspice(deck, nodes, samples)
+    volts = np.empty((samples, len(nodes)))
+    for k in range(samples):
+        computer.run(1, {"F": excitation.edges(*computer.window(1), 20e3)})
+        shown = computer.read()
+        volts[k] = [shown[node] for node in nodes]
+    assert np.abs(volts - reference)[1:].max() < 0.05 * LSB_V
+    return volts
+
+
+def test_a_limiter_across_the_capacitor_stays_there_and_readings_show_what_it_does() -> None:
+    """It conducts from 5 V on, through 1 k: an initial 10 V, asked for through 10 k, ends at the divider of both."""
+    limiter = DiodeLimiter("D1", "out", "s", 5.0, 1e3, 1e9)
+    computer = machine(integrator([limiter]), 10.0, ic_ohm=10e3)
+    last_v = computer.run(200)[-1, 0]
+    through_limiter_s = 1e-3 - 1e-9
+    settled_v = (10.0 / 10e3 + 5.0 * through_limiter_s) / (1 / 10e3 + 1e-9 + through_limiter_s)
+    assert last_v == pytest.approx(settled_v, abs=1e-9)
+    assert computer.read()["out"] == pytest.approx(settled_v, abs=1e-9)
+    assert set(computer.lamps.values()) == {None}
+
+
+def test_a_switch_of_the_circuit_can_be_thrown() -> None:
+    computer = machine(integrator([Switch("S1", "in", "s", 100e3, 1e12, closed=False)]), ic_ohm=None)
+    computer.switch(OPERATE)
+    coefficient = coefficient_under_load(0.5, 10e3, 100e3)
+    slopes = []
+    for closed in (False, True):
+        computer.throw({"S1": closed})
+        slopes.append(np.diff(computer.run(5, level(2.0) if not closed else None)[:, 0])[-1])
+    assert slopes[0] == pytest.approx(-2.0 * coefficient * SAMPLE_S / 1e-3, abs=1e-6)
+    assert slopes[1] == pytest.approx(-2.0 * (1.0 + coefficient) * SAMPLE_S / 1e-3, abs=1e-6)
+    assert computer.circuit.of(Switch)[0].closed
+    with pytest.raises(CircuitError, match="no switch is called 'S2'; there are S1"):
+        computer.throw({"S2": True})
+
+
+# ---- the suspension, operated by hand
+
+
+def free_response(program: str, x0: float, v0: float, times_s: Volts) -> Volts:
+    """Displacement in m and velocity in m/s, (instants, 2), of M x'' + B x' + K x = 0, 200 times its own speed."""
+    plant = SuspensionComputer(program).program
+    a = np.array([[0.0, 1.0], [-plant.K_n_per_m / plant.M_kg, -plant.B_n_s_per_m / plant.M_kg]])
+    return np.array([scipy.linalg.expm(a * 200.0 * t) @ (x0, v0) for t in times_s])
+
+
+@pytest.mark.parametrize("program", ["front", "shock"])
+def test_operate_from_an_initial_condition_is_the_free_response(program: str) -> None:
+    computer = SuspensionComputer(program, opamp="ideal")
+    volt_per_m, volt_per_m_s = computer.scales.volts("displacement"), computer.scales.volts("velocity")
+    by_hand = computer.machine
+    by_hand.set_initial({"U2": -0.5 * volt_per_m_s, "U3": -0.08 * volt_per_m})
+    # 100 samples are 50 time constants of the larger capacitor.
+    volts = by_hand.run(300, None, [(ticks(100.25), OPERATE), (ticks(120.75), HOLD), (ticks(180.125), OPERATE)])
+    running_samples = np.clip(np.arange(100, 300) - 100.25, 0.0, 20.5) + np.maximum(np.arange(100, 300) - 180.125, 0.0)
+    expected = free_response(program, 0.08, -0.5, running_samples * SAMPLE_S)
+    np.testing.assert_allclose(volts[100:, 1], expected[:, 0] * volt_per_m, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(volts[100:, 2], expected[:, 1] * volt_per_m_s, rtol=0, atol=1e-9)
+
+
+def test_the_states_are_continuous_where_relays_switch() -> None:
+    computer = SuspensionComputer("front", rng=np.random.default_rng(1)).machine
+    computer.set_initial({"U2": 3.0, "U3": -4.0})
+    for mode in (HOLD, OPERATE, IC, POT_SET, IC, OPERATE, HOLD, POT_SET):
+        computer.run(3, {"F": Excitation(frequency_hz=5e3).edges(*computer.window(3), 20e3)})
+        before = charges(computer)
+        computer.switch(mode)
+        assert charges(computer) == pytest.approx(before, abs=1e-12)
+
+
+def charges(computer: AnalogComputer) -> list[float]:
+    volts = computer.read()
+    return [volts["s2"] - volts["u2"], volts["s3"] - volts["u3"]]
+
+
+def test_readings_of_every_mode_are_those_of_the_record() -> None:
+    computer = SuspensionComputer("front").machine
+    computer.set_initial({"U2": 3.0, "U3": -4.0})
+    for mode in (IC, HOLD, OPERATE, HOLD, POT_SET):
+        computer.switch(mode)
+        last = computer.run(5, {"F": Excitation().edges(*computer.window(5), 20e3)})[-1]
+        shown = computer.read()
+        assert [shown[node] for node in ("in", "u5", "u2", "u1")] == pytest.approx(last.tolist(), abs=1e-12)
+        assert shown.keys() == set(computer.circuit.nodes)
+
+
+@st.composite
+def operations(draw: st.DrawFn) -> list[RelaySwitch]:
+    """Switches within 40 samples, every transition allowed."""
+    instants = sorted(draw(st.lists(st.integers(0, ticks(39)), max_size=6)))
+    switches, mode = [], IC
+    for instant in instants:
+        mode = draw(st.sampled_from([after for before, after in sorted(_ALLOWED, key=str) if before is mode]))
+        switches.append((instant, mode))
+    return switches
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(operations(), st.lists(st.integers(1, 12), max_size=4))
+def test_a_run_may_be_cut_anywhere(switches: list[RelaySwitch], cuts: list[int]) -> None:
+    excitation = Excitation(clock="free", phase=0.3, frequency_hz=900.0)
+    assert sum(cuts) <= 48
+    whole = played(switches, excitation, [50])
+    assert np.array_equal(played(switches, excitation, [*cuts, 50 - sum(cuts)]), whole)
+
+
+def played(switches: Sequence[RelaySwitch], excitation: Excitation, cuts: Sequence[int]) -> Volts:
+    computer = SuspensionComputer("front").machine
+    computer.set_initial({"U2": 2.0, "U3": -5.0})
+    blocks, done = [], 0
+    for samples in cuts:
+        first = done
+        while done < len(switches) and switches[done][0] < computer.window(samples)[1]:
+            done += 1
+        edges = {"F": excitation.edges(*computer.window(samples), 20e3)}
+        blocks.append(computer.run(samples, edges, switches[first:done]))
+    return np.concatenate(blocks)
+
+
+# ---- repetitive operation
+
+
+def test_repetitive_operation_repeats_bit_for_bit() -> None:
+    front = SuspensionComputer("front", rng=np.random.default_rng(1))
+    front.machine.turn({"K": 0.4})
+    computer = AnalogComputer(front.circuit, ["u5", "u1"], initial_v={"U2": 1.0, "U3": -2.0}, ic_ohm=None)
+    force = {"F": Edges(np.array([0, ticks(10.9), ticks(30.2)]), np.array([0.0, 10.0, -3.0]))}
+    cycles = computer.repeat(5, ticks(4.3), ticks(55.7), force)
+    assert cycles.shape == (5, 60, 2)
+    assert all(np.array_equal(cycle, cycles[0]) for cycle in cycles)
+    assert np.ptp(cycles[0, :, 0]) > 3.0
+    assert computer.mode is OPERATE
+
+
+def test_repetitive_operation_repeats_when_the_capacitors_have_time_to_charge() -> None:
+    computer = machine(ic_ohm=10e3)
+    cycles = computer.repeat(4, ticks(100), ticks(50), level(5.0))[:, :, 0]
+    assert np.abs(cycles[1:] - cycles[0])[:, 60:].max() < 1e-12
+    ramp = -5.0 * coefficient_under_load(0.5, 10e3, 100e3) * SAMPLE_S / 1e-3
+    np.testing.assert_allclose(np.diff(cycles[:, 100:], axis=1), ramp, rtol=0, atol=1e-9)
+
+
+def test_a_cycle_lasts_a_whole_number_of_samples() -> None:
+    with pytest.raises(ModeError, match=r"a cycle of 4194304 \+ 1 ticks is no whole number of samples"):
+        machine().repeat(2, ticks(1), 1)
+
+
+# ---- transitions
+
+
+@pytest.mark.parametrize("before", Mode)
+@pytest.mark.parametrize("after", Mode)
+def test_transitions_that_make_no_sense_are_refused_and_change_nothing(before: Mode, after: Mode) -> None:
+    computer = machine()
+    computer.restart(before)
+    if before is after or (before, after) in _ALLOWED:
+        computer.switch(after)
+        assert computer.mode is after
+        return
+    with pytest.raises(ModeError, match=f"{before.value} cannot be followed by {after.value}, only by"):
+        computer.run(5, switches=[(0, before), (ticks(1), after)])
+    assert (computer.mode, computer.recorded) == (before, 0)
+
+
+def test_the_present_mode_again_changes_no_bit() -> None:
+    computers = machine(), machine()
+    for computer in computers:
+        computer.switch(OPERATE)
+    computers[0].run(5, level(1.0))
+    computers[1].run(5, level(1.0))
+    computers[1].switch(OPERATE)
+    assert np.array_equal(computers[0].run(5), computers[1].run(5))
+
+
+@pytest.mark.parametrize("instants", [[5.5, 5.25], [3.0], [14.5]])
+def test_switches_out_of_order_or_out_of_the_run_are_refused(instants: list[float]) -> None:
+    computer = machine()
+    computer.run(5)
+    with pytest.raises(ModeError, match="not in order, or not within"):
+        computer.run(10, switches=[(ticks(instant), IC) for instant in instants])
+    assert computer.recorded == 5
+
+
+def test_edges_beyond_the_run_are_refused_with_switches_too() -> None:
+    with pytest.raises(EngineError, match="edges are out of order"):
+        machine().run(5, level(1.0, ticks(7)), [(ticks(2.5), OPERATE)])
+
+
+# ---- pots
+
+
+@pytest.mark.parametrize("program", ["front", "shock"])
+def test_pot_set_reads_coefficients_under_load(program: str) -> None:
+    computer = SuspensionComputer(program, opamp="ideal")
+    computer.machine.switch(POT_SET)
+    for pot, expected in computer.coefficients.items():
+        assert computer.machine.coefficient(pot) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_pot_with_resistance_at_its_ends_is_read_at_its_terminals() -> None:
+    """9990 of track, 5 at either end, 20 at the wiper; at 0.25 that is 2502.5 of 10 k; R1 takes all that it passes."""
+    pot: list[Element] = [
+        Pot("P1", "P1_top", "P1_wiper", "P1_bottom", 9990.0, 0.25),
+        Resistor("P1_top_ohm", "in", "P1_top", 5.0),
+        Resistor("P1_wiper_ohm", "P1_wiper", "w", 20.0),
+        Resistor("P1_bottom_ohm", "P1_bottom", "0", 5.0),
+    ]
+    computer = machine(Circuit([*pot, *(part for part in integrator().elements if part.name != "P1")]))
+    computer.switch(POT_SET)
+    loaded = coefficient_under_load(0.25025, 10e3, 100e3 + 20.0) * 100e3 / (100e3 + 20.0)
+    assert computer.coefficient("P1") == pytest.approx(loaded, rel=1e-9)
+
+
+def test_hold_droops_by_the_bias_current_of_the_amplifier() -> None:
+    """80 nA into 10 nF are 8 V/s; -16 V behind 200 M is how such a current is wired."""
+    bias: list[Element] = [VoltageSource("U1_bias", "U1_bias", dc_v=-16.0), Resistor("U1_ohm", "s", "U1_bias", 2e8)]
+    computer = machine(integrator(bias), ic_ohm=None)
+    computer.switch(HOLD)
+    volts = computer.run(1000, level(10.0))[:, 0]
+    start_v = 4.0 + 80e-9 * 10e3
+    np.testing.assert_allclose(volts, start_v + 8.0 * np.arange(1000) * SAMPLE_S, rtol=0, atol=1e-9)
+
+
+def test_pot_set_sets_coefficients_under_load() -> None:
+    computer = SuspensionComputer("front", rng=np.random.default_rng(1))
+    computer.machine.switch(POT_SET)
+    wanted = computer.dials_for(M_kg=30.0, B_n_s_per_m=3453.0, K_n_per_m=18000.0)
+    for pot, coefficient in (("M", 0.980), ("B", 0.77987), ("K", 0.60980)):
+        computer.machine.set_coefficient(pot, coefficient)
+        assert computer.machine.coefficient(pot) == pytest.approx(coefficient, abs=1e-9)
+    assert computer.dials == pytest.approx(wanted, abs=1e-4)
+
+
+def test_pots_still_see_their_loads_while_no_amplifier_moves_in_pot_set() -> None:
+    computer = SuspensionComputer("front", opamp="ideal").machine
+    computer.switch(POT_SET)
+    computer.run(200, {"F": Edges(np.array([0]), np.array([10.0]))})
+    shown = computer.read()
+    assert [shown[f"u{i}"] for i in range(1, 6)] == pytest.approx([0.0] * 5, abs=1e-9)
+
+
+def test_a_coefficient_beyond_the_track_is_refused_and_nothing_turns() -> None:
+    computer = machine()
+    computer.switch(POT_SET)
+    for coefficient in (-0.1, 1.1, math.nan):
+        with pytest.raises(PotError, match="pot P1: coefficient .* is beyond the track"):
+            computer.set_coefficient("P1", coefficient)
+    assert computer.dials == {"P1": 0.5}
+    computer.set_coefficient("P1", 1.0)
+    computer.set_coefficient("P1", 0.0)
+    assert computer.dials["P1"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_coefficients_are_for_pot_set_and_for_pots_that_are_there() -> None:
+    computer = machine()
+    with pytest.raises(ModeError, match="read and set in POT SET, and this is INITIAL CONDITION"):
+        computer.coefficient("P1")
+    computer.switch(POT_SET)
+    with pytest.raises(PotError, match="no pot is called 'P2'; there are P1"):
+        computer.coefficient("P2")
+    with pytest.raises(PotError, match="no pot is called 'P2'; there are P1"):
+        computer.turn({"P1": 0.1, "P2": 0.1})
+    assert computer.dials == {"P1": 0.5}
+
+
+@pytest.mark.parametrize("initial_v", [{"U1": math.nan}, {"U2": 1.0}])
+def test_initial_voltages_that_cannot_be_are_refused(initial_v: Mapping[str, float]) -> None:
+    with pytest.raises(CircuitError):
+        machine().set_initial(initial_v)
+    with pytest.raises(CircuitError, match="ic_ohm must be positive"):
+        machine(ic_ohm=-1.0)
+
+
+# ---- overload
+
+
+def acceleration_scaled(opamp: str = "tl07x") -> AnalogComputer:
+    """The front suspension with the mass in front of the summer, which puts out acceleration: 10 V for 2940 N / 115 kg.
+
+    Inputs of gain 10, so that the three pots pass 115 / (10 M) of 1, B vs / Fs and K xs / Fs.
+    """
+    model = preset(opamp)
+    integrators: list[Element] = [
+        OpAmp("U1", "0", "s1", "u1", model),
+        Resistor("RFB", "s1", "u1", 100e3),
+        Resistor("R1", "u1", "s2", 100e3 / 0.255652),
+        Capacitor("C1", "s2", "u2", 1e-9),
+        OpAmp("U2", "0", "s2", "u2", model),
+        Resistor("R2", "u2", "s3", 49.9e3),
+        Capacitor("C2", "s3", "u3", 10e-9),
+        OpAmp("U3", "0", "s3", "u3", model),
+        Resistor("R4", "u2", "s4", 10e3),
+        Resistor("R4FB", "s4", "u4", 10e3),
+        OpAmp("U4", "0", "s4", "u4", model),
+    ]
+    coefficients: list[Element] = []
+    for pot, top in (("F", "in"), ("B", "u4"), ("K", "u3")):
+        coefficients += [Pot(f"P{pot}", top, f"w{pot}", "0", 1e3, 0.5), Resistor(f"R{pot}", f"w{pot}", "s1", 10e3)]
+    circuit = Circuit([VoltageSource("V1", "in"), *coefficients, *integrators])
+    computer = AnalogComputer(circuit, ["u1", "u2", "u3"], initial_v={"U2": 0.0, "U3": 0.0})
+    set_mass(computer, 115.0)
+    computer.restart(OPERATE)
+    return computer
+
+
+def set_mass(computer: AnalogComputer, m_kg: float) -> None:
+    """As an operator would: in POT SET, on a machine of the same circuit."""
+    bench = AnalogComputer(computer.circuit, ["u1"], initial_v={"U2": 0.0, "U3": 0.0})
+    bench.switch(POT_SET)
+    for pot, coefficient in (("PF", 1.0), ("PB", 3021.0 * 2.0 / 2940.0), ("PK", 24500.0 * 0.1996 / 2940.0)):
+        bench.set_coefficient(pot, 0.1 * coefficient * 115.0 / m_kg)
+    computer.turn(bench.dials)
+
+
+def run_with_force(computer: AnalogComputer, samples: int) -> Volts:
+    edges = {"V1": Excitation().edges(*computer.window(samples), 20e3)}
+    return computer.run(samples, edges)
+
+
+def test_the_mass_that_jumps_overloads_an_acceleration_scaled_summer_at_the_next_edge() -> None:
+    """At M = 30 kg 2940 N ask 38 V of U1. The force steps at 600; 10 us later, before 601 is taken, the lamp lights."""
+    computer = acceleration_scaled()
+    run_with_force(computer, 571)
+    assert set(computer.lamps.values()) == {None}
+    set_mass(computer, 30.0)
+    volts = run_with_force(computer, 30)
+    assert set(computer.lamps.values()) == {None}
+    assert abs(volts[0, 0]) < 13.5
+    volts = run_with_force(computer, 30)
+    assert computer.lamps == {"U1": 601, "U2": None, "U3": None, "U4": None}
+    assert abs(volts).max() == pytest.approx(13.5, abs=0.02)
+
+
+def test_a_lamp_stays_lit_until_it_is_cleared_and_lights_again_under_overload() -> None:
+    computer = acceleration_scaled()
+    run_with_force(computer, 571)
+    set_mass(computer, 30.0)
+    run_with_force(computer, 70)
+    assert computer.lamps["U1"] == 601
+    computer.clear_lamps()
+    assert set(computer.lamps.values()) == {None}
+    run_with_force(computer, 20)
+    assert computer.lamps["U1"] == 651
+
+
+def test_an_overload_shorter_than_the_delay_lights_nothing() -> None:
+    """A TL07x follows a step of 10 V in 0.8 us; a lamp with 0.5 us of patience sees it, one with 1 us does not."""
+    elements = integrator(model=preset("tl07x")).elements
+    inverter: list[Element] = [
+        Resistor("R2", "in", "n", 1e4),
+        Resistor("R3", "n", "o", 1e4),
+        OpAmp("U2", "0", "n", "o", preset("tl07x")),
+    ]
+    for delay_s, sample in ((0.5e-6, 1), (1e-6, None)):
+        computer = machine(Circuit([*elements, *inverter]), lamp_delay_s=delay_s)
+        computer.run(3, level(10.0, ticks(0.5)))
+        assert computer.lamps == {"U1": None, "U2": sample}
+
+
+@pytest.mark.parametrize("stock", ["polyester", "polypropylene"])
+def test_a_machine_of_real_components_is_set_charged_and_held(stock: str) -> None:
+    """Coefficients as pot.py has them; HOLD loses less than an LSB in 100 samples but does lose."""
+    computer = SuspensionComputer("front", components=COMPONENTS[stock])
+    by_hand = computer.machine
+    by_hand.set_initial({"U2": 5.0, "U3": -5.0})
+    by_hand.switch(POT_SET)
+    for pot, expected in computer.coefficients.items():
+        assert by_hand.coefficient(pot) == pytest.approx(expected, abs=1e-6)
+    by_hand.switch(IC)
+    by_hand.run(30000)
+    assert by_hand.read()["u3"] == pytest.approx(-5.0, abs=0.12)
+    by_hand.switch(HOLD)
+    held = by_hand.run(101)[:, 1]
+    assert 1e-6 < abs(held[-1] - held[0]) < LSB_V
