@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emulator import (
@@ -166,6 +168,45 @@ def test_a_switch_is_its_resistance_and_is_thrown_like_a_pot() -> None:
 def test_bad_values_are_refused_naming_element_and_field(element: DiodeLimiter | Switch, message: str) -> None:
     with pytest.raises(CircuitError, match=message):
         Circuit([SOURCE, element])
+
+
+nodes_of_a_mesh = st.sampled_from(("in", "a", "b", "c", "d", "0"))
+limiters_of_a_mesh = st.lists(
+    st.tuples(
+        nodes_of_a_mesh, nodes_of_a_mesh, st.sampled_from((-1.0, 0.0, 0.6, 0.6, 3.0)), st.floats(0.0, 4.0)
+    ).filter(lambda drawn: drawn[0] != drawn[1]),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(limiters_of_a_mesh, st.lists(st.floats(-20.0, 20.0), min_size=3, max_size=12))
+def test_the_currents_of_any_mesh_of_limiters_balance(
+    drawn: list[tuple[str, str, float, float]], levels_v: list[float]
+) -> None:
+    """Kirchhoff's law with the law of each element is the definition; a passive mesh has one solution."""
+    limiters = [DiodeLimiter(f"D{i}", a, b, v, 10.0**decade, 1e6) for i, (a, b, v, decade) in enumerate(drawn)]
+    ring = [("in", "a"), ("a", "b"), ("b", "c"), ("c", "d"), ("d", "0")]
+    resistors = [Resistor(f"R{i}", a, b, 1e3 * (1 + i)) for i, (a, b) in enumerate(ring)]
+    engine = Engine(piecewise_linear(Circuit([SOURCE, *resistors, *limiters])), ["in", "a", "b", "c", "d"])
+    for volts in engine.run(len(levels_v), staircase(levels_v)):
+        v = dict(zip(("in", "a", "b", "c", "d"), volts.tolist(), strict=True)) | {"0": 0.0}
+        into = dict.fromkeys(v, 0.0)
+        elements: list[Resistor | DiodeLimiter] = [*resistors, *limiters]
+        for element in elements:
+            amperes = current(element, v[element.a] - v[element.b])
+            into[element.a] -= amperes
+            into[element.b] += amperes
+        assert max(abs(into[node]) for node in "abcd") < 2e-11  # of up to 20 A
+
+
+def current(element: Resistor | DiodeLimiter, v: float) -> float:
+    """From a to b, in A."""
+    if isinstance(element, Resistor):
+        return v / element.ohm
+    conducting = max(0.0, v - element.threshold_v)
+    return v / element.off_ohm + (1.0 / element.on_ohm - 1.0 / element.off_ohm) * conducting
 
 
 def test_an_unknown_switch_is_refused() -> None:

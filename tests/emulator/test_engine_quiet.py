@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emulator import (
+    PROGRAMS,
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -57,6 +62,37 @@ def test_slow_states_alone_give_the_same_voltages(program: str, excitation: Exci
     volts, engine = played(machine(program), excitation, 600, reduced=True)
     assert np.abs(volts - full).max() < 1e-9
     assert engine.counts.quiet > 300
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    st.sampled_from(("front", "shock")),
+    st.sampled_from(("tl07x", "741", "ideal")),
+    st.tuples(*[st.floats(0.6, 1.8)] * 4),
+    st.builds(
+        Excitation,
+        low_v=st.floats(-12.0, 0.0),
+        high_v=st.floats(0.0, 12.0),
+        frequency_hz=st.floats(60.0, 900.0),
+        clock=st.just("free"),
+        phase=st.floats(0.0, 0.99),
+    ),
+)
+def test_slow_states_alone_give_the_same_voltages_whatever_limits(
+    program: str, opamp: str, by: tuple[float, float, float, float], excitation: Excitation
+) -> None:
+    """Amplifiers slew and clamp at will: no event may be slept through."""
+    nominal = PROGRAMS[program].parts
+    parts = replace(
+        nominal,
+        rfb_ohm=nominal.rfb_ohm * by[0],
+        rb_ohm=nominal.rb_ohm * by[1],
+        c1_farad=nominal.c1_farad * by[2],
+        c2_farad=nominal.c2_farad * by[3],
+    )
+    full, _ = played(machine(program, opamp, parts), excitation, 200, reduced=False)
+    volts, _ = played(machine(program, opamp, parts), excitation, 200, reduced=True)
+    assert np.abs(volts - full).max() < 1e-7
 
 
 def test_a_clamped_amplifier_may_be_quiet_too() -> None:
