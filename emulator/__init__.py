@@ -4,6 +4,7 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
 from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
+from .deck import Deck, read_deck
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
@@ -24,6 +25,7 @@ __all__ = [
     "Card",
     "Circuit",
     "CircuitError",
+    "Deck",
     "DiodeLimiter",
     "Edges",
     "EmulatorError",
@@ -46,5 +48,6 @@ __all__ = [
     "Switch",
     "VoltageSource",
     "piecewise_linear",
+    "read_deck",
     "to_spice",
 ]

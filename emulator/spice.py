@@ -106,7 +106,7 @@ def to_spice(
     accuracy: Accuracy | None = None,
     title: str = "analogue computer",
 ) -> str:
-    """The deck of a circuit played for that many samples.
+    """The deck of a circuit played for that many samples; without .tran when there are none.
 
     edges: by input, from tick 0 on (an input without any stays at 0 V). turns: (sample, dials by pot), effective right
     after that sample. initial_v: volts of states (capacitors, op-amps with a pole) at sample 0, 0 V where not given.
@@ -161,8 +161,9 @@ class _Writer:
         yield ".save " + " ".join(f"v({node})" for node in (self._circuit.nodes if nodes is None else nodes))
         yield f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}"
         yield f".options trtol={accuracy.trtol:g}"
-        stop_s = (samples - 1) * self._period_s
-        yield f".tran {_number(self._period_s)} {_number(stop_s)} 0 {_number(accuracy.max_step_s)} uic"
+        if samples > 0:
+            stop_s = (samples - 1) * self._period_s
+            yield f".tran {_number(self._period_s)} {_number(stop_s)} 0 {_number(accuracy.max_step_s)} uic"
         yield ".end"
 
     def _element(self, element: Element) -> Iterator[str]:
@@ -261,11 +262,13 @@ def _known(what: str, names: Iterable[str], there: Sequence[str]) -> None:
 
 
 def _levels(edges: Edges, period_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Instants in s and levels, beginning at 0 s."""
+    """Instants in s and levels, beginning at 0 s; without levels that do not last as long as a step takes."""
     times_s = edges.ticks.astype(np.float64) * (period_s / TICKS_PER_SAMPLE)
+    lasting = np.append(times_s[1:] > times_s[:-1] + STEP_S, True)[: times_s.size]
+    times_s, levels_v = times_s[lasting], edges.levels_v[lasting]
     if times_s.size and times_s[0] <= 0:
-        return times_s, edges.levels_v
-    return np.append(0.0, times_s), np.append(0.0, edges.levels_v)
+        return times_s, levels_v
+    return np.append(0.0, times_s), np.append(0.0, levels_v)
 
 
 def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[str]:
@@ -280,4 +283,4 @@ def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64
 
 
 def _number(value: float) -> str:
-    return repr(min(max(float(value), -LIMITLESS), LIMITLESS))
+    return repr(float(value) if math.isfinite(value) else math.copysign(LIMITLESS, value))
