@@ -13,6 +13,7 @@ from .opamp import IDEAL, OpAmpModel
 from .sampler import Card, Sampler
 from .spice import to_spice
 from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
+from .two_mass import TWO_MASS_READINGS, TwoMassParts, TwoMassPlant, TwoMassProgram, TwoMassScales
 
 __all__ = [
     "CHANNELS",
@@ -21,6 +22,7 @@ __all__ = [
     "PROGRAMS",
     "SHOCK",
     "TICKS_PER_SAMPLE",
+    "TWO_MASS_READINGS",
     "Capacitor",
     "Card",
     "Circuit",
@@ -46,6 +48,10 @@ __all__ = [
     "SuspensionComputer",
     "SuspensionParts",
     "Switch",
+    "TwoMassParts",
+    "TwoMassPlant",
+    "TwoMassProgram",
+    "TwoMassScales",
     "VoltageSource",
     "piecewise_linear",
     "read_deck",
