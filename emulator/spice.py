@@ -151,7 +151,7 @@ class _Writer:
     def lines(self, samples: int, accuracy: Accuracy, nodes: Sequence[str] | None, title: str) -> Iterator[str]:
         elements = [line for element in self._circuit.elements for line in self._element(element)]
         clock = self._instance("time_points", self._free("Xclock"), (self._free("clock"),), period=self._period_s)
-        yield f"* {title}"
+        yield f"* {' '.join(title.split())}".encode("ascii", "replace").decode()
         for name in self._used:
             yield LIBRARY[name]
         yield from elements

@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator import Card, EmulatorError, Sampler, SuspensionComputer
+from emulator import Card, EmulatorError, Excitation, Sampler, SuspensionComputer
 from emulator.opamp import preset
 from harness import config
 from harness.errors import AnalogrigError, ConfigurationError, RigError
@@ -150,6 +150,14 @@ class _Stream(enum.IntEnum):
         return np.random.default_rng([seed, int(self)])
 
 
+class SetUp(NamedTuple):
+    """A computer, and what is to be played on it."""
+
+    computer: SuspensionComputer
+    excitation: Excitation
+    tweaks: tuple[tuple[int, dict[str, float]], ...]
+
+
 class EmulatorRig:
     """The emulated analogue computer and its card."""
 
@@ -164,7 +172,11 @@ class EmulatorRig:
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
 
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
+    def set_up(self, scenario: Scenario, seed: int) -> SetUp:
+        """The machine as the scenario starts it, and what will be played on it.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        """
         with _emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
@@ -174,6 +186,10 @@ class EmulatorRig:
                 settings = _settings(tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings))
+        return SetUp(computer, excitation, tuple(tweaks))
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        computer, excitation, tweaks = self.set_up(scenario, seed)
         with _emulator_errors(f"scenario {scenario.name}: "):
             volts = computer.play(excitation, scenario.samples, tweaks, BLOCK_SAMPLES)
         return Performance(
