@@ -131,6 +131,14 @@ P1 out
     assert np.abs(deck.volts(nodes) - reference).max() < 0.05 * LSB_V
 
 
+def test_the_deck_of_the_readme_runs() -> None:
+    readme = (Path(__file__).parents[2] / "emulator" / "README.md").read_text()
+    _, _, after = readme.partition("```\nan inverter")
+    volts = read_deck("an inverter" + after.partition("```")[0]).volts(["out", "w"])
+    # The pot, 10k at 0.3 without load, is the amplifier's.
+    np.testing.assert_allclose(volts[40], [-10.0, -3.0], atol=1e-3)
+
+
 def test_initial_conditions_of_nodes_reach_the_capacitors_between_them() -> None:
     deck = read_deck("t\nR1 a 0 1k\nR2 b 0 1k\nC1 a b 1u\nC2 b 0 1u IC=3\n.ic v(a)=5 V( b ) = 2\n.tran 1m 1m uic")
     assert deck.initial_v == {"C1": 3.0, "C2": 3.0}
