@@ -3,6 +3,7 @@
 README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
+from .bump_stop import BumpStop
 from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .deck import Deck, read_deck
 from .engine import Engine
@@ -23,6 +24,7 @@ __all__ = [
     "SHOCK",
     "TICKS_PER_SAMPLE",
     "TWO_MASS_READINGS",
+    "BumpStop",
     "Capacitor",
     "Card",
     "Circuit",

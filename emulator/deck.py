@@ -2,7 +2,8 @@
 
     R, C (IC=)           resistors, capacitors
     V                    DC: a constant; PULSE, PWL: an input whose level steps
-    X                    subcircuits of the deck, nested, with parameters; and those of spice.LIBRARY: op-amps and pots
+    X                    subcircuits of the deck, nested, with parameters; and those of spice.LIBRARY: op-amps,
+                         pots, diode limiters, switches
     .param               numbers, names, + - * / and parentheses (expression.py)
     .ic, .tran ... uic   initial conditions; sample period and length of the run
     .subckt .ends .end   and .save, .options, .print, .plot, .title, which change nothing here
@@ -24,7 +25,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, VoltageSource
+from .circuit import (
+    GROUND,
+    Capacitor,
+    Circuit,
+    DiodeLimiter,
+    Element,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
 from .deck_text import MAX_NESTING, Card, Definition, located, parse
 from .engine import Engine
 from .errors import CircuitError, EmulatorError
@@ -370,6 +382,15 @@ class _Reading:
             case "turned_pot":
                 top, wiper, bottom, dial = nodes
                 self._keep(place, card, Pot(name, top, wiper, bottom, given["track"], 0.0), dial_node=dial)
+            case "diode_limiter":
+                a, b = nodes
+                limiter = DiodeLimiter(name, a, b, given["threshold"], given["on"], given["off"])
+                self._keep(place, card, limiter)
+            case "switch":
+                a, b = nodes
+                if given["closed"] not in {0.0, 1.0}:
+                    raise CircuitError(f"closed must be 0 or 1, got {given['closed']:g}")
+                self._keep(place, card, Switch(name, a, b, given["on"], given["off"], closed=given["closed"] == 1.0))
             case "time_points":
                 pass
 

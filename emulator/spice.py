@@ -63,7 +63,7 @@ Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{t
         "diode_limiter": """\
 .subckt diode_limiter a b threshold=0 on=1 off=1g
 Roff a b {off}
-Bon a b I = {1 / on - 1 / off} * max(0, v(a, b) - {threshold})
+Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
 .ends""",
         "switch": """\
 .subckt switch a b on=1 off=1g closed=1

@@ -152,7 +152,7 @@ def test_a_switch_is_its_resistance_and_is_thrown_like_a_pot() -> None:
     assert [*before[:, 0], *engine.run(1)[:, 0]] == pytest.approx([6.0, 6.0, 4.0], rel=1e-14)
     closed = piecewise_linear(circuit.with_switches({"S1": True}))
     assert np.array_equal(closed.lmn, nodal.at({}, {"S1": True}).lmn)
-    assert "R_S1 o 0 1000.0" in to_spice(circuit.with_switches({"S1": True}), samples=2)
+    assert "X_S1 o 0 switch on=1000.0 off=3000.0 closed=1.0" in to_spice(circuit.with_switches({"S1": True}), samples=2)
 
 
 @pytest.mark.parametrize(
