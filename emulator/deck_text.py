@@ -17,7 +17,7 @@ MAX_NESTING = 20
 
 _COMMENT = re.compile(r"(?:;|(?:^|\s)\$\s).*")
 _QUOTED = re.compile(r"\{[^{}]*\}|'[^']*'")
-_ASSIGNMENT = re.compile(r"([A-Za-z_]\w*(?:\s*\([^()=]*\))?)\s*=\s*")
+_ASSIGNMENT = re.compile(r"\b([A-Za-z_]\w*(?:\s*\([^()=]*\))?)\s*=\s*")
 _GAP = re.compile(r"[\s,()]+")
 
 

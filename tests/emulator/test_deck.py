@@ -239,10 +239,11 @@ CHAIN = ".param " + " ".join(f"p{i}={{p{i + 1}+p{i + 1}}}" for i in range(40_000
         (CHAIN + "\nR1 in 0 {p0}", "nested deeper than 50"),
         ("\n".join(f"C{i} in n{i} 1n\nR{i} n{i} 0 1k" for i in range(40)), "40 states; the engine takes at most 32"),
         ("R1 in 0 " + "9" * 100_000, "characters; at most 1000"),
+        ("a" * 4_000_000 + "(", "cards of this kind are not supported"),
         ("* " + "x" * (9 << 20), "at most 8388608 are read"),
         ("V2 a 0 PULSE(0 1 0 1p 1p 1p 1n)\nR2 a 0 1k\n.tran 1m 10 uic", "more than 1000000 edges"),
     ],
-    ids=["elements", "doubling", "parameters", "states", "digits", "text", "edges"],
+    ids=["elements", "doubling", "parameters", "states", "digits", "word", "text", "edges"],
 )
 def test_a_deck_beyond_the_limits_is_refused_at_once(cards: str, message: str) -> None:
     start_s = time.perf_counter()
