@@ -4,6 +4,7 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
 from .acquisition import acquired, probes_per_sample
+from .bump_stop import BumpStop
 from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .components import (
     COMPONENTS,
@@ -16,6 +17,7 @@ from .components import (
     OpAmpGrade,
     PotGrade,
 )
+from .deck import Deck, read_deck
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, ModeError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
@@ -27,6 +29,7 @@ from .pot import PotModel
 from .sampler import CARDS, Card, Sampler, drawn_levels
 from .spice import to_spice
 from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
+from .two_mass import TWO_MASS_READINGS, TwoMassParts, TwoMassPlant, TwoMassProgram, TwoMassScales
 
 __all__ = [
     "CARDS",
@@ -42,13 +45,16 @@ __all__ = [
     "REFERENCE_V",
     "SHOCK",
     "TICKS_PER_SAMPLE",
+    "TWO_MASS_READINGS",
     "AnalogComputer",
+    "BumpStop",
     "Capacitor",
     "Card",
     "Circuit",
     "CircuitError",
     "CircuitNoise",
     "Components",
+    "Deck",
     "Dielectric",
     "DiodeLimiter",
     "Edges",
@@ -77,10 +83,15 @@ __all__ = [
     "SuspensionComputer",
     "SuspensionParts",
     "Switch",
+    "TwoMassParts",
+    "TwoMassPlant",
+    "TwoMassProgram",
+    "TwoMassScales",
     "VoltageSource",
     "acquired",
     "drawn_levels",
     "piecewise_linear",
     "probes_per_sample",
+    "read_deck",
     "to_spice",
 ]

@@ -1,47 +1,81 @@
-"""A circuit as a SPICE deck that ngspice runs unchanged.
+"""A circuit as a SPICE deck that ngspice runs unchanged, and that deck.py reads back.
 
     ngspice -b -r out.raw deck.cir
 
-Op-amps follow the same law as in the engine. The deck starts from zero state (uic). A pot that is turned becomes two
-behavioural resistors steered by a voltage that steps; sources and pots step within STEP_S, from the instant on. A dummy
-PULSE source puts ngspice's time points on the sample instants, where it would otherwise interpolate.
+Op-amps and pots are instances of the subcircuits in LIBRARY, with their datasheet numbers as parameters; an op-amp
+follows the same law there as in the engine. The deck starts from the initial conditions (uic). A pot that is turned has
+a fourth node, whose voltage is its dial. Sources and dials step within STEP_S, from the instant on. A dummy PULSE
+source puts ngspice's time points on the sample instants, where it would otherwise interpolate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import (
-    GROUND,
-    Capacitor,
-    Circuit,
-    DiodeLimiter,
-    Element,
-    OpAmp,
-    Pot,
-    Resistor,
-    Switch,
-    VoltageSource,
-)
+from .circuit import Capacitor, Circuit, DiodeLimiter, Element, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .errors import CircuitError
 from .excitation import TICKS_PER_SAMPLE, Edges
-from .opamp import CLAMP_RATE, OpAmpModel
-from .pot import legs_ohm
+from .opamp import CLAMP_RATE
+from .pot import END_FRACTION
 
-__all__ = ["STEP_S", "Accuracy", "to_spice"]
+__all__ = ["LIBRARY", "LIMITLESS", "STEP_S", "Accuracy", "to_spice"]
 
 STEP_S = 1e-11
 """Rise time of every step in a deck, far below anything the circuits resolve."""
 
-_STATE_FARAD = 1e-10
-"""Capacitance that holds an op-amp's state in the deck; it only scales the currents to sizes that ngspice's tolerances
-suit (mA at full slew)."""
+LIMITLESS = 1e99
+"""What stands for infinity in a deck."""
 
-_NULLOR_GAIN = 1e9
+LIBRARY: Mapping[str, str] = MappingProxyType(
+    {
+        # The capacitance only scales the currents to sizes that ngspice's tolerances suit (mA at full slew). An output
+        # without resistance gets 0.1 mOhm, 1 uV at 10 mA.
+        "opamp": f"""\
+.subckt opamp plus minus out avol=2e5 gbw=3e6 slew=13e6 swing_low=-13.5 swing_high=13.5 rout=100 vos=0
+Cstate state 0 1e-10
+Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}},
++ {2 * math.pi!r} * {{gbw}} * (v(plus, minus) + {{vos}} - v(state) / {{avol}})))
++ - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}})))
+Einner inner 0 state 0 1
+Rout inner out {{max(rout, 1e-4)}}
+.ends""",
+        "opamp_without_pole": """\
+.subckt opamp_without_pole plus minus out avol=1e99 rout=0 vos=0
+Binner inner 0 V = {min(avol, 1e9)} * (v(plus, minus) + {vos})
+Rout inner out {max(rout, 1e-4)}
+.ends""",
+        "pot": f"""\
+.subckt pot top wiper bottom track=10k dial=0.5
+Rupper top wiper {{max(1 - dial, {END_FRACTION!r}) * track}}
+Rlower wiper bottom {{max(dial, {END_FRACTION!r}) * track}}
+.ends""",
+        "turned_pot": f"""\
+.subckt turned_pot top wiper bottom dial track=10k
+Bupper top wiper I = v(top, wiper) / (max(1 - v(dial), {END_FRACTION!r}) * {{track}})
+Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{track}})
+.ends""",
+        "diode_limiter": """\
+.subckt diode_limiter a b threshold=0 on=1 off=1g
+Roff a b {off}
+Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
+.ends""",
+        "switch": """\
+.subckt switch a b on=1 off=1g closed=1
+Rab a b {closed * on + (1 - closed) * off}
+.ends""",
+        "time_points": """\
+.subckt time_points node period=5e-5
+Vnode node 0 PULSE(0 1 0 1n 1n {period / 2} {period})
+.ends""",
+    }
+)
+"""The subcircuits of which decks are made, by name."""
 
 _WRAP = 8
 
@@ -67,126 +101,174 @@ def to_spice(
     sample_rate_hz: float = 20e3,
     edges: Mapping[str, Edges] | None = None,
     turns: Sequence[tuple[int, Mapping[str, float]]] = (),
+    initial_v: Mapping[str, float] | None = None,
     nodes: Sequence[str] | None = None,
     accuracy: Accuracy | None = None,
     title: str = "analogue computer",
 ) -> str:
-    """The deck of a circuit played for that many samples from zero state.
+    """The deck of a circuit played for that many samples; without .tran when there are none.
 
     edges: by input, from tick 0 on (an input without any stays at 0 V). turns: (sample, dials by pot), effective right
-    after that sample.
-    nodes: which voltages are saved, all when None. Raises CircuitError for an input, pot or node that is not there.
+    after that sample. initial_v: volts of states (capacitors, op-amps with a pole) at sample 0, 0 V where not given.
+    nodes: which voltages are saved, all when None.
+    Raises CircuitError for an input, pot, state or node that is not there, or whose name SPICE does not allow.
     """
-    accuracy = accuracy or Accuracy()
-    period_s = 1.0 / sample_rate_hz
-    edges = edges or {}
-    _check(circuit, edges, turns, nodes)
-    lines = [f"* {title}"]
-    for element in circuit.elements:
-        lines += _element(element, edges, turns, period_s)
-    lines += [
-        "* time points on the samples",
-        f"Vtimepoints timepoints 0 PULSE(0 1 0 1n 1n {_number(0.5 * period_s)} {_number(period_s)})",
-        ".save " + " ".join(f"v({node})" for node in (circuit.nodes if nodes is None else nodes)),
-        f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}",
-        f".options trtol={accuracy.trtol:g}",
-        f".tran {_number(period_s)} {_number((samples - 1) * period_s)} 0 {_number(accuracy.max_step_s)} uic",
-        ".end",
-    ]
-    return "\n".join(lines) + "\n"
+    writer = _Writer(circuit, 1.0 / sample_rate_hz, edges or {}, turns, initial_v or {})
+    writer.check(nodes)
+    return "\n".join(writer.lines(samples, accuracy or Accuracy(), nodes, title)) + "\n"
 
 
-def _check(
-    circuit: Circuit,
-    edges: Mapping[str, Edges],
-    turns: Sequence[tuple[int, Mapping[str, float]]],
-    nodes: Sequence[str] | None,
-) -> None:
-    inputs = {source.name for source in circuit.of(VoltageSource) if source.dc_v is None}
-    for name in edges:
-        if name not in inputs:
-            raise CircuitError(f"no input is called {name!r}; there are {', '.join(sorted(inputs)) or 'none'}")
-    for _, dials in turns:
-        circuit.with_dials(dials)
-    for node in nodes or ():
-        if node not in circuit.nodes:
-            raise CircuitError(f"no node is called {node!r}; there are {', '.join(circuit.nodes)}")
+class _Writer:
+    def __init__(
+        self,
+        circuit: Circuit,
+        period_s: float,
+        edges: Mapping[str, Edges],
+        turns: Sequence[tuple[int, Mapping[str, float]]],
+        initial_v: Mapping[str, float],
+    ) -> None:
+        self._circuit = circuit
+        self._period_s = period_s
+        self._edges = edges
+        self._turns = turns
+        self._initial_v = initial_v
+        self._taken = {name.lower() for name in circuit.nodes}
+        self._taken |= {_card(_LETTERS[type(element)], element.name).lower() for element in circuit.elements}
+        self._used: dict[str, None] = {}
+
+    def check(self, nodes: Sequence[str] | None) -> None:
+        circuit = self._circuit
+        _known("input", self._edges, [source.name for source in circuit.of(VoltageSource) if source.dc_v is None])
+        for _, dials in self._turns:
+            circuit.with_dials(dials)
+        amps = [amp.name for amp in circuit.of(OpAmp) if amp.model.has_state]
+        _known("state", self._initial_v, [*(capacitor.name for capacitor in circuit.of(Capacitor)), *amps])
+        _known("node", nodes or (), circuit.nodes)
+        for node in circuit.nodes:
+            if node.lower() == "gnd":
+                raise CircuitError(f"node {node}: SPICE takes this name for ground; call it otherwise")
+
+    def lines(self, samples: int, accuracy: Accuracy, nodes: Sequence[str] | None, title: str) -> Iterator[str]:
+        elements = [line for element in self._circuit.elements for line in self._element(element)]
+        clock = self._instance("time_points", self._free("Xclock"), (self._free("clock"),), period=self._period_s)
+        yield f"* {' '.join(title.split())}".encode("ascii", "replace").decode()
+        for name in self._used:
+            yield LIBRARY[name]
+        yield from elements
+        yield "* time points on the samples"
+        yield clock
+        yield from self._initial_conditions()
+        yield ".save " + " ".join(f"v({node})" for node in (self._circuit.nodes if nodes is None else nodes))
+        yield f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}"
+        yield f".options trtol={accuracy.trtol:g}"
+        if samples > 0:
+            stop_s = (samples - 1) * self._period_s
+            yield f".tran {_number(self._period_s)} {_number(stop_s)} 0 {_number(accuracy.max_step_s)} uic"
+        yield ".end"
+
+    def _element(self, element: Element) -> Iterator[str]:
+        card = _card(_LETTERS[type(element)], element.name)
+        match element:
+            case Resistor(a=a, b=b, ohm=ohm):
+                yield f"{card} {a} {b} {_number(ohm)}"
+            case Capacitor(name=name, a=a, b=b, farad=farad):
+                initial = f" IC={_number(self._initial_v[name])}" if name in self._initial_v else ""
+                yield f"{card} {a} {b} {_number(farad)}{initial}"
+            case VoltageSource(name=name, plus=plus, minus=minus, dc_v=None):
+                levels = _levels(self._edges.get(name, Edges.none()), self._period_s)
+                yield from _stepped(f"{card} {plus} {minus}", *levels)
+            case VoltageSource(plus=plus, minus=minus, dc_v=volts):
+                yield f"{card} {plus} {minus} DC {_number(volts or 0.0)}"
+            case Pot():
+                yield from self._pot(card, element)
+            case OpAmp():
+                yield self._opamp(card, element)
+            case DiodeLimiter(threshold_v=volts, on_ohm=on, off_ohm=off):
+                yield self._instance("diode_limiter", card, element.nodes, threshold=volts, on=on, off=off)
+            case Switch(on_ohm=on, off_ohm=off, closed=closed):
+                yield self._instance("switch", card, element.nodes, on=on, off=off, closed=closed)
+
+    def _pot(self, card: str, pot: Pot) -> Iterator[str]:
+        turns = [(sample, dials[pot.name]) for sample, dials in self._turns if pot.name in dials]
+        if not turns:
+            yield self._instance("pot", card, pot.nodes, track=pot.track_ohm, dial=pot.dial)
+            return
+        dial = self._free(f"dial_{pot.name}")
+        times_s = np.array([0.0] + [sample * self._period_s for sample, _ in turns])
+        dials = np.array([pot.dial] + [setting for _, setting in turns])
+        yield from _stepped(f"{self._free(f'V_{dial}')} {dial} 0", times_s, dials)
+        yield self._instance("turned_pot", card, (*pot.nodes, dial), track=pot.track_ohm)
+
+    def _opamp(self, card: str, amp: OpAmp) -> str:
+        model = amp.model
+        if not model.has_state:
+            values = {"avol": model.avol, "rout": model.rout_ohm, "vos": model.vos_v}
+            return self._instance("opamp_without_pole", card, amp.nodes, **values)
+        low, high = model.swing_v
+        return self._instance(
+            "opamp",
+            card,
+            amp.nodes,
+            avol=model.avol,
+            gbw=model.gbw_hz,
+            slew=model.slew_v_per_s,
+            swing_low=low,
+            swing_high=high,
+            rout=model.rout_ohm,
+            vos=model.vos_v,
+        )
+
+    def _instance(self, subcircuit: str, card: str, nodes: Sequence[str], **values: float) -> str:
+        self._used[subcircuit] = None
+        return " ".join([card, *nodes, subcircuit, *(f"{name}={_number(value)}" for name, value in values.items())])
+
+    def _initial_conditions(self) -> Iterator[str]:
+        for amp in self._circuit.of(OpAmp):
+            if amp.name in self._initial_v:
+                yield f".ic v({_card('X', amp.name)}.state)={_number(self._initial_v[amp.name])}"
+
+    def _free(self, name: str) -> str:
+        """The name itself, or with as many underscores as make it one that nothing else in the deck has."""
+        while name.lower() in self._taken:
+            name += "_"
+        self._taken.add(name.lower())
+        return name
 
 
-def _element(
-    element: Element, edges: Mapping[str, Edges], turns: Sequence[tuple[int, Mapping[str, float]]], period_s: float
-) -> Iterator[str]:
-    name = element.name
-    match element:
-        case Resistor(a=a, b=b, ohm=ohm):
-            yield f"R_{name} {a} {b} {_number(ohm)}"
-        case Capacitor(a=a, b=b, farad=farad):
-            yield f"C_{name} {a} {b} {_number(farad)}"
-        case VoltageSource(plus=plus, minus=minus, dc_v=None):
-            yield from _stepped(f"V_{name} {plus} {minus}", *_levels(edges.get(name, Edges.none()), period_s))
-        case VoltageSource(plus=plus, minus=minus, dc_v=volts):
-            yield f"V_{name} {plus} {minus} DC {_number(volts or 0.0)}"
-        case Pot():
-            yield from _pot(element, [(sample, dials[name]) for sample, dials in turns if name in dials], period_s)
-        case OpAmp():
-            yield from _opamp(element)
-        case DiodeLimiter(a=a, b=b, threshold_v=threshold_v, off_ohm=off_ohm):
-            beyond = f"max(0, {_difference(a, b)} - ({_number(threshold_v)}))"
-            yield f"R_{name}_off {a} {b} {_number(off_ohm)}"
-            yield f"B_{name} {a} {b} I = {_number(element.excess_siemens)} * {beyond}"
-        case Switch(a=a, b=b, closed=closed):
-            yield f"R_{name} {a} {b} {_number(element.ohm(closed=closed))}"
+_LETTERS: Mapping[type, str] = {
+    Resistor: "R",
+    Capacitor: "C",
+    VoltageSource: "V",
+    Pot: "X",
+    OpAmp: "X",
+    DiodeLimiter: "X",
+    Switch: "X",
+}
 
 
-def _pot(pot: Pot, turns: list[tuple[int, float]], period_s: float) -> Iterator[str]:
-    if not turns:
-        upper_ohm, lower_ohm = legs_ohm(pot.dial, pot.track_ohm)
-        yield f"R_{pot.name}_upper {pot.top} {pot.wiper} {_number(upper_ohm)}"
-        yield f"R_{pot.name}_lower {pot.wiper} {pot.bottom} {_number(lower_ohm)}"
-        return
-    upper_s, lower_s = f"upper_{pot.name}", f"lower_{pot.name}"
-    times_s = np.array([0.0] + [sample * period_s for sample, _ in turns])
-    legs = np.array([legs_ohm(dial, pot.track_ohm) for dial in [pot.dial] + [dial for _, dial in turns]])
-    # Voltages that stand for the legs' conductances in mS.
-    yield from _stepped(f"V_{pot.name}_upper {upper_s} 0", times_s, 1e3 / legs[:, 0])
-    yield from _stepped(f"V_{pot.name}_lower {lower_s} 0", times_s, 1e3 / legs[:, 1])
-    yield f"B_{pot.name}_upper {pot.top} {pot.wiper} I = 1e-3 * v({upper_s}) * {_difference(pot.top, pot.wiper)}"
-    yield f"B_{pot.name}_lower {pot.wiper} {pot.bottom} I = 1e-3 * v({lower_s}) * {_difference(pot.wiper, pot.bottom)}"
+def _card(letter: str, name: str) -> str:
+    """The name of an element's card: its own where that begins as SPICE wants it, else with the letter and _ before it.
+
+    A name like R_1 gets them too, so that whoever takes the prefix off again has the name.
+    """
+    begins = name[:1].upper() == letter and name[1:2] != "_"
+    return name if begins else f"{letter}_{name}"
 
 
-def _opamp(amp: OpAmp) -> Iterator[str]:
-    model, inner, driven = amp.model, f"{amp.name}_v", amp.out if amp.model.rout_ohm == 0 else f"{amp.name}_r"
-    difference = f"({_difference(amp.plus, amp.minus)} + {_number(model.vos_v)})"
-    if model.has_state:
-        yield f"C_{amp.name} {inner} 0 {_number(_STATE_FARAD)}"
-        yield f"B_{amp.name} 0 {inner} I = {_number(_STATE_FARAD)} * ({_slope(model, difference, f'v({inner})')})"
-        yield f"E_{amp.name} {driven} 0 {inner} 0 1"
-    else:
-        yield f"B_{amp.name} {driven} 0 V = {_number(min(model.avol, _NULLOR_GAIN))} * {difference}"
-    if model.rout_ohm > 0:
-        yield f"R_{amp.name}_out {driven} {amp.out} {_number(model.rout_ohm)}"
-
-
-def _slope(model: OpAmpModel, difference: str, state: str) -> str:
-    """The law of opamp.py as an expression."""
-    slope = f"{_number(model.gain_rate)} * {difference} - {_number(model.leak_rate)} * {state}"
-    if model.slews:
-        slew = _number(model.slew_v_per_s)
-        slope = f"max(-{slew}, min({slew}, {slope}))"
-    low, high = model.swing_v
-    if np.isfinite(high):
-        slope += f" - {_number(CLAMP_RATE)} * max(0, {state} - {_number(high)})"
-    if np.isfinite(low):
-        slope += f" - {_number(CLAMP_RATE)} * min(0, {state} - ({_number(low)}))"
-    return slope
+def _known(what: str, names: Iterable[str], there: Sequence[str]) -> None:
+    for name in names:
+        if name not in there:
+            raise CircuitError(f"no {what} is called {name!r}; there are {', '.join(there) or 'none'}")
 
 
 def _levels(edges: Edges, period_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Instants in s and levels, beginning at 0 s."""
+    """Instants in s and levels, beginning at 0 s; without levels that do not last as long as a step takes."""
     times_s = edges.ticks.astype(np.float64) * (period_s / TICKS_PER_SAMPLE)
+    lasting = np.append(times_s[1:] > times_s[:-1] + STEP_S, True)[: times_s.size]
+    times_s, levels_v = times_s[lasting], edges.levels_v[lasting]
     if times_s.size and times_s[0] <= 0:
-        return times_s, edges.levels_v
-    return np.append(0.0, times_s), np.append(0.0, edges.levels_v)
+        return times_s, levels_v
+    return np.append(0.0, times_s), np.append(0.0, levels_v)
 
 
 def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[str]:
@@ -200,11 +282,5 @@ def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64
     yield "+ )"
 
 
-def _difference(a: str, b: str) -> str:
-    if b == GROUND:
-        return f"v({a})"
-    return f"(v({a}) - v({b}))" if a != GROUND else f"(-v({b}))"
-
-
 def _number(value: float) -> str:
-    return repr(float(value))
+    return repr(float(value) if math.isfinite(value) else math.copysign(LIMITLESS, value))

@@ -91,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_replay(commands)
     _add_emulate(commands)
     _add_effects(commands)
+    _add_netlist(commands)
     return parser
 
 
@@ -150,6 +151,14 @@ def _add_effects(commands: Any) -> None:
     command.add_argument("--out", type=Path, metavar="FILE", help="also draw it, as an .svg file")
     command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     command.set_defaults(command=_effects)
+
+
+def _add_netlist(commands: Any) -> None:
+    command = commands.add_parser("netlist", help="the emulated computer as a SPICE deck, which ngspice runs unchanged")
+    _add_what_to_play(command)
+    command.add_argument("--out", type=Path, metavar="FILE", help="where the deck goes (default: standard output)")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    command.set_defaults(command=_netlist)
 
 
 def _add_what_to_play(command: argparse.ArgumentParser) -> None:
@@ -314,7 +323,29 @@ def _effects(arguments: argparse.Namespace) -> int:
     table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
     if arguments.out is not None:
         effects.write_picture(table, arguments.out)
-    print(json.dumps(effects.as_json(table)) if arguments.json else effects.text(table))
+    _print(json.dumps(effects.as_json(table)) if arguments.json else effects.text(table))
+    return PASSED
+
+
+def _netlist(arguments: argparse.Namespace) -> int:
+    from harness.netlist import netlist
+    from harness.rig import open_rig
+    from harness.storage import replacing
+
+    with open_rig(arguments.rig) as rig:
+        scenario, seed = _what_to_play(rig, arguments)
+        deck = netlist(rig, scenario, seed)
+    text = deck.text()
+    if arguments.out is not None:
+        with replacing(arguments.out) as file:
+            file.write(text.encode("ascii"))
+    if arguments.json:
+        where = {"deck": text} if arguments.out is None else {"file": str(arguments.out)}
+        _print(json.dumps({**where, "samples": deck.samples, "seed": seed}))
+    elif arguments.out is None:
+        _print(text.rstrip("\n"))
+    else:
+        _print(f"{arguments.out}: {deck.samples} samples; run it with: ngspice -b -r out.raw {arguments.out}")
     return PASSED
 
 

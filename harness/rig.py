@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from emulator import (
     Card,
     Components,
     EmulatorError,
+    Excitation,
     NoisySuspension,
     OpAmpGrade,
     Sampler,
@@ -172,7 +173,7 @@ class CardDescription:
                 )
         if not 1.0 <= self.rate_hz <= MOST_RATE_HZ:
             raise ValueError(f"rate_hz must be 1 to {MOST_RATE_HZ:g}, not {self.rate_hz:g}")
-        if not 0.0 <= self.noise_lsb <= MOST_NOISE_LSB:
+        if self.noise_lsb is not None and not 0.0 <= self.noise_lsb <= MOST_NOISE_LSB:
             raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {self.noise_lsb:g}")
 
     def card(self) -> Card:
@@ -217,6 +218,14 @@ class _Stream(enum.IntEnum):
         return np.random.default_rng([seed, int(self)])
 
 
+class SetUp(NamedTuple):
+    """A computer, and what is to be played on it."""
+
+    computer: SuspensionComputer
+    excitation: Excitation
+    tweaks: tuple[tuple[int, dict[str, float]], ...]
+
+
 class EmulatorRig:
     """The emulated analogue computer and its card."""
 
@@ -231,7 +240,11 @@ class EmulatorRig:
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
 
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
+    def set_up(self, scenario: Scenario, seed: int) -> SetUp:
+        """The machine as the scenario starts it, and what will be played on it.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        """
         with _emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
@@ -241,6 +254,10 @@ class EmulatorRig:
                 settings = _settings(tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings))
+        return SetUp(computer, excitation, tuple(tweaks))
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        computer, excitation, tweaks = self.set_up(scenario, seed)
         with _emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
             jitter = _Stream.APERTURE.generator(seed)

@@ -84,13 +84,13 @@ def test_slewing_and_clamping_amplifiers_agree_with_ngspice(ngspice: NgSpice) ->
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(50))
 def test_random_machines_agree_with_ngspice_at_every_amplifier(ngspice: NgSpice, seed: int) -> None:
-    """Parts, op-amps, pots turned, edges at any instant: all drawn."""
+    """Parts, op-amps, pots turned, edges at any instant: all drawn from the seed in the test's name."""
     rng = np.random.default_rng(seed)
     computer = random_machine(rng)
     excitation = random_excitation(rng)
-    samples = 200
+    samples = 70
     instants = np.sort(rng.choice(samples - 10, 3, replace=False)).tolist()
     turns = [(int(instant), {str(rng.choice(["M", "B", "K"])): rng.uniform(0.1, 1.0)}) for instant in instants]
     edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)

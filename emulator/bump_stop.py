@@ -1,0 +1,48 @@
+"""A third program: the suspension with a bump stop, a second spring that it meets towards the end of its travel.
+
+    M x'' + B x' + K x + K_stop max(0, x - x_stop) = F
+
+A diode limiter from the summer's input to -e_x does it: beyond its threshold it draws (e_x - e_stop) / R_on, as one
+more input of the summer. Everything else is the program it is added to, with its scales.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from .circuit import Circuit, DiodeLimiter
+from .errors import CircuitError
+from .suspension import Program, SuspensionComputer
+
+__all__ = ["BumpStop"]
+
+
+@dataclass(frozen=True)
+class BumpStop:
+    """Where the stop is met, and how stiff it is; off_ohm: of its limiter before it is met.
+
+    The defaults suit the front suspension: 60 kN/m from 0.1 m on, in the machine 24.55k from 5.01 V on.
+    Raises CircuitError for values that are not positive and finite.
+    """
+
+    stop_m: float = 0.1
+    stiffness_n_per_m: float = 60e3
+    off_ohm: float = 1e9
+
+    def __post_init__(self) -> None:
+        for name in ("stop_m", "stiffness_n_per_m", "off_ohm"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise CircuitError(f"bump stop: {name} must be positive and finite, got {value!r}")
+
+    def limiter(self, program: Program) -> DiodeLimiter:
+        """The element between the nodes of a program of the suspension, on its scales."""
+        scales = program.scales
+        spring_at_rfb_n_per_m = scales.force_n / scales.displacement_m
+        on_ohm = program.parts.rfb_ohm * spring_at_rfb_n_per_m / self.stiffness_n_per_m
+        return DiodeLimiter("STOP", "s1", "u3", self.stop_m * scales.volts("displacement"), on_ohm, self.off_ohm)
+
+    def added_to(self, computer: SuspensionComputer) -> Circuit:
+        """The circuit of a computer, its pots as they are set, with the stop."""
+        return Circuit((*computer.circuit.elements, self.limiter(computer.program)))

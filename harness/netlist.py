@@ -1,0 +1,28 @@
+"""The emulated computer as a SPICE deck: what a rig and a scenario make of it, for any other simulator."""
+
+from __future__ import annotations
+
+from emulator import TICKS_PER_SAMPLE, Deck
+from emulator.suspension import SOURCE
+from harness.errors import ConfigurationError
+from harness.rig import EmulatorRig, Rig
+from harness.scenario import Scenario
+
+
+def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
+    """The circuit as the scenario sets it, with the components that the seed draws, its excitation and its tweaks.
+
+    :raises ConfigurationError: the scenario cannot be played on this rig, or the rig has no circuit.
+    """
+    if not isinstance(rig, EmulatorRig):
+        raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
+    setup = rig.set_up(scenario, seed)
+    rate_hz = setup.computer.sample_rate_hz
+    return Deck(
+        setup.computer.circuit,
+        samples=scenario.samples,
+        sample_rate_hz=rate_hz,
+        edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
+        turns=[(sample, setup.computer.dials_for(**settings)) for sample, settings in setup.tweaks],
+        title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
+    )
