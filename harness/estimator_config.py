@@ -42,7 +42,7 @@ class EstimatorConfig:
     nb: int = 3
     nk: int = 0
     offset: bool = True
-    forgetting: float = 0.99
+    forgetting: float = 0.9925
     p0: float = 10.0
     p0_offset: float = 1.0e6
     """codes^2"""

@@ -288,7 +288,7 @@ est_config_t est_config_default(void) {
         .nb             = (uint8_t)DEFAULT_NB,
         .nk             = 0U,
         .offset         = true,
-        .forgetting     = 0.99F,
+        .forgetting     = 0.9925F,
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,

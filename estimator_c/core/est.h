@@ -205,7 +205,7 @@ typedef struct {
 } est_t;
 
 /// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C fixed at
-/// (1 - 0.8 z^-1)^2, forgetting 0.99, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
+/// (1 - 0.8 z^-1)^2, forgetting 0.9925, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
 est_config_t est_config_default(void);
 
 /// Makes the estimator ready for the first sample: theta zero, P = P0, counters zero.
