@@ -29,6 +29,10 @@ static void count(uint32_t* const counter) { *counter += (*counter < UINT32_MAX)
 #define DEFAULT_NA ((EST_NA_MAX < 2U) ? EST_NA_MAX : 2U)
 #define DEFAULT_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
 
+/// How much less certain a slip leaves every parameter: enough for b's whose covariance is that of their neighbours (10 is
+/// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
+#define SLIP_DOUBT 1000.0F
+
 // ---------------------------------------------      U-D FACTORS      ---------------------------------------------
 
 /// The part of column j of U above its diagonal: rows 0 .. j-1.
@@ -260,16 +264,43 @@ static float update_estimate(est_t* const self, const float* const phi, const fl
     return alpha / self->config.forgetting;
 }
 
-static void react(est_t* const self, const est_finding_t finding) {
-    if (finding == EST_QUIET) {
+/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
+/// did on u(k), or the other way round. The statistic goes on as this reading has it, so that a change is not lost in it.
+static void follow_slip(est_t* const self) {
+    const uint8_t nb = self->config.nb;
+    float* const  b  = &self->theta[self->past + self->config.na];
+    for (uint8_t i = self->past; i < self->dim; i++) {
+        self->theta[i] = self->edges.theta[i];
+        self->d[i]     = limited(self, i, self->d[i] * SLIP_DOUBT);
+    }
+    if (est_trigger_settle_late(&self->trigger)) {
+        shift(b, nb, 0.0F);
         return;
     }
-    count((finding == EST_ALARM) ? &self->counters.alarms : &self->counters.slips);
-    if ((finding == EST_ALARM) && (self->config.trigger.reset == EST_RESET_ALL)) {
+    for (uint8_t j = 0U; j < nb; j++) {
+        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
+    }
+}
+
+static void estimate_afresh(est_t* const self) {
+    if (self->config.trigger.reset == EST_RESET_ALL) {
         zero(self->theta, self->dim);
     }
     reset_covariance(self, self->dim);
     est_trigger_restart(&self->trigger, self->config.trigger.hold_off_n);
+}
+
+static void react(est_t* const self, const est_finding_t finding) {
+    if (finding == EST_QUIET) {
+        return;
+    }
+    if (finding == EST_ALARM) {
+        count(&self->counters.alarms);
+        estimate_afresh(self);
+    } else {
+        count(&self->counters.slips);
+        follow_slip(self);
+    }
     self->running = false;  // the filters remember the plant, or the clock, as it was
 }
 

@@ -77,6 +77,13 @@ est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger
     return EST_QUIET;
 }
 
+bool est_trigger_settle_late(est_trigger_t* const self) {
+    const bool late = self->rival[1] < self->rival[0];
+    self->statistic = late ? self->rival[1] : self->rival[0];
+    est_trigger_begin_doubt(self);
+    return late;
+}
+
 bool est_trigger_in_doubt(const est_trigger_t* const self) {
     return (self->rival[0] < self->statistic) || (self->rival[1] < self->statistic);
 }

@@ -25,6 +25,9 @@ void est_trigger_begin_doubt(est_trigger_t* self);
 /// had already passed the ceiling, another reading explained them: a slip. Else the statistic goes on from the best reading.
 est_finding_t est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
 
+/// Makes the best of the other readings the statistic; true iff it is the one in which the edges came late.
+bool est_trigger_settle_late(est_trigger_t* self);
+
 /// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
 bool est_trigger_in_doubt(const est_trigger_t* self);
 
