@@ -141,6 +141,21 @@ def test_edges_that_cross_a_sampling_instant_raise_no_alarm(estimator: Estimator
     assert len(estimator.run(u, y).alarms) == 1, "without the second look it is a false alarm"
 
 
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+@pytest.mark.parametrize("after_n", [2, 6, 10])
+def test_change_soon_after_a_crossing_is_still_noticed(estimator: Estimator, slip: int, after_n: int) -> None:
+    """The stiffness falls while the edge at sample 910 is still in doubt; the next edge comes at 960."""
+    edges = np.arange(10.0, 1800.0, 50.0)
+    edges = edges + (edges - 900.0) * 20e-6 * slip
+    changes = [(0, FRONT), (910 + after_n, (115.0, 3021.0, 18000.0))]
+    for seed in range(5):
+        u, y = suspension(changes, edges, 1800, 1.0, seed)
+        assert estimator.init()
+        alarms = estimator.run(u, y).alarms
+        assert len(alarms) >= 1
+        assert 910 + after_n < alarms[0] < 1010
+
+
 @pytest.mark.parametrize("lag_n", [2, 5, 11])
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
 def test_gap_while_edges_are_in_doubt_raises_no_alarm(estimator: Estimator, slip: int, lag_n: int) -> None:
