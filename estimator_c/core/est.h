@@ -2,11 +2,11 @@
 ///
 /// The model, in sampled codes y (output) and u (input):
 ///
-///     y(k) = -a1 y(k-1) - ... - a_na y(k-na) + b_0 u(k-nk) + ... + b_(nb-1) u(k-nk-nb+1) + C(1) d + C(z) e(k)
+///     y(k) = -a1 y(k-1) - ... - a_na y(k-na) + b_0 u(k-nk) + ... + b_(nb-1) u(k-nk-nb+1) [+ d] + C(z) e(k)
 ///
-/// theta = (a1 .. a_na, b_0 .. b_(nb-1) [, d]) is estimated by Bierman's U-D factorised least squares on the signals
-/// filtered by 1/C; a trigger watches the innovation and tells when theta has jumped. Missing samples are survived.
-/// estimator_c/README.md derives it; this header says how to use it.
+/// theta = (a1 .. a_na, b_0 .. b_(nb-1) [, c_1 .. c_nc] [, d]) is estimated by Bierman's U-D factorised least squares on
+/// the equation whitened by 1/C; a trigger watches the innovation and tells when theta has jumped. Missing samples are
+/// survived. estimator_c/README.md derives it; this header says how to use it.
 ///
 /// The library is freestanding C99 in float32: no heap, no libm, no globals, no recursion. The caller owns the state;
 /// any number of instances may live side by side. It is not thread-safe: one instance belongs to one context, which
@@ -16,8 +16,8 @@
 ///
 /// Typical use:
 ///
-///     est_config_t config = est_config_default();
-///     est_t estimator;
+///     static est_t estimator;
+///     const est_config_t config = est_config_default();
 ///     if (!est_init(&estimator, &config)) { ... a value of config is out of range ... }
 ///     for (;;) {
 ///         const est_step_t step = est_step(&estimator, (est_sample_t){ .u = force, .y = displacement, .valid = true });
@@ -40,7 +40,7 @@ extern "C" {
 #define EST_VERSION_MAJOR 0
 #define EST_VERSION_MINOR 1
 
-/// The largest orders that est_init() accepts. They fix the size of est_t; override them with -D to save RAM.
+/// The largest orders that est_init() accepts, and the most parameters. They fix the size of est_t; override them with -D.
 #ifndef EST_NA_MAX
 #define EST_NA_MAX 2U
 #endif
@@ -50,19 +50,21 @@ extern "C" {
 #ifndef EST_NK_MAX
 #define EST_NK_MAX 1U
 #endif
-#if (EST_NA_MAX < 1) || (EST_NA_MAX > 8) || (EST_NB_MAX < 1) || (EST_NB_MAX > 8) || (EST_NK_MAX > 8)
-#error "EST_NA_MAX and EST_NB_MAX must be in the range [1, 8], EST_NK_MAX in [0, 8]"
+#ifndef EST_NC_MAX
+#define EST_NC_MAX 2U
+#endif
+#ifndef EST_THETA_MAX
+#define EST_THETA_MAX 6U
+#endif
+#if (EST_NA_MAX < 1) || (EST_NA_MAX > 8) || (EST_NB_MAX < 1) || (EST_NB_MAX > 8) || (EST_NK_MAX > 8) || (EST_NC_MAX > 8)
+#error "EST_NA_MAX and EST_NB_MAX must be in the range [1, 8], EST_NK_MAX and EST_NC_MAX in [0, 8]"
+#endif
+#if (EST_THETA_MAX < 2) || (EST_THETA_MAX > 25)
+#error "EST_THETA_MAX must be in the range [2, 25]"
 #endif
 
-/// The samples before a (re)start that the model reaches back to, at most; each is one unknown initial condition.
+/// The samples that the longest model reaches back to.
 #define EST_INPUT_PAST_MAX (EST_NB_MAX + EST_NK_MAX - 1U)
-#define EST_PAST_MAX ((EST_NA_MAX > EST_INPUT_PAST_MAX) ? EST_NA_MAX : EST_INPUT_PAST_MAX)
-
-/// The most parameters theta can have: a's, b's and the offset.
-#define EST_THETA_MAX (EST_NA_MAX + EST_NB_MAX + 1U)
-
-/// The dimension of the least-squares problem: the initial conditions first, then theta.
-#define EST_DIM_MAX (EST_PAST_MAX + EST_THETA_MAX)
 
 /// The change triggers.
 typedef enum {
@@ -75,6 +77,8 @@ typedef enum {
     /// Cumulative sum of the normalised squared innovation; ceiling = ln(ARL0), the logarithm of the wanted mean
     /// number of samples between false alarms. The default.
     EST_TRIGGER_CUSUM = 3,
+    /// The caller's own: see est_trigger_config_t.
+    EST_TRIGGER_CUSTOM = 4,
 } est_trigger_kind_t;
 
 /// What an alarm does to the estimate.
@@ -85,13 +89,20 @@ typedef enum {
     EST_RESET_ALL = 1,
 } est_reset_t;
 
+/// A trigger of the caller's own: takes in one innovation [codes] and its predicted variance [codes^2] and returns its
+/// statistic, which raises an alarm when it reaches the ceiling. `anew` is true for the first innovation after est_init()
+/// and after an alarm. Nothing else of the estimator is its business.
+typedef float (*est_trigger_fn)(void* context, float innovation, float variance, bool anew);
+
 typedef struct {
     est_trigger_kind_t kind;
-    float              ceiling;     ///< [codes] for the first two kinds, ln(ARL0) for the cumulative sum; > 0
-    uint16_t           hold_off_n;  ///< valid samples after an alarm in which the statistic is held at zero
-    uint16_t           warm_up_n;   ///< valid samples after est_init() in which the statistic is held at zero
-    bool               absolute;    ///< the mean between faults averages |innovation| instead of the innovation
     est_reset_t        reset;
+    bool               absolute;    ///< the mean between faults averages |innovation| instead of the innovation
+    uint16_t           hold_off_n;  ///< innovations after an alarm in which the statistic is held at zero
+    uint16_t           warm_up_n;   ///< innovations after est_init() in which the statistic is held at zero
+    float              ceiling;     ///< [codes] for the first two kinds, ln(ARL0) for the cumulative sum; > 0
+    est_trigger_fn     custom;      ///< used by EST_TRIGGER_CUSTOM, with the context
+    void*              context;
 } est_trigger_config_t;
 
 /// Where between two sampling instants the edges of u come. The sampled u does not tell.
@@ -102,25 +113,35 @@ typedef enum {
     /// or later than before, and no alarm is raised for that alone. For a generator on a clock of its own whose period is
     /// a whole number of samples, to some 20 ppm: the forgetting must follow what the drift does to the b's.
     EST_EDGES_MAY_SLIP = 1,
-    /// Anywhere, and each elsewhere: what an edge did to the plant within its interval is unknown, so that each begins the
-    /// past anew. For any generator; costs some 10 % of latency.
+    /// Anywhere, and each elsewhere: what an edge did to the plant within its interval is unknown, so that the na equations
+    /// that involve it are left out. For any generator; costs some 10 % of latency.
     EST_EDGES_ANYWHERE = 2,
 } est_edge_instants_t;
 
 /// Everything that is fixed before a run. P is in units of the noise variance of y: P = 10 means a prior standard
 /// deviation of sqrt(10) times that of the noise.
 typedef struct {
-    uint8_t na;      ///< order of A, 1 .. EST_NA_MAX
-    uint8_t nb;      ///< number of b's, 1 .. EST_NB_MAX
-    uint8_t nk;      ///< delay of the first b; 0 is the direct term y(k) <- u(k), which a free-running generator needs
-    bool    offset;  ///< estimate the constant d as well
+    uint8_t na;               ///< order of A, 1 .. EST_NA_MAX
+    uint8_t nb;               ///< number of b's, 1 .. EST_NB_MAX
+    uint8_t nk;               ///< delay of the first b, 0 .. EST_NK_MAX; 0 is the direct term y(k) <- u(k), which a
+                              ///< free-running generator needs
+    uint8_t nc;               ///< estimate so many coefficients of C as well (extended least squares, thesis Equ 3.11),
+                              ///< 0 .. EST_NC_MAX; na + nb + nc + offset must not exceed EST_THETA_MAX
+    bool    offset;           ///< estimate the constant d as well
+    bool    noise_estimated;  ///< follow the variance of the noise, beginning with noise_variance
+    uint16_t refresh_n;       ///< take C from the estimate of A after so many equations and each time A has moved; 0: never
+    uint16_t stuck_n;         ///< y is stuck once it was the same for so many samples after an edge of u; 0: never
+    uint16_t idle_n;          ///< excitation is lost once u had no edge for so many samples; 0: never
+    est_edge_instants_t edge_instants;
     float   forgetting;      ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
-    float   p0;              ///< initial variance of each a and b; > 0
+    float   random_walk;     ///< variance by which each parameter walks per equation (thesis Equ 3.23); 0 .. 1e9
+    float   p0;              ///< initial variance of each a, b and c; > 0
     float   p0_offset;       ///< initial variance of d; > 0 [codes^2]
     float   noise_variance;  ///< of the noise e, not underestimated; > 0 [codes^2]
-    float   c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: no prefilter. |c| <= 70
+    float   c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: none. Zeros inside the unit circle
     float   edge_codes;      ///< a step of u at least this large is an edge; > 0, at most EST_CODE_LIMIT [codes]
-    est_edge_instants_t  edge_instants;
+    float   code_low;        ///< u or y at or below code_low, or at or above code_high, is saturated: beyond the range of
+    float   code_high;       ///< the converter [codes]; at most EST_CODE_LIMIT in magnitude
     est_trigger_config_t trigger;
 } est_config_t;
 
@@ -132,10 +153,10 @@ typedef struct {
 } est_sample_t;
 
 typedef enum {
-    EST_UPDATED = 0,  ///< the sample entered the estimate
-    EST_MISSING = 1,  ///< the sample was declared missing: theta and its covariance stay as they were
-    EST_REFUSED = 2,  ///< u or y was not finite, or beyond EST_CODE_LIMIT, or C is unstable and what it makes of them
-                      ///< has grown beyond all use: counted, otherwise as a missing sample
+    EST_UPDATED   = 0,  ///< the sample entered the estimate
+    EST_MISSING   = 1,  ///< the sample was declared missing: theta and its covariance stay as they were
+    EST_REFUSED   = 2,  ///< u or y was not finite, saturated or stuck: counted, otherwise as a missing sample
+    EST_GATHERING = 3,  ///< the sample was taken in, but the samples that its equation reaches back to are not all known
 } est_status_t;
 
 /// A sample of larger magnitude than this is refused [codes].
@@ -151,6 +172,7 @@ typedef enum {
 typedef struct {
     est_status_t status;
     bool         alarm;       ///< the plant has changed: theta is being estimated afresh from the next sample on
+    bool         idle;        ///< excitation is lost: the estimate can only be as good as it was
     float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1), [codes]; 0 unless status is EST_UPDATED
     float        statistic;   ///< the trigger's statistic after this sample, before any reset by the alarm
 } est_step_t;
@@ -159,57 +181,81 @@ typedef struct {
 typedef struct {
     uint32_t updated;
     uint32_t missing;
-    uint32_t refused;
-    uint32_t alarms;
-    uint32_t restarts;  ///< how often the prefilters began afresh, the first time included
-    uint32_t slips;     ///< how often the edges of u began to be recorded one sample earlier or later
+    uint32_t refused;    ///< not finite or absurd, saturated, stuck
+    uint16_t saturated;  ///< of those
+    uint16_t stuck;      ///< of those
+    uint16_t alarms;
+    uint16_t restarts;  ///< how often the equations began afresh, the first time included
+    uint16_t slips;     ///< how often the edges of u began to be recorded one sample earlier or later
+    uint16_t refreshes; ///< how often C was taken from the estimate of A
 } est_counters_t;
+
+/// P = U D U' with U unit upper triangular. Private to est_factors.c.
+typedef struct {
+    float d[EST_THETA_MAX];
+    float upper[(EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
+} est_factors_t;
+
+/// Makes the noise of consecutive equations white. Private to est_whitener.c.
+typedef struct {
+    float c[EST_NA_MAX];
+    float gain[EST_NA_MAX][EST_NA_MAX];          ///< of the newest equation first
+    float variance[EST_NA_MAX];                  ///< of the noise of the whitened equations, newest first
+    float past[EST_NA_MAX][EST_THETA_MAX + 1U];  ///< the whitened equations, newest first
+    uint8_t n;                                   ///< how many equations there were, as far as it matters
+    bool    settled;                             ///< the gains are c and the variance is 1
+} est_whitener_t;
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
-    float    u_previous;
-    bool     u_known;
-    uint16_t age_n;                     ///< samples since the first of these edges, that one included; 0: no doubt
-    float    train[EST_PAST_MAX + 2U];  ///< their heights as impulses, filtered by 1/C, newest first
-    float    theta[EST_DIM_MAX];        ///< what was believed before the doubt began
+    float   early[EST_NA_MAX];     ///< their share in the whitened equations, newest first
+    float   late[EST_NA_MAX];
+    float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
+    uint8_t age_n;                 ///< samples since the first of these edges, that one included; 0: no doubt
 } est_edges_t;
 
 /// The readings of the recent edges: as recorded, one sample early, one sample late.
 #define EST_READINGS 3U
 
-/// The state of a trigger. Private to the trigger.
+/// The state of a trigger. Private to est_trigger.c.
 typedef struct {
     float    statistic;
     float    rival[EST_READINGS - 1U];  ///< the cumulative sum as it would be under the other readings
-    float    mean;                      ///< of the innovations since the last alarm, signed
-    uint32_t mean_n;                    ///< how many they are
-    uint32_t quiet_n;                   ///< samples for which the statistic is still held at zero
+    uint16_t quiet_n;                   ///< innovations for which the statistic is still held at zero
+    uint16_t mean_n;                    ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
 } est_trigger_t;
 
 /// The state of an estimator. The fields are private; read them through the functions below.
 typedef struct {
-    est_config_t   config;
-    uint8_t        past;           ///< number of initial conditions of this model
-    uint8_t        dim;            ///< past + number of parameters
-    uint8_t        first;          ///< the first active row: 0 while the initial conditions matter, past afterwards
-    bool           running;        ///< false before the first sample and inside a gap
-    float          y[EST_NA_MAX];  ///< filtered outputs y_f(k-1), y_f(k-2), ...
-    float          u[EST_PAST_MAX + 1U];   ///< filtered inputs u_f(k), u_f(k-1), ...
-    float          impulse[EST_PAST_MAX];  ///< impulse response of 1/C at m, m-1, ...: the regressors of the past
-    float          theta[EST_DIM_MAX];
-    float          d[EST_DIM_MAX];                                  ///< P = U D U', U unit upper triangular
-    float          upper[(EST_DIM_MAX * (EST_DIM_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
-    est_edges_t    edges;
-    est_trigger_t  trigger;
-    est_counters_t counters;
+    const est_config_t* config;
+    est_factors_t       factors;
+    float               theta[EST_THETA_MAX];
+    float               y[EST_NA_MAX];                 ///< y(k-1), y(k-2), ...
+    float               u[EST_INPUT_PAST_MAX + 2U];    ///< u(k), u(k-1), ...
+    float               residual[EST_NC_MAX + 1U];     ///< of the equations before this one, newest first
+    float               noise_variance;                ///< [codes^2]
+    est_whitener_t      whitener;
+    est_edges_t         edges;
+    est_trigger_t       trigger;
+    est_counters_t      counters;
+    uint16_t            equations_n;  ///< since the last reset of the covariance or refresh of C
+    uint16_t            idle_n;       ///< samples since the last edge of u
+    uint16_t            same_n;       ///< samples since an edge of u for which y has been the same
+    uint8_t             count;        ///< of parameters
+    uint8_t             pending_n;    ///< samples to come before the next equation is complete
+    bool                known;        ///< the sample before this one is known
 } est_t;
 
 /// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C fixed at
 /// (1 - 0.8 z^-1)^2, forgetting 0.9925, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
 est_config_t est_config_default(void);
 
+/// True iff every value of the configuration is in the range stated at its field. Cost: constant. Cannot fail.
+bool est_config_valid(const est_config_t* config);
+
 /// Makes the estimator ready for the first sample: theta zero, P = P0, counters zero.
-/// Returns false iff a value of the configuration is out of the range stated at its field; the state is then unusable.
+/// The configuration is not copied: it must stay as it is for as long as the estimator is used (it may be in flash).
+/// Returns false iff the configuration is not valid; the state is then unusable.
 /// Cost: as one est_step(). May be called from an interrupt.
 bool est_init(est_t* self, const est_config_t* config);
 
@@ -219,7 +265,7 @@ bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t.
 est_step_t est_step(est_t* self, est_sample_t sample);
 
-/// The number of parameters: na + nb, and one more with the offset.
+/// The number of parameters: na + nb + nc, and one more with the offset.
 uint8_t est_theta_count(const est_t* self);
 
 /// One element of theta; index in [0, est_theta_count()), asserted.
@@ -227,6 +273,9 @@ float est_theta(const est_t* self, uint8_t index);
 
 /// One diagonal element of P [noise variances]; index in [0, est_theta_count()), asserted. Cost: O(n).
 float est_variance(const est_t* self, uint8_t index);
+
+/// The variance of the noise [codes^2]: as configured, or as estimated.
+float est_noise_variance(const est_t* self);
 
 est_counters_t est_counters(const est_t* self);
 

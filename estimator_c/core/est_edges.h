@@ -6,22 +6,28 @@
 #ifndef EST_EDGES_H_INCLUDED
 #define EST_EDGES_H_INCLUDED
 
-#include "est.h"
+#include "est_whitener.h"
 
 /// Doubt ends, one way or the other, so many samples after it began: the readings differ most in the first few.
 #define EST_DOUBT_N 12U
 
-/// No edge is in doubt, and the level before the next sample is unknown.
+/// No edge is in doubt.
 void est_edges_forget(est_edges_t* self);
 
-/// Whether u(k), unfiltered, would be an edge.
-bool est_edges_is_edge(const est_edges_t* self, const est_config_t* config, float u);
+/// The height of the edge at u[0], the values of u newest first; 0 if it is none.
+float est_edges_height(const est_config_t* config, const float* u);
 
-/// Enters u(k), unfiltered. If it is an edge and no doubt is kept, a new doubt begins; returns true then.
-/// `keep` is true while the present doubt must not be dropped for a new one.
-bool est_edges_enter(est_edges_t* self, const est_config_t* config, float u, bool keep);
+/// An edge of this height has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
+/// sample before had an equation, which an edge one sample early would have entered.
+void est_edges_begin(
+    est_edges_t* self, const est_config_t* config, const float* theta, uint8_t count, float height, bool after_equation);
 
-/// The share of the innovation that is due to the edges having come early, and late, given the b's.
-void est_edges_shares(const est_edges_t* self, const est_config_t* config, const float* b, float* early, float* late);
+/// What the edges, had they come early, and late, would have added to the present equation, whitened.
+void est_edges_shares(est_edges_t*          self,
+                      const est_config_t*   config,
+                      const est_whitener_t* whitener,
+                      const float*          u,
+                      float*                early,
+                      float*                late);
 
 #endif  // EST_EDGES_H_INCLUDED

@@ -13,9 +13,10 @@ static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
 /// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
 static float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
     const float term = absolute ? magnitude(innovation) : innovation;
-    self->mean_n += (self->mean_n < UINT32_MAX) ? 1U : 0U;
-    self->mean += (term - self->mean) / (float)self->mean_n;
-    return magnitude(self->mean);
+    float* const mean = &self->rival[0];
+    self->mean_n      = (uint16_t)(self->mean_n + ((self->mean_n < UINT16_MAX) ? 1U : 0U));
+    *mean += (term - *mean) / (float)self->mean_n;
+    return magnitude(*mean);
 }
 
 static float cusum(const float before, const float innovation, const float variance) {
@@ -45,14 +46,14 @@ static est_finding_t find_by_cusum(est_trigger_t* const self,
 }
 
 bool est_trigger_config_valid(const est_trigger_config_t* const config) {
-    const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSUM);
+    const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
+                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != 0));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
 
-void est_trigger_restart(est_trigger_t* const self, const uint32_t quiet_n) {
+void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
     self->statistic = 0.0F;
-    self->mean      = 0.0F;
     self->mean_n    = 0U;
     self->quiet_n   = quiet_n;
     est_trigger_begin_doubt(self);
@@ -103,6 +104,10 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
         break;
     case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
         self->statistic = mean_between_faults(self, config->absolute, readings[0]);
+        break;
+    case EST_TRIGGER_CUSTOM:
+        self->statistic = config->custom(config->context, readings[0], variance, self->mean_n == 0U);
+        self->mean_n    = 1U;
         break;
     case EST_TRIGGER_CUSUM:
         return find_by_cusum(self, config->ceiling, readings, variance, doubt_n);

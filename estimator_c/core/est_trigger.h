@@ -1,5 +1,6 @@
 /// The change triggers of est.h. They see the innovation, in every reading of the edges in doubt, and its variance, and
-/// nothing else of the estimator. A new trigger is a new est_trigger_kind_t and a new function in est_trigger.c.
+/// nothing else of the estimator. A user's trigger is a function in the configuration (est_trigger_fn); one of the library's
+/// own is a new est_trigger_kind_t and a new function in est_trigger.c.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
@@ -16,7 +17,7 @@ typedef enum {
 } est_finding_t;
 
 /// Ready for the first innovation; the statistic is zero for the next quiet_n samples.
-void est_trigger_restart(est_trigger_t* self, uint32_t quiet_n);
+void est_trigger_restart(est_trigger_t* self, uint16_t quiet_n);
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
 void est_trigger_begin_doubt(est_trigger_t* self);

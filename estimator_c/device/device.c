@@ -301,7 +301,14 @@ static uint16_t whole_value(const est_config_t* const config, const uint8_t key)
     }
 }
 
-/// Only est_init() knows what it accepts, and the estimator is idle: it tries the candidate.
+/// The coefficients of C come one by one, and only together they make a stable filter or none: START judges them.
+static bool acceptable(est_config_t candidate) {
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        candidate.c[i] = 0.0F;
+    }
+    return est_config_valid(&candidate);
+}
+
 static uint8_t configure(device_t* const self, const uint8_t key, const float value) {
     est_config_t candidate = self->config;
     float* const field     = float_field(&candidate, key);
@@ -312,7 +319,7 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
         return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
     }
     if (field != 0) {
-        if (!is_finite(value)) {  // est_init() looks only at the coefficients that the order uses
+        if (!is_finite(value)) {
             return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
         }
         *field = value;
@@ -323,7 +330,7 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
         }
         set_whole(&candidate, key, number);
     }
-    if (!est_init(&self->estimator, &candidate)) {
+    if (!acceptable(candidate)) {
         return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
     }
     self->config = candidate;

@@ -9,13 +9,15 @@ typedef struct {
     double kind, ceiling, hold_off_n, warm_up_n, absolute, reset;
 } driver_config_t;
 
-static est_t self;
+static est_t        self;
+static est_config_t config;
 
 int driver_init(const driver_config_t* in) {
-    const est_config_t config = {
+    config = (est_config_t){
         .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .offset = in->offset != 0,
         .forgetting = (float)in->forgetting, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
-        .noise_variance = (float)in->noise_variance, .c = { (float)in->c[0], (float)in->c[1] },
+        .noise_variance = (float)in->noise_variance, .stuck_n = 16, .idle_n = 1000, .code_low = -EST_CODE_LIMIT,
+        .code_high = EST_CODE_LIMIT, .c = { (float)in->c[0], (float)in->c[1] },
         .edge_codes = (float)in->edge_codes, .edge_instants = (est_edge_instants_t)in->edge_instants,
         .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
                      .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,

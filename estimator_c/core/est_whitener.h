@@ -1,0 +1,29 @@
+/// Consecutive equations of the model have the coloured noise C(z) e. This filter makes it white, and passes every element
+/// of the equation alike, so that the equation still holds. It is not 1/C, which would need the e's before the first
+/// equation, but the innovations filter of a moving average that begins there (Brockwell and Davis, "Time Series: Theory and
+/// Methods" (1991), section 5.3): its gains begin at zero and come to C, and the variance of the noise comes down to 1.
+
+#ifndef EST_WHITENER_H_INCLUDED
+#define EST_WHITENER_H_INCLUDED
+
+#include "est.h"
+
+/// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
+bool est_whitener_accepts(const float* c, uint8_t na);
+
+/// From now on C is this; how the next equations hang together with those before is kept.
+void est_whitener_set(est_whitener_t* self, const float* c, uint8_t na);
+
+/// The next equation is the first.
+void est_whitener_restart(est_whitener_t* self);
+
+/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1.
+float est_whitener_advance(est_whitener_t* self, uint8_t na);
+
+/// Whitens the present equation in place: the regressor phi[0 .. count-1] and, last, the output phi[count].
+void est_whitener_apply(est_whitener_t* self, uint8_t na, uint8_t count, float* phi);
+
+/// Whitens another signal along with the equations. past[] has its last na values, newest first.
+float est_whitener_filter(const est_whitener_t* self, uint8_t na, float* past, float x);
+
+#endif  // EST_WHITENER_H_INCLUDED
