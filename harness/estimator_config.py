@@ -22,6 +22,12 @@ _RESETS: tuple[ResetName, ...] = ("covariance", "all")
 _EDGE_INSTANTS: tuple[EdgeInstants, ...] = ("locked", "may-slip", "anywhere")
 """In the order of est_edge_instants_t."""
 
+_SETTINGS = (
+    *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
+    *("forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"),
+)
+"""The fields that the device knows under the same name and as they are."""
+
 DEFAULT_ARL0 = 1e5
 
 MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
@@ -41,8 +47,20 @@ class EstimatorConfig:
     na: int = 2
     nb: int = 3
     nk: int = 0
+    nc: int = 0
+    """Coefficients of C to be estimated along with theta (extended least squares)."""
     offset: bool = True
+    noise_estimated: bool = False
+    """Follow the variance of the noise, beginning with ``noise_variance``."""
+    refresh_n: int = 0
+    """Take C from the estimate of A after so many equations, and each time A has moved; 0: never."""
+    stuck_n: int = 16
+    """The displacement is stuck once it was the same for so many samples after an edge of the force; 0: never."""
+    idle_n: int = 1000
+    """Excitation is lost once the force had no edge for so many samples; 0: never."""
     forgetting: float = 0.9925
+    random_walk: float = 0.0
+    """Variance by which each parameter walks per sample, in noise variances."""
     p0: float = 10.0
     p0_offset: float = 1.0e6
     """codes^2"""
@@ -52,6 +70,9 @@ class EstimatorConfig:
     """Prefilter C = 1 + c[0] z^-1 + ...; what is not given is zero."""
     edge_codes: float = 64.0
     """A step of the force at least this large is an edge; codes."""
+    code_low: float = -1.0e6
+    """A reading at or below ``code_low``, or at or above ``code_high``, is saturated; codes."""
+    code_high: float = 1.0e6
     edge_instants: EdgeInstants = "may-slip"
     """Where between two samples the edges of the force come: always at the same place (``locked``), at nearly the same
     (``may-slip``), or each elsewhere (``anywhere``), as when the period is no whole number of samples."""
@@ -92,7 +113,7 @@ class EstimatorConfig:
     @property
     def parameters(self) -> int:
         """The number of elements of theta."""
-        return self.na + self.nb + self.offset
+        return self.na + self.nb + self.nc + self.offset
 
     @property
     def statistic_ceiling(self) -> float | None:
@@ -103,7 +124,7 @@ class EstimatorConfig:
 
     def settings(self) -> Iterator[tuple[Key, float]]:
         """Every key of the device with its value, in an order in which each is in range if all are."""
-        for name in ("na", "nb", "nk", "offset", "forgetting", "p0", "p0_offset", "noise_variance", "edge_codes"):
+        for name in _SETTINGS:
             yield Key[name.upper()], float(getattr(self, name))
         for i in range(self.na):
             yield Key[f"C{i + 1}"], self.c[i] if i < len(self.c) else 0.0

@@ -409,7 +409,6 @@ static est_step_t enter_equation(est_t* const self, const float y) {
     read_innovation(self, phi, readings);
     const float variance = update_estimate(self, phi, readings[0], whitened);
     keep_residual(self, phi);
-    count_long(&self->counters.updated);
     count(&self->equations_n);
 
     const est_finding_t finding = est_trigger_step(
@@ -445,6 +444,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         count(&self->counters.stuck);
         return enter_gap(self, EST_REFUSED);
     }
+    count_long(&self->counters.updated);
     est_step_t step;
     if (self->pending_n > 0U) {
         gather(self);

@@ -179,7 +179,7 @@ typedef struct {
 
 /// Counters since est_init(). They saturate, they do not wrap.
 typedef struct {
-    uint32_t updated;
+    uint32_t updated;    ///< samples taken in, those without an equation included
     uint32_t missing;
     uint32_t refused;    ///< not finite or absurd, saturated, stuck
     uint16_t saturated;  ///< of those

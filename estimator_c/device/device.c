@@ -1,8 +1,7 @@
 #include "device.h"
 
 #include "analogrig_codec.h"
-
-#include <float.h>
+#include "settings.h"
 
 #ifndef DEVICE_ASSERT
 #include <assert.h>
@@ -81,6 +80,8 @@ static void put_stepped(device_t* const self, answer_t* const answer, const est_
                                                  .missing      = (step->status == EST_MISSING) ? 1U : 0U,
                                                  .refused      = (step->status == EST_REFUSED) ? 1U : 0U,
                                                  .restarted    = restarted ? 1U : 0U,
+                                                 .gathering    = (step->status == EST_GATHERING) ? 1U : 0U,
+                                                 .idle         = step->idle ? 1U : 0U,
                                                  .sample_index = self->next_index,
                                                  .statistic    = step->statistic };
     uint8_t                          payload[PAYLOAD_MAX];
@@ -179,175 +180,31 @@ static void step_block(device_t* const self, answer_t* const answer) {
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-static bool is_finite(const float value) { return (value >= -FLT_MAX) && (value <= FLT_MAX); }
-
-/// A float that is a whole number in [0, limit]. False for NaN too.
-static bool whole(const float value, const uint16_t limit, uint16_t* const out) {
-    if (!((value >= 0.0F) && (value <= (float)limit))) {
-        return false;
-    }
-    *out = (uint16_t)value;
-    return !((value - (float)*out) > 0.0F);
-}
-
-/// The field that a key of floating-point type stands for; null for any other key.
-static float* float_field(est_config_t* const config, const uint8_t key) {
-    if ((key >= ANALOGRIG_CONFIGURE_KEY_C1_CHOICE) && (key < (ANALOGRIG_CONFIGURE_KEY_C1_CHOICE + EST_NA_MAX))) {
-        return &config->c[key - ANALOGRIG_CONFIGURE_KEY_C1_CHOICE];
-    }
-    switch (key) {
-    case ANALOGRIG_CONFIGURE_KEY_FORGETTING_CHOICE:
-        return &config->forgetting;
-    case ANALOGRIG_CONFIGURE_KEY_P0_CHOICE:
-        return &config->p0;
-    case ANALOGRIG_CONFIGURE_KEY_P0_OFFSET_CHOICE:
-        return &config->p0_offset;
-    case ANALOGRIG_CONFIGURE_KEY_NOISE_VARIANCE_CHOICE:
-        return &config->noise_variance;
-    case ANALOGRIG_CONFIGURE_KEY_EDGE_CODES_CHOICE:
-        return &config->edge_codes;
-    case ANALOGRIG_CONFIGURE_KEY_CEILING_CHOICE:
-        return &config->trigger.ceiling;
-    default:
-        return 0;
-    }
-}
-
-/// The largest value of a key of whole numbers; 0 for any other key. est_init() knows the true ranges of the orders.
-static uint16_t limit_of(const uint8_t key) {
-    switch (key) {
-    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
-    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
-    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
-        return UINT8_MAX;
-    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
-    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
-        return 1U;
-    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
-    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
-        return UINT16_MAX;
-    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
-        return (uint16_t)EST_TRIGGER_CUSUM;
-    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
-        return (uint16_t)EST_RESET_ALL;
-    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
-        return (uint16_t)EST_EDGES_ANYWHERE;
-    default:
-        return 0U;
-    }
-}
-
-static void set_whole(est_config_t* const config, const uint8_t key, const uint16_t value) {
-    switch (key) {
-    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
-        config->na = (uint8_t)value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
-        config->nb = (uint8_t)value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
-        config->nk = (uint8_t)value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
-        config->offset = value != 0U;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
-        config->trigger.absolute = value != 0U;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
-        config->trigger.hold_off_n = value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
-        config->trigger.warm_up_n = value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
-        config->trigger.kind = (est_trigger_kind_t)value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
-        config->trigger.reset = (est_reset_t)value;
-        break;
-    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
-        config->edge_instants = (est_edge_instants_t)value;
-        break;
-    default:
-        break;
-    }
-}
-
-static uint16_t whole_value(const est_config_t* const config, const uint8_t key) {
-    switch (key) {
-    case ANALOGRIG_CONFIGURE_KEY_NA_CHOICE:
-        return config->na;
-    case ANALOGRIG_CONFIGURE_KEY_NB_CHOICE:
-        return config->nb;
-    case ANALOGRIG_CONFIGURE_KEY_NK_CHOICE:
-        return config->nk;
-    case ANALOGRIG_CONFIGURE_KEY_OFFSET_CHOICE:
-        return config->offset ? 1U : 0U;
-    case ANALOGRIG_CONFIGURE_KEY_ABSOLUTE_CHOICE:
-        return config->trigger.absolute ? 1U : 0U;
-    case ANALOGRIG_CONFIGURE_KEY_HOLD_OFF_N_CHOICE:
-        return config->trigger.hold_off_n;
-    case ANALOGRIG_CONFIGURE_KEY_WARM_UP_N_CHOICE:
-        return config->trigger.warm_up_n;
-    case ANALOGRIG_CONFIGURE_KEY_TRIGGER_CHOICE:
-        return (uint16_t)config->trigger.kind;
-    case ANALOGRIG_CONFIGURE_KEY_RESET_CHOICE:
-        return (uint16_t)config->trigger.reset;
-    case ANALOGRIG_CONFIGURE_KEY_EDGE_INSTANTS_CHOICE:
-        return (uint16_t)config->edge_instants;
-    default:
-        return 0U;
-    }
-}
-
-/// The coefficients of C come one by one, and only together they make a stable filter or none: START judges them.
-static bool acceptable(est_config_t candidate) {
-    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
-        candidate.c[i] = 0.0F;
-    }
-    return est_config_valid(&candidate);
-}
-
 static uint8_t configure(device_t* const self, const uint8_t key, const float value) {
-    est_config_t candidate = self->config;
-    float* const field     = float_field(&candidate, key);
-    if ((field == 0) && (limit_of(key) == 0U)) {
-        return ANALOGRIG_CONFIGURED_RESULT_UNKNOWN_CHOICE;
-    }
     if (self->running) {
         return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
     }
-    if (field != 0) {
-        if (!is_finite(value)) {
-            return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
-        }
-        *field = value;
-    } else {
-        uint16_t number = 0U;
-        if (!whole(value, limit_of(key), &number)) {
-            return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
-        }
-        set_whole(&candidate, key, number);
-    }
-    if (!acceptable(candidate)) {
+    switch (settings_set(&self->config, key, value)) {
+    case SETTINGS_APPLIED:
+        return ANALOGRIG_CONFIGURED_RESULT_APPLIED_CHOICE;
+    case SETTINGS_OUT_OF_RANGE:
         return ANALOGRIG_CONFIGURED_RESULT_OUT_OF_RANGE_CHOICE;
+    case SETTINGS_UNKNOWN:
+    default:
+        return ANALOGRIG_CONFIGURED_RESULT_UNKNOWN_CHOICE;
     }
-    self->config = candidate;
-    return ANALOGRIG_CONFIGURED_RESULT_APPLIED_CHOICE;
 }
 
 static void on_configure(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
     struct analogrig_configure_t message;
     (void)analogrig_configure_unpack(&message, payload, ANALOGRIG_CONFIGURE_LENGTH);
     const uint8_t                       result  = configure(self, message.key, message.value);
-    const float* const                  field   = float_field(&self->config, message.key);
     const struct analogrig_configured_t applied = {
         .seq     = self->seq,
         .key     = message.key,
         .answers = message.seq,
         .result  = result,
-        .value   = (field != 0) ? *field : (float)whole_value(&self->config, message.key),
+        .value   = settings_get(&self->config, message.key),
     };
     uint8_t out[PAYLOAD_MAX];
     (void)analogrig_configured_pack(out, &applied, sizeof(out));
@@ -448,6 +305,12 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
         return estimator.restarts;
     case ANALOGRIG_STATUS_COUNTER_SLIPS_CHOICE:
         return estimator.slips;
+    case ANALOGRIG_STATUS_COUNTER_SATURATED_CHOICE:
+        return estimator.saturated;
+    case ANALOGRIG_STATUS_COUNTER_STUCK_CHOICE:
+        return estimator.stuck;
+    case ANALOGRIG_STATUS_COUNTER_REFRESHES_CHOICE:
+        return estimator.refreshes;
     case ANALOGRIG_STATUS_COUNTER_FRAMES_DROPPED_CHOICE:
         return frame_dropped(&self->decoder);
     case ANALOGRIG_STATUS_COUNTER_SEQUENCE_GAPS_CHOICE:

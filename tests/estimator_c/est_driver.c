@@ -5,7 +5,8 @@
 #include <stddef.h>
 
 typedef struct {
-    double na, nb, nk, offset, forgetting, p0, p0_offset, noise_variance, c[2], edge_codes, edge_instants;
+    double na, nb, nk, nc, offset, noise_estimated, refresh_n, stuck_n, idle_n, edge_instants;
+    double forgetting, random_walk, p0, p0_offset, noise_variance, c[2], edge_codes, code_low, code_high;
     double kind, ceiling, hold_off_n, warm_up_n, absolute, reset;
 } driver_config_t;
 
@@ -14,11 +15,13 @@ static est_config_t config;
 
 int driver_init(const driver_config_t* in) {
     config = (est_config_t){
-        .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .offset = in->offset != 0,
-        .forgetting = (float)in->forgetting, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
-        .noise_variance = (float)in->noise_variance, .stuck_n = 16, .idle_n = 1000, .code_low = -EST_CODE_LIMIT,
-        .code_high = EST_CODE_LIMIT, .c = { (float)in->c[0], (float)in->c[1] },
-        .edge_codes = (float)in->edge_codes, .edge_instants = (est_edge_instants_t)in->edge_instants,
+        .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .nc = (uint8_t)in->nc,
+        .offset = in->offset != 0, .noise_estimated = in->noise_estimated != 0, .refresh_n = (uint16_t)in->refresh_n,
+        .stuck_n = (uint16_t)in->stuck_n, .idle_n = (uint16_t)in->idle_n,
+        .edge_instants = (est_edge_instants_t)in->edge_instants, .forgetting = (float)in->forgetting,
+        .random_walk = (float)in->random_walk, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
+        .noise_variance = (float)in->noise_variance, .c = { (float)in->c[0], (float)in->c[1] },
+        .edge_codes = (float)in->edge_codes, .code_low = (float)in->code_low, .code_high = (float)in->code_high,
         .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
                      .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,
                      .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset },
@@ -28,14 +31,16 @@ int driver_init(const driver_config_t* in) {
 
 void driver_default(driver_config_t* out) {
     const est_config_t c = est_config_default();
-    *out = (driver_config_t){ c.na, c.nb, c.nk, c.offset, c.forgetting, c.p0, c.p0_offset, c.noise_variance,
-                              { c.c[0], c.c[1] }, c.edge_codes, c.edge_instants, c.trigger.kind, c.trigger.ceiling,
-                              c.trigger.hold_off_n, c.trigger.warm_up_n, c.trigger.absolute, c.trigger.reset };
+    *out = (driver_config_t){ c.na, c.nb, c.nk, c.nc, c.offset, c.noise_estimated, c.refresh_n, c.stuck_n, c.idle_n,
+                              c.edge_instants, c.forgetting, c.random_walk, c.p0, c.p0_offset, c.noise_variance,
+                              { c.c[0], c.c[1] }, c.edge_codes, c.code_low, c.code_high, c.trigger.kind,
+                              c.trigger.ceiling, c.trigger.hold_off_n, c.trigger.warm_up_n, c.trigger.absolute,
+                              c.trigger.reset };
 }
 
 /* theta: (n, est_theta_count()); returns whether the invariants held after every sample. */
 int driver_run(size_t n, const double* u, const double* y, const unsigned char* valid, float* theta, float* innovation,
-               float* statistic, unsigned char* alarm, unsigned char* status) {
+               float* statistic, unsigned char* alarm, unsigned char* status, unsigned char* idle) {
     const uint8_t count = est_theta_count(&self);
     int           held  = 1;
     for (size_t k = 0; k < n; k++) {
@@ -48,6 +53,7 @@ int driver_run(size_t n, const double* u, const double* y, const unsigned char* 
         statistic[k]  = step.statistic;
         alarm[k]      = step.alarm;
         status[k]     = (unsigned char)step.status;
+        idle[k]       = step.idle;
         held          = held && est_invariants_hold(&self);
     }
     return held;
@@ -57,12 +63,13 @@ int driver_theta_count(void) { return est_theta_count(&self); }
 
 float driver_variance(int index) { return est_variance(&self, (uint8_t)index); }
 
-void driver_counters(unsigned out[6]) {
+float driver_noise_variance(void) { return est_noise_variance(&self); }
+
+void driver_counters(unsigned out[9]) {
     const est_counters_t c = est_counters(&self);
-    out[0] = c.updated;
-    out[1] = c.missing;
-    out[2] = c.refused;
-    out[3] = c.alarms;
-    out[4] = c.restarts;
-    out[5] = c.slips;
+    const unsigned all[9]  = { c.updated, c.missing, c.refused, c.alarms, c.restarts, c.slips, c.saturated, c.stuck,
+                               c.refreshes };
+    for (int i = 0; i < 9; i++) {
+        out[i] = all[i];
+    }
 }

@@ -23,10 +23,10 @@ STRICT = [
     "-Werror",
     "-ffp-contract=off",
 ]
-COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips")
+COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes")
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM = range(4)
-UPDATED, MISSING, REFUSED = range(3)
+UPDATED, MISSING, REFUSED, GATHERING = range(4)
 LOCKED, MAY_SLIP, ANYWHERE = range(3)
 
 
@@ -34,12 +34,14 @@ class Config(ctypes.Structure):
     """As driver_config_t: all numbers are doubles."""
 
     _fields_ = [
-        *((name, ctypes.c_double) for name in "na nb nk offset forgetting p0 p0_offset noise_variance".split()),
-        ("c", ctypes.c_double * 2),
         *(
             (name, ctypes.c_double)
-            for name in "edge_codes edge_instants kind ceiling hold_off_n warm_up_n absolute reset".split()
+            for name in "na nb nk nc offset noise_estimated refresh_n stuck_n idle_n edge_instants".split()
         ),
+        *((name, ctypes.c_double) for name in "forgetting random_walk p0 p0_offset noise_variance".split()),
+        ("c", ctypes.c_double * 2),
+        *((name, ctypes.c_double) for name in "edge_codes code_low code_high".split()),
+        *((name, ctypes.c_double) for name in "kind ceiling hold_off_n warm_up_n absolute reset".split()),
     ]
 
 
@@ -53,9 +55,12 @@ class Result:
     alarms: NDArray[np.int64]
     """Sample indices."""
     status: NDArray[np.uint8]
+    idle: NDArray[np.uint8]
     counters: Mapping[str, int]
     variance: NDArray[np.float64]
     """Of each parameter, after the last sample, in noise variances."""
+    noise_variance: float
+    """After the last sample; codes^2."""
 
 
 class Estimator:
@@ -64,6 +69,7 @@ class Estimator:
     def __init__(self, library: Path) -> None:
         self._c = ctypes.CDLL(str(library))
         self._c.driver_variance.restype = ctypes.c_float
+        self._c.driver_noise_variance.restype = ctypes.c_float
 
     def init(self, **changes: float | tuple[float, float]) -> bool:
         """est_init() with the default configuration and these changes."""
@@ -80,15 +86,18 @@ class Estimator:
         valid_ = np.ascontiguousarray(np.ones(n) if valid is None else valid, dtype=np.uint8)
         theta = np.zeros((n, self._c.driver_theta_count()), np.float32)
         innovation, statistic = np.zeros(n, np.float32), np.zeros(n, np.float32)
-        alarm, status = np.zeros(n, np.uint8), np.zeros(n, np.uint8)
-        arrays = (u_, y_, valid_, theta, innovation, statistic, alarm, status)
+        alarm, status, idle = (np.zeros(n, np.uint8) for _ in range(3))
+        arrays = (u_, y_, valid_, theta, innovation, statistic, alarm, status, idle)
         held = self._c.driver_run(ctypes.c_size_t(n), *(ctypes.c_void_p(a.ctypes.data) for a in arrays))
         assert held, "est_invariants_hold() was false"
         counters = (ctypes.c_uint * len(COUNTERS))()
         self._c.driver_counters(counters)
         variance = np.array([self._c.driver_variance(i) for i in range(theta.shape[1])])
         named = dict(zip(COUNTERS, counters, strict=True))
-        return Result(theta, innovation, statistic, np.flatnonzero(alarm), status, named, variance)
+        noise_variance = float(self._c.driver_noise_variance())
+        return Result(
+            theta, innovation, statistic, np.flatnonzero(alarm), status, idle, named, variance, noise_variance
+        )
 
 
 def compile_driver(folder: Path) -> Path:

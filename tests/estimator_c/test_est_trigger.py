@@ -10,7 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from tests.estimator_c.est_driver import ANYWHERE, CUSUM, LOCKED, MEAN_BETWEEN_FAULTS, PREDICTION_ERROR, Estimator
+from tests.estimator_c.est_driver import (
+    ANYWHERE,
+    CUSUM,
+    GATHERING,
+    LOCKED,
+    MEAN_BETWEEN_FAULTS,
+    PREDICTION_ERROR,
+    Estimator,
+)
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01
@@ -83,6 +91,9 @@ def test_mean_between_faults_follows_the_thesis(estimator: Estimator) -> None:
     assert len(result.alarms)
     expected, terms, quiet = [], [], 50
     for k, innovation in enumerate(result.innovation.astype(float)):
+        if result.status[k] == GATHERING:
+            expected.append(0.0)
+            continue
         if quiet:
             quiet -= 1
             expected.append(0.0)
@@ -102,8 +113,8 @@ def test_absolute_mean_averages_magnitudes(estimator: Estimator) -> None:
     u, y = rng.normal(0.0, 100.0, 300), rng.normal(0.0, 10.0, 300)
     assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=1e6, warm_up_n=0, absolute=1)
     result = estimator.run(u, y)
-    magnitudes = np.abs(result.innovation.astype(float))
-    assert result.statistic == pytest.approx(np.cumsum(magnitudes) / np.arange(1, 301), rel=1e-4)
+    magnitudes = np.abs(result.innovation.astype(float))[2:]
+    assert result.statistic[2:] == pytest.approx(np.cumsum(magnitudes) / np.arange(1, 299), rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(10))
