@@ -23,7 +23,23 @@ _SAMPLES_LOOKED_AT = 4000
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences, the gravest first; empty if all is well."""
-    return (*_noise(run), *_edges(run), *_false_alarms(verdict), *_unseen(verdict), *_unidentified(verdict))
+    return (
+        *_overloads(verdict),
+        *_noise(run),
+        *_edges(run),
+        *_false_alarms(verdict),
+        *_unseen(verdict),
+        *_unidentified(verdict),
+    )
+
+
+def _overloads(verdict: Verdict) -> Iterator[str]:
+    if verdict.overloads:
+        names = ", ".join(sorted(verdict.overloads))
+        yield (
+            f"{names} overloaded from sample {min(verdict.overloads.values())} on: the computer was then not the plant"
+            " of the scenario, and estimates and alarms may be true to it"
+        )
 
 
 def _noise(run: Run) -> Iterator[str]:

@@ -99,7 +99,8 @@ class Bench:
             conditions = dataclasses.replace(conditions, faults=(str(error),))
         except KeyboardInterrupt:
             conditions = dataclasses.replace(conditions, faults=(INTERRUPTED_BY_USER,))
-        return collected.run(conditions, self.dut.parameters)
+        lit = {amplifier: sample for amplifier, sample in performance.lamps().items() if sample < collected.samples}
+        return collected.run(dataclasses.replace(conditions, overloads=lit), self.dut.parameters)
 
     def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
         for block in blocks:

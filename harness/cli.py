@@ -302,6 +302,7 @@ def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
 def _emulate(arguments: argparse.Namespace) -> int:
     from harness.emulate import write_signals
     from harness.rig import open_rig
+    from harness.summary import lamps_text
 
     with open_rig(arguments.rig) as rig:
         scenario, seed = _what_to_play(rig, arguments)
@@ -310,6 +311,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
         _print(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
     else:
         _print(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
+        _print(f"overload lamps: {lamps_text(written['overloads'])}")
     return PASSED
 
 

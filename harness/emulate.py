@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,17 +20,19 @@ from harness.storage import replacing
 
 def write_signals(
     rig: Rig, scenario: Scenario, seed: int, path: Path, progress: Progress | None = None
-) -> dict[str, int]:
+) -> dict[str, Any]:
     """Play ``scenario`` on ``rig`` and write volts, codes and clipping flags, one row a sample, as .csv or .npz.
 
-    :returns: ``samples`` and ``clipped``, the samples in which any channel was clipped.
+    :returns: ``samples``; ``clipped``, the samples in which any channel was clipped; ``overloads``, the amplifiers
+        whose overload lamp lit, with the sample at which it did.
     :raises ConfigurationError: the file's ending is neither.
     :raises RecordingError: it cannot be written.
     """
     if path.suffix not in (".csv", ".npz"):
         raise ConfigurationError(f"{path}: the file's name must end with .csv or .npz")
     blocks: list[Block] = []
-    for block in rig.perform(scenario, seed).blocks:
+    performance = rig.perform(scenario, seed)
+    for block in performance.blocks:
         blocks.append(block)
         if progress is not None:
             progress(block.first + len(block.codes), scenario.samples)
@@ -42,6 +44,7 @@ def write_signals(
     return {
         "samples": sum(len(block.codes) for block in blocks),
         "clipped": sum(int(block.clipped.any(axis=1).sum()) for block in blocks),
+        "overloads": dict(performance.lamps()),
     }
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -75,6 +75,9 @@ class Performance:
     segments: tuple[Segment, ...]
     """The truth; empty if the rig does not know it."""
     blocks: Iterator[Block]
+    lamps: Callable[[], Mapping[str, int]] = dict
+    """Asked when the blocks have been taken: of each amplifier whose overload lamp is lit, the first sample that was
+    taken with it lit. None for a rig that has no lamps."""
 
 
 class Rig(Protocol):
@@ -270,6 +273,7 @@ class EmulatorRig:
             channels=self._channels(computer),
             segments=scenario.segments(),
             blocks=_sampled(volts, Sampler(self._card, _Stream.CARD.generator(seed))),
+            lamps=lambda: _lit(computer, probes_per_sample(self._card)),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
@@ -348,7 +352,12 @@ class RecordingRig:
         if seed != conditions.seed:
             raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}")
         return Performance(
-            conditions.sample_period_s, conditions.time_scale, conditions.channels, conditions.segments, self._blocks()
+            conditions.sample_period_s,
+            conditions.time_scale,
+            conditions.channels,
+            conditions.segments,
+            self._blocks(),
+            lamps=lambda: conditions.overloads,
         )
 
     def _blocks(self) -> Iterator[Block]:
@@ -363,6 +372,12 @@ class RecordingRig:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+
+def _lit(computer: SuspensionComputer, probes: int) -> dict[str, int]:
+    """Lamps that are lit, with the card's sample; the machine takes `probes` for each of those."""
+    lamps = computer.machine.lamps.items()
+    return {amplifier: -(-probe // probes) for amplifier, probe in lamps if probe is not None}
 
 
 def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:

@@ -104,6 +104,8 @@ class Conditions:
     """The device's own counters at the end."""
     faults: tuple[str, ...] = ()
     """Why the run is not valid; empty if it is."""
+    overloads: Mapping[str, int] = field(default_factory=dict)
+    """Of each amplifier whose overload lamp lit, the first sample that was taken with the lamp lit."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -202,6 +204,7 @@ class Run:
             "sample times": conditions.sample_period_s > 0.0 and conditions.time_scale > 0.0,
             "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
+            "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
             "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),
         }

@@ -26,10 +26,18 @@ def summary(run: Run, verdict: Verdict) -> str:
     lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
     if verdict.missing_n:
         lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
+    if verdict.overloads:
+        lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
     return "\n".join(lines)
+
+
+def lamps_text(overloads: Mapping[str, int]) -> str:
+    """The lamps that lit, in order of time: ``U1 from sample 51``."""
+    in_order = sorted(overloads.items(), key=lambda lamp: (lamp[1], lamp[0]))
+    return ", ".join(f"{amplifier} from sample {sample}" for amplifier, sample in in_order) or "none"
 
 
 def _false_alarms(verdict: Verdict) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -112,6 +112,8 @@ class Verdict:
     """Of the trigger's statistic; None without a trigger."""
     missing_n: int
     theta_hash: str
+    overloads: Mapping[str, int] = field(default_factory=dict)
+    """Amplifier to the first sample that was taken with its overload lamp lit."""
 
     @property
     def valid(self) -> bool:
@@ -137,6 +139,7 @@ def judge(run: Run) -> Verdict:
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
         missing_n=int(run.missing.sum()),
         theta_hash=run.theta_hash(),
+        overloads=dict(run.conditions.overloads),
     )
 
 
@@ -184,6 +187,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "arl0": verdict.arl0,
         "missing": verdict.missing_n,
         "theta_hash": verdict.theta_hash,
+        "overloads": dict(verdict.overloads),
     }
 
 

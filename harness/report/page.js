@@ -107,6 +107,7 @@
     const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
     return {
       lines() {
+        verticals(u, run.overloads.filter(seen), { colour: ink("truth"), width: 2, dash: [1, 3], alpha: 1 });
         verticals(u, run.tweaks.filter(seen), { colour: ink("ink"), width: 1.25, dash: [], alpha: 1 });
         verticals(u, wrong, { colour: ink("false"), width: 2.25, dash: [2, 3], alpha });
         verticals(u, noticed, { colour: ink("alarm"), width: 1.75, dash: [6, 4], alpha: 1 });
@@ -115,6 +116,7 @@
         flags(u, wrong, ink("false"));
         flags(u, noticed, ink("alarm"));
         labels(u, run.tweaks.filter(seen), ink);
+        lamps(u, run.overloads.filter(seen), ink);
       },
     };
   }
@@ -158,11 +160,7 @@
   function labels(u, tweaks, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
-    ctx.save();
-    ctx.font = FONT.replace(/^\d+/, (size) => String(size * px));
-    ctx.fillStyle = ink("ink");
-    ctx.textAlign = "center";
-    ctx.textBaseline = "bottom";
+    lettered(u, ink("ink"), "center", "bottom");
     let free = -Infinity;
     for (const tweak of tweaks) {
       const x = position(u, tweak.sample);
@@ -172,6 +170,30 @@
       free = x + half + 6 * px;
     }
     ctx.restore();
+  }
+
+  // A lit lamp and the name of its amplifier, inside the plot: those of one sample below one another.
+  function lamps(u, overloads, ink) {
+    const { ctx, bbox } = u;
+    const px = devicePixelRatio;
+    lettered(u, ink("truth"), "left", "middle");
+    overloads.forEach((lamp, k) => {
+      const above = overloads.slice(0, k).filter((other) => other.sample === lamp.sample).length;
+      const [x, y] = [position(u, lamp.sample), bbox.top + (8 + 14 * above) * px];
+      ctx.beginPath();
+      ctx.arc(x, y, 4 * px, 0, 2 * Math.PI);
+      ctx.fill();
+      ctx.fillText(lamp.label, x + 7 * px, y);
+    });
+    ctx.restore();
+  }
+
+  function lettered({ ctx }, colour, align, baseline) {
+    ctx.save();
+    ctx.font = FONT.replace(/^\d+/, (size) => String(size * devicePixelRatio));
+    ctx.fillStyle = colour;
+    ctx.textAlign = align;
+    ctx.textBaseline = baseline;
   }
 
   function missingBand(u, stretches, ink) {

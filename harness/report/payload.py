@@ -49,6 +49,7 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
         "deflated": deflated(column.values for column in columns),
         "tweaks": [{"sample": tweak.sample, "label": direction(tweak)} for tweak in verdict.tweaks],
         "alarms": [{"sample": index, "false": index in false_alarms} for index in run.alarm_index.tolist()],
+        "overloads": [{"sample": sample, "label": name} for name, sample in sorted(verdict.overloads.items())],
         "segments": [
             {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in run.segments
         ],

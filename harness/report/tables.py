@@ -9,6 +9,7 @@ from typing import Any
 from harness.advice import advice
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
+from harness.summary import lamps_text
 from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
 
 _MAX_FALSE_ALARMS = 20
@@ -57,6 +58,7 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Link", ran.link),
         ("Seed", ran.seed),
         ("Samples", _samples(run, verdict)),
+        ("Overload lamps", lamps_text(verdict.overloads)),
         ("Theta hash", verdict.theta_hash),
     ]
     return _table("What ran, and where", "", (_named(name, value) for name, value in rows), kind="pairs")
