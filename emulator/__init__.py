@@ -26,12 +26,15 @@ from .nodal import PiecewiseLinear, piecewise_linear
 from .noise import CircuitNoise, NoisySuspension
 from .opamp import IDEAL, OpAmpModel
 from .pot import PotModel
+from .program import CHANNELS, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from .quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts, SuspensionProgram
 from .sampler import CARDS, Card, Sampler, drawn_levels
 from .spice import to_spice
-from .suspension import CHANNELS, FRONT, PROGRAMS, SHOCK, Program, Scales, SuspensionComputer, SuspensionParts
-from .two_mass import TWO_MASS_READINGS, TwoMassParts, TwoMassPlant, TwoMassProgram, TwoMassScales
+from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak
+from .two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
+    "BUMP_STOP",
     "CARDS",
     "CHANNELS",
     "COMPONENTS",
@@ -45,7 +48,7 @@ __all__ = [
     "REFERENCE_V",
     "SHOCK",
     "TICKS_PER_SAMPLE",
-    "TWO_MASS_READINGS",
+    "TWO_MASS",
     "AnalogComputer",
     "BumpStop",
     "Capacitor",
@@ -63,30 +66,36 @@ __all__ = [
     "EngineError",
     "Excitation",
     "ExcitationError",
+    "ForceLaw",
     "Grade",
+    "Mass",
     "Mode",
     "ModeError",
     "NoisySuspension",
     "OpAmp",
     "OpAmpGrade",
     "OpAmpModel",
+    "Parameter",
     "PiecewiseLinear",
     "Pot",
     "PotError",
     "PotGrade",
     "PotModel",
     "Program",
+    "Quantity",
+    "RampedTweak",
     "Resistor",
     "Sampler",
     "SamplerError",
     "Scales",
     "SuspensionComputer",
     "SuspensionParts",
+    "SuspensionProgram",
     "Switch",
+    "Tweak",
     "TwoMassParts",
     "TwoMassPlant",
     "TwoMassProgram",
-    "TwoMassScales",
     "VoltageSource",
     "acquired",
     "drawn_levels",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .errors import SamplerError
 from .excitation import Edges, Excitation
 from .sampler import Card
-from .suspension import Tweak
+from .suspension import RampedTweak, Tweak, in_full
 
 __all__ = ["PROBE_S", "Playable", "acquired", "probes_per_sample"]
 
@@ -36,7 +36,11 @@ class Playable(Protocol):
     """A machine that can be played, at the rate it was made for (SuspensionComputer)."""
 
     def play(
-        self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = ..., block_samples: int = ...
+        self,
+        excitation: Excitation,
+        samples: int,
+        tweaks: Sequence[Tweak | RampedTweak] = ...,
+        block_samples: int = ...,
     ) -> Iterator[NDArray[np.float64]]: ...
 
 
@@ -59,7 +63,7 @@ def acquired(
     card: Card,
     excitation: Excitation,
     samples: int,
-    tweaks: Sequence[Tweak] = (),
+    tweaks: Sequence[Tweak | RampedTweak] = (),
     *,
     rng: np.random.Generator,
     block_samples: int = 256,
@@ -75,7 +79,7 @@ def acquired(
         return machine.play(excitation, samples, tweaks, block_samples)
     clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
     slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
-    turns = [(k * count, settings) for k, settings in tweaks]
+    turns = [(k * count, settings, ramp_n * count) for k, settings, ramp_n in map(in_full, tweaks)]
     probed = machine.play(slow, samples * count, turns, block_samples * count)
     return _picked(probed, card, count, rng)
 

@@ -1,9 +1,9 @@
-"""A third program: the suspension with a bump stop, a second spring that it meets towards the end of its travel.
+"""The program bump-stop is the front suspension with a second spring, which it meets towards the end of its travel.
 
     M x'' + B x' + K x + K_stop max(0, x - x_stop) = F
 
 A diode limiter from the summer's input to -e_x does it: beyond its threshold it draws (e_x - e_stop) / R_on, as one
-more input of the summer. Everything else is the program it is added to, with its scales.
+more input of the summer. Everything else is the suspension it is added to, with its scales.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .circuit import Circuit, DiodeLimiter
+from .circuit import DiodeLimiter
 from .errors import CircuitError
-from .suspension import Program, SuspensionComputer
+from .program import Scales
 
 __all__ = ["BumpStop"]
 
@@ -36,13 +36,8 @@ class BumpStop:
             if not (math.isfinite(value) and value > 0):
                 raise CircuitError(f"bump stop: {name} must be positive and finite, got {value!r}")
 
-    def limiter(self, program: Program) -> DiodeLimiter:
-        """The element between the nodes of a program of the suspension, on its scales."""
-        scales = program.scales
-        spring_at_rfb_n_per_m = scales.force_n / scales.displacement_m
-        on_ohm = program.parts.rfb_ohm * spring_at_rfb_n_per_m / self.stiffness_n_per_m
+    def limiter(self, scales: Scales, feedback_ohm: float) -> DiodeLimiter:
+        """The element between the nodes of a suspension on these scales, its summer fed back by feedback_ohm."""
+        spring_at_feedback_n_per_m = scales.full("force") / scales.full("displacement")
+        on_ohm = feedback_ohm * spring_at_feedback_n_per_m / self.stiffness_n_per_m
         return DiodeLimiter("STOP", "s1", "u3", self.stop_m * scales.volts("displacement"), on_ohm, self.off_ohm)
-
-    def added_to(self, computer: SuspensionComputer) -> Circuit:
-        """The circuit of a computer, its pots as they are set, with the stop."""
-        return Circuit((*computer.circuit.elements, self.limiter(computer.program)))

@@ -38,6 +38,7 @@ __all__ = [
     "Grade",
     "OpAmpGrade",
     "PotGrade",
+    "contact_of",
 ]
 
 REFERENCE_C = 25.0
@@ -201,7 +202,8 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
 class PotGrade:
     """Coefficient pots: the track's grade, the resistance of the wiper, of the ends beyond each stop, and the windings.
 
-    windings: turns of wire on the track, on one of which the wiper rests; 0 for a continuous track.
+    windings: turns of wire on the track, on one of which the wiper rests; 0 for a continuous track. wiper_noise_ohm: by
+    how much the wiper's resistance rises at most while it moves, differently from place to place (drawn).
     Raises CircuitError naming the field.
     """
 
@@ -209,13 +211,14 @@ class PotGrade:
     wiper_ohm: float = 0.0
     end_ohm: float = 0.0
     windings: int = 0
+    wiper_noise_ohm: float = 0.0
 
     def __post_init__(self) -> None:
         self.model(1.0)
 
     def model(self, track_ohm: float) -> PotModel:
         """The pot of this grade whose track between the stops has track_ohm."""
-        return PotModel(track_ohm, self.wiper_ohm, self.end_ohm, self.windings)
+        return PotModel(track_ohm, self.wiper_ohm, self.end_ohm, self.windings, self.wiper_noise_ohm)
 
 
 @dataclass(frozen=True)
@@ -242,6 +245,11 @@ class Components:
         _require(self, "temperature_c", -55 <= self.temperature_c <= 125, "must be within -55..125")
         _require(self, "age_h", 0 <= self.age_h < math.inf, "must be finite and not negative")
         _require(self, "seed", self.seed >= 0, "must not be negative")
+
+    def contact(self, pot: Pot) -> NDArray[np.float64]:
+        """PotModel.contact of one pot, drawn from the seed and the pot's name."""
+        rng = np.random.default_rng([self.seed, *contact_of(pot.name).lower().encode()])
+        return self.pots.model(pot.track_ohm).contact(rng)
 
     def fitted(self, elements: Iterable[Element]) -> tuple[Element, ...]:
         """One specimen of a netlist: each element with its real value, followed by what comes with it.
@@ -337,6 +345,15 @@ def _losses(capacitor: Capacitor, dielectric: Dielectric) -> Iterator[Element]:
         yield Capacitor(f"{name}_soak{i}", inner, b, farad)
 
 
+_NOWHERE_OHM = 1e12
+"""What leads to it leads nowhere."""
+
+
+def contact_of(pot: str) -> str:
+    """Name of the rheostat that is the noisy contact of a pot's wiper: all of it at dial 0, nothing at dial 1."""
+    return f"{pot}_contact"
+
+
 def _mounted(pot: Pot, grade: PotGrade) -> Iterator[Element]:
     wiper, top, bottom = pot.wiper, pot.top, pot.bottom
     if grade.wiper_ohm > 0:
@@ -346,6 +363,10 @@ def _mounted(pot: Pot, grade: PotGrade) -> Iterator[Element]:
         top, bottom = f"{pot.name}_top", f"{pot.name}_bottom"
         yield Resistor(f"{pot.name}_top_ohm", pot.top, top, grade.end_ohm)
         yield Resistor(f"{pot.name}_bottom_ohm", bottom, pot.bottom, grade.end_ohm)
+    if grade.wiper_noise_ohm > 0:
+        contact, rest, wiper = contact_of(pot.name), wiper, f"{pot.name}_track"
+        yield Pot(contact, wiper, rest, f"{contact}_end", grade.wiper_noise_ohm, 1.0)
+        yield Resistor(f"{contact}_ohm", f"{contact}_end", GROUND, _NOWHERE_OHM)
     yield replace(pot, top=top, wiper=wiper, bottom=bottom)
 
 

@@ -19,8 +19,9 @@ from .components import DIELECTRICS, NOMINAL, OP_AMP_GRADES, Components, Dielect
 from .excitation import Excitation
 from .noise import NoisySuspension
 from .opamp import IDEAL, PRESETS, OpAmpModel
+from .program import CHANNELS, Program
 from .sampler import Card, Sampler, drawn_levels
-from .suspension import CHANNELS, PROGRAMS, Program, SuspensionComputer, Tweak
+from .suspension import PROGRAMS, SuspensionComputer, Tweak
 
 __all__ = ["DRAWS", "SAMPLES", "Effect", "measured_effects"]
 
@@ -65,7 +66,7 @@ def _without_load(
     machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
 ) -> dict[str, float]:
     """Turns the dial to the coefficient that the pot should give under load."""
-    return {f"{key[0]}_dial": machine.program.coefficient(key[0], value) for key, value in wanted.items()}
+    return {f"{key[0]}_dial": machine.program.coefficient(key, value) for key, value in wanted.items()}
 
 
 def _to_a_thousandth(
@@ -100,8 +101,7 @@ class _Setup:
         components = dataclasses.replace(self.components, seed=seed)
         machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
         rng = np.random.default_rng(seed)
-        given = {"M_kg": program.M_kg, "B_n_s_per_m": program.B_n_s_per_m, "K_n_per_m": program.K_n_per_m}
-        machine.set(**self.operator(machine, given, rng))
+        machine.set(**self.operator(machine, program.values, rng))
         tweaks = [(sample, self.operator(machine, wanted, rng)) for sample, wanted in _CHANGES[program.name]]
         played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
         volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, tweaks, rng=rng)))

@@ -16,8 +16,8 @@ from __future__ import annotations
 import enum
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
+from .components import NOMINAL, Components, contact_of
 from .engine import Engine
 from .errors import CircuitError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
@@ -42,6 +43,11 @@ LAMP_DELAY_S = 10e-6
 
 _AT_ONCE_OHM = 10e3
 _BISECTIONS = 53
+
+_SLOW_PER_SAMPLE = 5e-5
+"""A dial that turns by so much a sample may stand still from one sample to the next."""
+
+_MOST_PIECES = 64
 
 _READING_TOLERANCE = 2 * END_FRACTION
 """The end stops leave so much of the track."""
@@ -82,6 +88,8 @@ class AnalogComputer:
     for lamp_delay_s without a break: then its junction is off virtual ground, by more than slew / (2 pi GBW) (0.7 V
     for a TL07x). Amplifiers without such limits have a lamp that stays dark.
 
+    components: with which the circuit was fitted; they say where wipers come to rest, and how they sound on the way.
+
     Raises CircuitError for errors of patching and for an integrator that is none.
     """
 
@@ -94,6 +102,7 @@ class AnalogComputer:
         ic_ohm: float | None = 10e3,
         sample_rate_hz: float = 20e3,
         lamp_delay_s: float = LAMP_DELAY_S,
+        components: Components = NOMINAL,
     ) -> None:
         if ic_ohm is not None and not (math.isfinite(ic_ohm) and ic_ohm > 0):
             raise CircuitError(f"ic_ohm must be positive and finite, got {ic_ohm!r}")
@@ -104,7 +113,9 @@ class AnalogComputer:
         self._ic_ohm = ic_ohm
         self._sample_rate_hz = sample_rate_hz
         self._lamp_delay_ticks = round(lamp_delay_s * sample_rate_hz * TICKS_PER_SAMPLE)
+        self._wipers = _Wipers(circuit, components)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
+        self._turns: dict[str, _Turn] = {}
         self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
         self._nodals: dict[Mode, Nodal] = {}
         self._check_integrators(self._initial_v)
@@ -134,7 +145,7 @@ class AnalogComputer:
     @property
     def dials(self) -> dict[str, float]:
         """Where the pots stand, 0..1."""
-        return dict(self._dials)
+        return {pot: self._dials[pot] for pot in self._wipers.pots}
 
     @property
     def recorded(self) -> int:
@@ -165,17 +176,39 @@ class AnalogComputer:
 
     # ---- pots
 
-    def turn(self, dials: Mapping[str, float]) -> None:
+    def turn(self, dials: Mapping[str, float], ramp_n: int = 0) -> None:
         """Turns pots to these dials, in any mode; a running machine keeps its voltages.
 
-        Raises PotError for a dial off its track or a pot that is not there, with nothing turned.
+        With ramp_n they turn evenly while run() plays on, and arrive ramp_n samples after the last one taken (sample 0
+        when there is none yet). Wipers rest on the nearest winding, on the way too. A pot that is turned again goes on
+        from where it is.
+        Raises PotError for a dial off its track, a pot that is not there or a ramp of less than no samples, with
+        nothing turned.
         """
-        for pot, dial in dials.items():
-            if pot not in self._dials:
-                raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._dials)) or 'none'}")
-            checked_dial(dial, pot)
-        self._dials |= dials
+        goals = self.resting(dials)
+        if ramp_n < 0:
+            raise PotError(f"pots {', '.join(dials)}: cannot turn in {ramp_n} samples")
+        for pot in goals:
+            self._turns.pop(pot, None)
+        if ramp_n:
+            first = max(self.recorded - 1, 0)
+            moving = {pot: dial for pot, dial in goals.items() if dial != self._dials[pot]}
+            self._turns |= {pot: _Turn(self._dials[pot], dial, first, first + ramp_n) for pot, dial in moving.items()}
+        else:
+            self._dials |= goals
+        self._dials |= self._wipers.contacts_at_rest(goals)
         self._change()
+
+    def resting(self, dials: Mapping[str, float]) -> dict[str, float]:
+        """Where the wipers come to rest when pots are turned to these dials. Raises PotError, as turn does."""
+        for pot, dial in dials.items():
+            self._check_pot(pot)
+            checked_dial(dial, pot)
+        return {pot: self._wipers.resting(pot, dial) for pot, dial in dials.items()}
+
+    def _check_pot(self, pot: str) -> None:
+        if pot not in self._wipers.pots:
+            raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
 
     def throw(self, closed: Mapping[str, bool]) -> None:
         """Throws switches of the circuit, in any mode. Raises CircuitError for one that is not there."""
@@ -191,7 +224,10 @@ class AnalogComputer:
         return self._reading(self._pot_on_reference(pot), pot, self._dials[pot])
 
     def set_coefficient(self, pot: str, coefficient: float) -> None:
-        """Turns a pot in POT SET until coefficient() reads so. Raises ModeError, and PotError beyond the track."""
+        """Turns a pot in POT SET until coefficient() reads so, to the nearest winding.
+
+        Raises ModeError, and PotError beyond the track.
+        """
         nodal = self._pot_on_reference(pot)
         low, high = 0.0, 1.0
         for _ in range(_BISECTIONS):
@@ -207,9 +243,11 @@ class AnalogComputer:
     def restart(self, mode: Mode = Mode.INITIAL_CONDITION) -> None:
         """Power off and on: empty capacitors, inputs at 0 V, dark lamps, the clock before sample 0; in that mode.
 
-        The pots and the initial voltages stay as they are set.
+        The pots and the initial voltages stay as they are set; a pot on its way stays where it is.
         """
         self._mode = mode
+        self._dials |= self._wipers.contacts_at_rest(self._turns)
+        self._turns = {}
         self._levels_v = {source.name: 0.0 for source in self._patched.of(VoltageSource) if source.dc_v is None}
         self._powered: Engine | None = None
         self._solved: PiecewiseLinear | None = None
@@ -246,6 +284,8 @@ class AnalogComputer:
         """
         edges = edges or {}
         self._check_switches([mode for _, mode in switches])
+        if switches and self._turns:
+            raise ModeError(f"relays cannot switch between samples while {', '.join(self._turns)} are being turned")
         self._check_instants(samples, [tick for tick, _ in switches])
         volts = []
         stop = self.recorded + samples
@@ -294,11 +334,16 @@ class AnalogComputer:
     def _system(self) -> PiecewiseLinear:
         """The state space of the present mode, the pots as they are set now."""
         if self._solved is None:
-            nodal = self._nodals.get(self._mode)
-            if nodal is None:
-                nodal = self._nodals[self._mode] = Nodal(self._wired(self._mode))
-            self._solved = nodal.at(self._dials, self._closed)
+            self._solved = self._nodal.at(self._dials, self._closed)
         return self._solved
+
+    @property
+    def _nodal(self) -> Nodal:
+        """Of the present mode, at any setting of the pots."""
+        nodal = self._nodals.get(self._mode)
+        if nodal is None:
+            nodal = self._nodals[self._mode] = Nodal(self._wired(self._mode))
+        return nodal
 
     def _play_to(self, tick: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
         """Records what samples there are up to a tick, and goes there."""
@@ -313,9 +358,37 @@ class AnalogComputer:
         return volts
 
     def _play(self, samples: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        volts = self._engine.run(samples, edges)
+        if not (self._turns and samples):
+            volts = self._engine.run(samples, edges)
+        else:
+            volts = np.concatenate(list(self._turned(self.recorded + samples, edges)))
         self._note_levels(edges)
         return volts
+
+    def _turned(self, stop: int, edges: Mapping[str, Edges]) -> Iterator[NDArray[np.float64]]:
+        """Records samples up to stop, in stretches in which the same pots are being turned."""
+        while self._turns and self.recorded < stop:
+            last = min(stop - 1, *(turn.last for turn in self._turns.values()))
+            pieces = max(turn.pieces for turn in self._turns.values())
+            until = last * TICKS_PER_SAMPLE
+            yield self._engine.run_turning(last + 1 - self.recorded, self._while_turning, _until(edges, until), pieces)
+            edges = _after(edges, until)
+            self._dials |= self._dials_at(last)
+            self._turns = {pot: turn for pot, turn in self._turns.items() if turn.last > last}
+            self._change()
+        yield self._engine.run(stop - self.recorded, edges)
+
+    def _while_turning(self, sample: float) -> PiecewiseLinear:
+        return self._nodal.at(self._dials | self._dials_at(sample), self._closed)
+
+    def _dials_at(self, sample: float) -> dict[str, float]:
+        """The pots on their way, and the contacts of their wipers."""
+        dials: dict[str, float] = {}
+        for pot, turn in self._turns.items():
+            dials[pot] = self._wipers.resting(pot, turn.at(sample))
+            moves = turn.first < sample < turn.last
+            dials |= self._wipers.contacts_moving(pot, dials[pot]) if moves else self._wipers.contacts_at_rest([pot])
+        return dials
 
     def _note_levels(self, edges: Mapping[str, Edges]) -> None:
         self._levels_v |= {name: float(train.levels_v[-1]) for name, train in edges.items() if train.ticks.size}
@@ -391,8 +464,7 @@ class AnalogComputer:
     def _pot_on_reference(self, pot: str) -> Nodal:
         if self._mode is not Mode.POT_SET:
             raise ModeError(f"coefficients are read and set in POT SET, and this is {self._mode.value}")
-        if pot not in self._dials:
-            raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._dials)) or 'none'}")
+        self._check_pot(pot)
         pot_top = self._terminal(pot, "top")
         elements = [
             _moved(element, pot_top, "reference") if element.name == pot or is_part_of(element, pot) else element
@@ -413,6 +485,55 @@ class AnalogComputer:
         levels_v = np.array([self._levels_v[name] for name in system.inputs])
         z = np.concatenate((system.rest(levels_v), levels_v, (1.0,)))
         return float((system.readings([self._terminal(pot, "wiper")])[0] * z).sum()) / REFERENCE_V
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """A pot on its way, evenly, from one dial at sample `first` to another at sample `last`."""
+
+    start: float
+    goal: float
+    first: int
+    last: int
+
+    def at(self, sample: float) -> float:
+        """The dial."""
+        if sample >= self.last:
+            return self.goal
+        return self.start + (self.goal - self.start) * max(sample - self.first, 0.0) / (self.last - self.first)
+
+    @property
+    def pieces(self) -> int:
+        """Into how many pieces of standing dials a sample is cut: the error goes with speed / pieces^2."""
+        speed_per_sample = abs(self.goal - self.start) / (self.last - self.first)
+        return min(max(math.ceil(math.sqrt(speed_per_sample / _SLOW_PER_SAMPLE)), 1), _MOST_PIECES)
+
+
+class _Wipers:
+    """What the wipers of a circuit's pots do: where they rest, and what their contacts do on the way."""
+
+    def __init__(self, circuit: Circuit, components: Components) -> None:
+        names = [pot.name for pot in circuit.of(Pot)]
+        contacts = {contact_of(name) for name in names}
+        self.pots = {
+            pot.name: components.pots.model(pot.track_ohm) for pot in circuit.of(Pot) if pot.name not in contacts
+        }
+        self._contacts = {pot.name: components.contact(pot) for pot in circuit.of(Pot) if contact_of(pot.name) in names}
+
+    def resting(self, pot: str, dial: float) -> float:
+        """On the nearest winding."""
+        return self.pots[pot].resting(dial)
+
+    def contacts_at_rest(self, pots: Iterable[str]) -> dict[str, float]:
+        """The dials of the contacts of these pots while their wipers stand: no resistance."""
+        return {contact_of(pot): 1.0 for pot in pots if pot in self._contacts}
+
+    def contacts_moving(self, pot: str, dial: float) -> dict[str, float]:
+        """The dial of the contact while the wiper passes there."""
+        if pot not in self._contacts:
+            return {}
+        places = self._contacts[pot]
+        return {contact_of(pot): 1.0 - float(places[round(dial * (len(places) - 1))])}
 
 
 def _lifted(element: Element, patch: Patch) -> Element:

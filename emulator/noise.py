@@ -25,7 +25,7 @@ from .errors import CircuitError
 from .excitation import Excitation
 from .nodal import PiecewiseLinear, piecewise_linear
 from .pot import legs_ohm
-from .suspension import CHANNEL_NODES, CHANNEL_SIGNS, SuspensionComputer, Tweak
+from .suspension import RampedTweak, SuspensionComputer, Tweak
 
 __all__ = ["BOLTZMANN_J_PER_K", "CircuitNoise", "NoisySuspension"]
 
@@ -107,17 +107,20 @@ class NoisySuspension:
         self._temperature_c = temperature_c
 
     def play(
-        self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = (), block_samples: int = 4096
+        self,
+        excitation: Excitation,
+        samples: int,
+        tweaks: Sequence[Tweak | RampedTweak] = (),
+        block_samples: int = 4096,
     ) -> Iterator[Matrix]:
-        """As SuspensionComputer.play; set() between two blocks does not reach the noise."""
+        """As SuspensionComputer.play; set() between two blocks does not reach the noise, a ramp when it has ended."""
         computer = self._computer
         circuit = computer.circuit
-        turns = [
-            (sample + 1, computer.dials_for(**settings)) for sample, settings in sorted(tweaks, key=lambda t: t[0])
-        ]
+        turns = [(turn.sample + 1 + turn.ramp_n, turn.dials) for turn in computer.planned(tweaks, samples)]
+        turns.sort(key=lambda turn: turn[0])
         noise = CircuitNoise(
             circuit,
-            CHANNEL_NODES,
+            computer.program.channel_nodes,
             op_amps=self._op_amps,
             temperature_c=self._temperature_c,
             sample_rate_hz=computer.sample_rate_hz,
@@ -135,7 +138,7 @@ class NoisySuspension:
                     circuit = circuit.with_dials(turns.pop(0)[1])
                     noise.set_circuit(circuit)
                 until = min(len(block), turns[0][0] - first) if turns else len(block)
-                block[done:until] += noise.volts(until - done, self._rng) * CHANNEL_SIGNS
+                block[done:until] += noise.volts(until - done, self._rng) * self._computer.program.channel_signs
                 done = until
             first += len(block)
             yield block

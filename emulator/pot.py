@@ -13,9 +13,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .errors import CircuitError, PotError
 
 __all__ = ["END_FRACTION", "PotModel", "checked_dial", "coefficient_under_load", "dial_for", "legs_ohm"]
+
+_PLACES = 5000
+"""Into which a continuous track is divided for its noise."""
 
 END_FRACTION = 1e-6
 """Part of the track that stays between wiper and terminal at an end stop, so that no leg is ever a short circuit."""
@@ -57,7 +63,8 @@ class PotModel:
 
     track_ohm: between the end stops, dial 0 to dial 1; end_ohm: what lies beyond either stop; wiper_ohm: of the wiper's
     contact, in series with the load. windings: turns of wire on which the wiper can rest, so that the dial acts in
-    steps of 1 / windings; 0 for a continuous track.
+    steps of 1 / windings; 0 for a continuous track. wiper_noise_ohm: by how much the contact's resistance rises at
+    most while the wiper moves (the datasheets' equivalent noise resistance; 100 ohm is usual for wire).
     Raises CircuitError naming the field.
     """
 
@@ -65,11 +72,12 @@ class PotModel:
     wiper_ohm: float = 0.0
     end_ohm: float = 0.0
     windings: int = 0
+    wiper_noise_ohm: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.track_ohm < math.inf:
             raise CircuitError(f"pot: track_ohm must be positive and finite, got {self.track_ohm!r}")
-        for field in ("wiper_ohm", "end_ohm", "windings"):
+        for field in ("wiper_ohm", "end_ohm", "windings", "wiper_noise_ohm"):
             value = getattr(self, field)
             if not 0 <= value < math.inf:
                 raise CircuitError(f"pot: {field} must be finite and not negative, got {value!r}")
@@ -99,3 +107,10 @@ class PotModel:
     def resting(self, dial: float) -> float:
         """Where the wiper comes to rest when the dial is turned there: on the nearest winding."""
         return round(dial * self.windings) / self.windings if self.windings else dial
+
+    def contact(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """What part of wiper_noise_ohm the moving wiper meets along one specimen's track: (places,), 0..1.
+
+        A place is a winding, or a five-thousandth of a continuous track; the same place has always the same.
+        """
+        return rng.uniform(0.0, 1.0, (self.windings or _PLACES) + 1)

@@ -16,7 +16,7 @@ from harness.plant import Plant
 from harness.run import Segment
 from harness.verdict import Expectations
 
-PLANTS = {name: Plant(program.M_kg, program.B_n_s_per_m, program.K_n_per_m) for name, program in PROGRAMS.items()}
+PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
 """The parameters with which each program of the computer starts."""
 
 MAX_SAMPLES = 10_000_000

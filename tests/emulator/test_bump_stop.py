@@ -33,7 +33,7 @@ STOP = BumpStop()
 def deck_of(computer: SuspensionComputer, excitation: Excitation, samples: int, **dials: float) -> Deck:
     edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
     turns = [(samples // 2, dials)] if dials else []
-    return Deck(STOP.added_to(computer), samples, RATE_HZ, {"F": edges}, turns, title="bump stop")
+    return Deck(computer.circuit, samples, RATE_HZ, {"F": edges}, turns, title="bump stop")
 
 
 def by_equation(force_n: float, samples: int) -> NDArray[np.float64]:
@@ -53,7 +53,7 @@ def by_equation(force_n: float, samples: int) -> NDArray[np.float64]:
 
 
 def test_with_ideal_amplifiers_it_solves_its_equation() -> None:
-    computer = SuspensionComputer("front", opamp="ideal")
+    computer = SuspensionComputer("bump-stop", opamp="ideal")
     volts = deck_of(computer, Excitation(frequency_hz=1.0), 60).volts(["u5", "u2"])
     expected = by_equation(2940.0, 60) * [computer.scales.volts("displacement"), computer.scales.volts("velocity")]
     # 1.5 N/m of the limiter's off_ohm are a ppm of its displacement.
@@ -62,14 +62,14 @@ def test_with_ideal_amplifiers_it_solves_its_equation() -> None:
 
 
 def test_at_rest_on_the_stop_both_springs_carry_the_force() -> None:
-    computer = SuspensionComputer("front")
+    computer = SuspensionComputer("bump-stop")
     volts = deck_of(computer, Excitation(frequency_hz=1.0), 100).volts(["u5"])
     expected_m = (2940.0 + STOP.stiffness_n_per_m * STOP.stop_m) / (24500.0 + STOP.stiffness_n_per_m)
     assert volts[-1, 0] / computer.scales.volts("displacement") == pytest.approx(expected_m, rel=2e-4)
 
 
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -> None:
-    computer = SuspensionComputer("front", rng=np.random.default_rng(3), offset_v=3e-3)
+    computer = SuspensionComputer("bump-stop", rng=np.random.default_rng(3), offset_v=3e-3)
     excitation = Excitation(low_v=-3.0, clock="free", phase=0.637)
     deck = deck_of(computer, excitation, 300, **computer.dials_for(K_n_per_m=18000.0))
     outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
@@ -80,7 +80,7 @@ def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -
 
 
 def test_its_deck_reads_back_equal() -> None:
-    deck = deck_of(SuspensionComputer("front"), Excitation(), 100)
+    deck = deck_of(SuspensionComputer("bump-stop"), Excitation(), 100)
     read = read_deck(deck.text())
     assert read.circuit == deck.circuit
     assert np.array_equal(read.volts(["u5"]), deck.volts(["u5"]))

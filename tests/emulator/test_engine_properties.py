@@ -23,10 +23,10 @@ from emulator import (
     OpAmp,
     OpAmpModel,
     Pot,
-    Program,
     Resistor,
     Sampler,
     SuspensionComputer,
+    SuspensionProgram,
     VoltageSource,
     piecewise_linear,
     to_spice,
@@ -55,7 +55,7 @@ excitations = st.builds(
 deterministic = settings(max_examples=40, deadline=None, derandomize=True)
 
 
-def scaled(program: Program, by: tuple[float, float, float]) -> Program:
+def scaled(program: SuspensionProgram, by: tuple[float, float, float]) -> SuspensionProgram:
     """The same machine with other M (never lighter), B and K."""
     m, b, k = by
     return replace(
@@ -77,15 +77,15 @@ def kept(computer: SuspensionComputer, start: Volts, opamp_v: float) -> Volts:
     state[:2] = -start
     engine.state = state
     volts = engine.run(300)
-    program, scales = computer.program, computer.scales
+    scales, values = computer.scales, computer.program.values
     velocity, displacement = volts[:, 0] / scales.volts("velocity"), volts[:, 1] / scales.volts("displacement")
-    return np.asarray(0.5 * program.M_kg * velocity**2 + 0.5 * program.K_n_per_m * displacement**2)
+    return np.asarray(0.5 * values["M_kg"] * velocity**2 + 0.5 * values["K_n_per_m"] * displacement**2)
 
 
 @deterministic
 @given(programs, factors, st.tuples(st.floats(-6, 6), st.floats(-6, 6)))
 def test_energy_never_grows_with_excitation_off_and_pots_still(
-    program: Program, by: tuple[float, float, float], start: tuple[float, float]
+    program: SuspensionProgram, by: tuple[float, float, float], start: tuple[float, float]
 ) -> None:
     energy_j = kept(SuspensionComputer(scaled(program, by), opamp="ideal"), np.array(start), 0.0)
     assert (np.diff(energy_j) <= 1e-12 * energy_j[0]).all()
@@ -94,7 +94,7 @@ def test_energy_never_grows_with_excitation_off_and_pots_still(
 @deterministic
 @given(programs, factors, st.tuples(st.floats(-5, 5), st.floats(-5, 5)))
 def test_energy_never_grows_with_real_amplifiers_once_they_have_settled(
-    program: Program, by: tuple[float, float, float], start: tuple[float, float]
+    program: SuspensionProgram, by: tuple[float, float, float], start: tuple[float, float]
 ) -> None:
     model = replace(preset("tl07x"), avol=1e6)
     energy_j = kept(SuspensionComputer(scaled(program, by), opamp=model), np.array(start), 0.0)
@@ -104,7 +104,7 @@ def test_energy_never_grows_with_real_amplifiers_once_they_have_settled(
 @deterministic
 @given(programs, factors, excitations, excitations)
 def test_superposition_holds_while_nothing_limits(
-    program: Program, by: tuple[float, float, float], one: Excitation, other: Excitation
+    program: SuspensionProgram, by: tuple[float, float, float], one: Excitation, other: Excitation
 ) -> None:
     """Two generators into the summer, alone and together; amplifiers do not slew and stay below their clamps."""
     computer = SuspensionComputer(scaled(program, by), opamp=replace(preset("tl07x"), slew_v_per_s=float("inf")))
@@ -125,7 +125,7 @@ def test_superposition_holds_while_nothing_limits(
 @deterministic
 @given(programs, factors, excitations, st.integers(1, 300), st.integers(0, 99))
 def test_halving_the_block_size_changes_no_code(
-    program: Program, by: tuple[float, float, float], excitation: Excitation, block: int, seed: int
+    program: SuspensionProgram, by: tuple[float, float, float], excitation: Excitation, block: int, seed: int
 ) -> None:
     codes = []
     for size in (block, max(block // 2, 1)):
@@ -139,10 +139,10 @@ def test_halving_the_block_size_changes_no_code(
 @deterministic
 @given(programs, factors, excitations, st.integers(0, 298), st.sampled_from(("M_kg", "B_n_s_per_m", "K_n_per_m")))
 def test_a_tweak_to_the_same_value_changes_nothing(
-    program: Program, by: tuple[float, float, float], excitation: Excitation, sample: int, setting: str
+    program: SuspensionProgram, by: tuple[float, float, float], excitation: Excitation, sample: int, setting: str
 ) -> None:
     plain, touched = (SuspensionComputer(scaled(program, by)) for _ in range(2))
-    tweak = (sample, {setting: getattr(touched.program, setting)})
+    tweak = (sample, {setting: touched.program.values[setting]})
     untouched = np.concatenate(list(plain.play(excitation, 300)))
     assert np.array_equal(np.concatenate(list(touched.play(excitation, 300, [tweak]))), untouched)
 

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from emulator import (
     COMPONENTS,
+    FRONT,
     IDEAL,
+    SHOCK,
     TICKS_PER_SAMPLE,
     AnalogComputer,
     Capacitor,
@@ -212,7 +214,7 @@ def test_a_switch_of_the_circuit_can_be_thrown() -> None:
 
 def free_response(program: str, x0: float, v0: float, times_s: Volts) -> Volts:
     """Displacement in m and velocity in m/s, (instants, 2), of M x'' + B x' + K x = 0, 200 times its own speed."""
-    plant = SuspensionComputer(program).program
+    plant = {"front": FRONT, "shock": SHOCK}[program]
     a = np.array([[0.0, 1.0], [-plant.K_n_per_m / plant.M_kg, -plant.B_n_s_per_m / plant.M_kg]])
     return np.array([scipy.linalg.expm(a * 200.0 * t) @ (x0, v0) for t in times_s])
 

@@ -10,7 +10,6 @@ import pytest
 
 from emulator import (
     IDEAL,
-    PROGRAMS,
     AnalogComputer,
     Capacitor,
     Circuit,
@@ -76,7 +75,7 @@ def test_an_integrator_without_a_capacitor_is_refused() -> None:
         AnalogComputer(circuit, ["u5"], initial_v={"U9": 1.0})
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("program", ["front", "shock"])
 def test_the_suspension_is_patched_as_its_drawing_says(program: str) -> None:
     found = patches(SuspensionComputer(program).circuit)
     assert found["U1"] == Patch("U1", "s1", "u1", ("RF", "RB", "RK"), ())

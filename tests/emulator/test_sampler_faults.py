@@ -23,7 +23,7 @@ from emulator import (
     drawn_levels,
     probes_per_sample,
 )
-from emulator.suspension import Tweak
+from emulator.suspension import RampedTweak, Tweak
 
 Volts = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Wave:
         self.channels = channels
 
     def play(
-        self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = (), block_samples: int = 256
+        self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak | RampedTweak] = (), block_samples: int = 256
     ) -> Iterator[Volts]:
         del excitation, tweaks
         times = np.arange(samples) / self.rate_hz * 1e6

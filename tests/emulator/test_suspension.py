@@ -43,13 +43,13 @@ def played(
 
 def plant(program: Program, force_n: Volts, tweaks: Sequence[Tweak] = ()) -> Volts:
     """M x'' + B x' + K x = F with F held between samples, exactly, by scipy: x in m, v in m/s, (samples, 2)."""
-    values = {"M_kg": program.M_kg, "B_n_s_per_m": program.B_n_s_per_m, "K_n_per_m": program.K_n_per_m}
+    values = program.values
     turns = dict(tweaks)
     x = np.zeros(2)
     rows = []
     for k, force in enumerate(force_n):
         rows.append(x)
-        values |= turns.get(k, {})
+        values = {**values, **turns.get(k, {})}
         mass, damping, stiffness = values["M_kg"], values["B_n_s_per_m"], values["K_n_per_m"]
         a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
         b = np.array([[0.0], [1.0 / mass]])
@@ -118,12 +118,10 @@ def test_coefficients_are_those_of_the_set_up_sheet(program: str, coefficients: 
     assert SuspensionComputer(program).coefficients == pytest.approx(coefficients, abs=6e-5)
 
 
-@pytest.mark.parametrize("program", PROGRAMS.values())
-def test_the_displacement_scale_is_that_of_the_second_integrator(program: Program) -> None:
-    scales, parts = program.scales, program.parts
-    assert scales.displacement_m == pytest.approx(
-        scales.time * scales.velocity_m_per_s * parts.r2_ohm * parts.c2_farad, rel=1e-12
-    )
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_all_programs_move_as_far_for_10_v(program: str) -> None:
+    """README.md: 200 times 2 m/s times R2 C2 = 49.9k 10n."""
+    assert PROGRAMS[program].scales.full("displacement") == pytest.approx(0.1996, rel=1e-12)
 
 
 def test_a_tweak_at_k_shows_first_at_the_next_sample() -> None:
@@ -213,7 +211,7 @@ def test_parts_off_their_nominal_values_move_the_plant_and_not_the_pots() -> Non
     ("settings", "message"),
     [
         ({"M_kg": 29.0}, r"pot M: coefficient 1.01379 is beyond the track .*M_kg = 29 cannot be set on program front"),
-        ({"K_n_per_m": -1.0}, "pot K: K must be positive"),
+        ({"K_n_per_m": -1.0}, "pot K: K_n_per_m must be positive"),
         ({"B_dial": 1.5}, "pot B: dial 1.5 is beyond the track"),
         ({"M_kg": 50.0, "M_dial": 0.5}, "pot M: set twice"),
         ({"mass": 50.0}, "unknown setting 'mass'; there are M_kg"),
@@ -237,7 +235,7 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
         computer.play(Excitation(frequency_hz=15e3), 100)
     with pytest.raises(EngineError, match="-1 samples"):
         computer.play(Excitation(), -1)
-    with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock"):
+    with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock, bump-stop, two-mass"):
         SuspensionComputer("rear")
 
 

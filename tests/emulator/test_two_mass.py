@@ -12,13 +12,14 @@ from scipy.linalg import expm
 
 from emulator import (
     TICKS_PER_SAMPLE,
-    TWO_MASS_READINGS,
+    TWO_MASS,
     Circuit,
     Deck,
     Excitation,
     OpAmp,
     OpAmpModel,
     PotError,
+    SuspensionComputer,
     TwoMassParts,
     TwoMassPlant,
     TwoMassProgram,
@@ -32,6 +33,18 @@ LSB_V = 10.0 / 4096
 RATE_HZ = 20e3
 SAMPLES = 400
 TIME_SCALE = 200.0
+QUANTITIES = (
+    "force",
+    "displacement",
+    "velocity",
+    "net_force",
+    "suspension_force",
+    "compression",
+    "compression_rate",
+    "tyre_net_force",
+    "tyre_velocity",
+    "tyre_displacement",
+)
 TWEAKS: tuple[tuple[int, Mapping[str, float]], ...] = (
     (120, {"K2_n_per_m": 18000.0}),
     (200, {"M1_kg": 14.0, "B2_n_s_per_m": 3453.0}),
@@ -40,28 +53,28 @@ TWEAKS: tuple[tuple[int, Mapping[str, float]], ...] = (
 
 
 def deck_of(
-    program: TwoMassProgram,
+    computer: SuspensionComputer,
     tweaks: Sequence[tuple[int, Mapping[str, float]]] = TWEAKS,
     excitation: Excitation | None = None,
 ) -> Deck:
     edges = (excitation or Excitation()).edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [(sample, program.dials_for(**settings)) for sample, settings in tweaks]
-    return Deck(program.circuit(), SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
+    turns = [(sample, computer.dials_for(**settings)) for sample, settings in tweaks]
+    return Deck(computer.circuit, SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
 
 
 def by_equations(program: TwoMassProgram, tweaks: Sequence[tuple[int, Mapping[str, float]]]) -> Volts:
-    """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of TWO_MASS_READINGS), in V at their nodes."""
+    """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
     plant, scales = program.plant, program.scales
     edges = Excitation().edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
     force_v = edges.levels_v[np.searchsorted(edges.ticks, np.arange(SAMPLES) * TICKS_PER_SAMPLE, side="right") - 1]
     settings = dict(tweaks)
     state, rows = np.zeros(4), []
     for k in range(SAMPLES):
-        force_n = force_v[k] * scales.force_n / 10.0
+        force_n = force_v[k] * scales.full("force") / 10.0
         rows.append(quantities(plant, state, force_n))
         plant = replace(plant, **settings.get(k, {}))
         state = stepped(plant, state, force_n)
-    return np.array(rows) * [scales.volts_per(quantity) for quantity in TWO_MASS_READINGS]
+    return np.array(rows) * [scales.volts_at_node(quantity) for quantity in QUANTITIES]
 
 
 def quantities(plant: TwoMassPlant, state: Volts, force_n: float) -> list[float]:
@@ -85,39 +98,37 @@ def stepped(plant: TwoMassPlant, state: Volts, force_n: float) -> Volts:
     return following
 
 
-READ_NODES = [node for node, _ in TWO_MASS_READINGS.values()]
+READ_NODES = [TWO_MASS.scales.quantities[quantity].node for quantity in QUANTITIES]
 
 
 def test_with_ideal_amplifiers_it_solves_the_equations_of_the_thesis() -> None:
-    program = TwoMassProgram(opamp="ideal")
-    volts = deck_of(program).volts(READ_NODES)
-    np.testing.assert_allclose(volts, by_equations(program, TWEAKS), atol=1e-9)
+    volts = deck_of(SuspensionComputer("two-mass", opamp="ideal")).volts(READ_NODES)
+    np.testing.assert_allclose(volts, by_equations(TWO_MASS, TWEAKS), atol=1e-9)
 
 
 def test_with_real_amplifiers_it_stays_within_15_lsb_of_them() -> None:
     # Bandwidth: U7 sees a noise gain of 17, and the tyre rings at 3.4 kHz of machine time.
-    program = TwoMassProgram()
-    volts = deck_of(program).volts(READ_NODES)
-    deviation = np.abs(volts - by_equations(program, TWEAKS)).max(axis=0) / LSB_V
+    volts = deck_of(SuspensionComputer("two-mass")).volts(READ_NODES)
+    deviation = np.abs(volts - by_equations(TWO_MASS, TWEAKS)).max(axis=0) / LSB_V
     moving = [READ_NODES.index(node) for node in ("u11", "u2", "u5", "u8", "u9")]
     assert deviation[moving].max() < 15.0
 
 
 def test_no_amplifier_exceeds_10_v() -> None:
-    deck = deck_of(TwoMassProgram())
+    deck = deck_of(SuspensionComputer("two-mass"))
     assert np.abs(deck.volts([amp.out for amp in deck.circuit.of(OpAmp)])).max() < 10.0
 
 
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -> None:
     # At an edge's own instant ngspice still shows the level before it, so no edge is to fall on a sample.
-    deck = deck_of(TwoMassProgram(), excitation=Excitation(clock="free", phase=0.637))
+    deck = deck_of(SuspensionComputer("two-mass"), excitation=Excitation(clock="free", phase=0.637))
     outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
     reference = ngspice(deck.text(outputs), outputs, SAMPLES)
     assert np.abs(deck.volts(outputs) - reference).max() < 0.05 * LSB_V
 
 
 def test_it_is_a_netlist_that_reads_back_equal() -> None:
-    deck = deck_of(TwoMassProgram())
+    deck = deck_of(SuspensionComputer("two-mass"))
     read = read_deck(deck.text())
     assert read.circuit == deck.circuit
     assert np.array_equal(read.volts(["u11"]), deck.volts(["u11"]))
@@ -126,26 +137,23 @@ def test_it_is_a_netlist_that_reads_back_equal() -> None:
 def test_both_springs_in_series_carry_a_constant_force() -> None:
     plant = TwoMassPlant(K1_n_per_m=225e3, M1_kg=13.0)
     program = TwoMassProgram(plant)
-    volts = deck_of(program, ()).volts(["u11"])
+    volts = deck_of(SuspensionComputer(program), ()).volts(["u11"])
     scales = program.scales
     static_m = 2940.0 / plant.K2_n_per_m + 2940.0 / plant.K1_n_per_m
-    assert volts[49, 0] / scales.volts_per("displacement_m") == pytest.approx(static_m, rel=0.002)
+    assert volts[49, 0] / scales.volts_at_node("displacement") == pytest.approx(static_m, rel=0.002)
 
 
 def test_the_scaling_of_the_readme() -> None:
-    program = TwoMassProgram()
+    computer = SuspensionComputer("two-mass")
     expected = {"M2": 0.2557, "B2": 0.6819, "K2": 0.8300, "M1": 0.7014, "B1": 0.3013, "K1": 0.7954}
-    assert program.coefficients() == pytest.approx(expected, abs=1e-4)
-    assert program.shown(program.dials()) == pytest.approx(program.coefficients())
-    scales = asdict(program.scales)
-    assert scales["suspension_force_n"] == pytest.approx(5891.8, abs=0.1)
-    assert scales["tyre_net_force_n"] == pytest.approx(995.7, abs=0.1)
-    assert (scales["tyre_velocity_m_per_s"], scales["tyre_displacement_m"]) == pytest.approx((1.0, 0.04))
+    assert computer.coefficients == pytest.approx(expected, abs=1e-4)
+    full = computer.scales.full
+    assert full("suspension_force") == pytest.approx(5891.8, abs=0.1)
+    assert full("tyre_net_force") == pytest.approx(995.7, abs=0.1)
+    assert (full("tyre_velocity"), full("tyre_displacement")) == pytest.approx((1.0, 0.04))
     # x2 = d + x1 needs both at U11 on one scale.
     parts = TwoMassParts()
-    assert scales["tyre_displacement_m"] * parts.r_out_x1_ohm == pytest.approx(
-        scales["displacement_m"] * parts.feedback_ohm
-    )
+    assert full("tyre_displacement") * parts.r_out_x1_ohm == pytest.approx(full("displacement") * parts.feedback_ohm)
 
 
 @pytest.mark.parametrize(
@@ -159,11 +167,11 @@ def test_the_scaling_of_the_readme() -> None:
 )
 def test_what_no_pot_can_show_is_refused_naming_it(settings: dict[str, float], message: str) -> None:
     with pytest.raises(PotError, match=message):
-        TwoMassProgram().dials_for(**settings)
+        SuspensionComputer("two-mass").dials_for(**settings)
 
 
 def test_any_op_amp_can_be_given() -> None:
     model = OpAmpModel(gbw_hz=1e7)
-    circuit: Circuit = TwoMassProgram(opamp=model).circuit()
+    circuit: Circuit = SuspensionComputer("two-mass", opamp=model).circuit
     assert {amp.model for amp in circuit.of(OpAmp)} == {model}
     assert len(circuit.of(OpAmp)) == 11
