@@ -112,7 +112,7 @@ class Program(ABC):
     @property
     @abstractmethod
     def parameters(self) -> Mapping[str, Parameter]:
-        """What the pots show, by the name of the setting ("M_kg")."""
+        """What the pots show, by the name of the setting ("M_kg"); first mass, damper and spring of the sprung mass."""
 
     @property
     @abstractmethod

@@ -90,15 +90,16 @@ class Bench:
             rig=self.rig.description(),
             dut=self.dut.description(),
             link=self.dut.link_name,
+            faults=scenario.caveats,
         )
         collected = _Collected()
         try:
             self._exchange(performance.blocks, scenario.samples, collected)
             conditions = dataclasses.replace(conditions, counters=self.dut.stop())
         except (DeviceError, LinkError, RigError) as error:
-            conditions = dataclasses.replace(conditions, faults=(str(error),))
+            conditions = dataclasses.replace(conditions, faults=(*conditions.faults, str(error)))
         except KeyboardInterrupt:
-            conditions = dataclasses.replace(conditions, faults=(INTERRUPTED_BY_USER,))
+            conditions = dataclasses.replace(conditions, faults=(*conditions.faults, INTERRUPTED_BY_USER))
         lit = {amplifier: sample for amplifier, sample in performance.lamps().items() if sample < collected.samples}
         return collected.run(dataclasses.replace(conditions, overloads=lit), self.dut.parameters)
 

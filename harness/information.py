@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.plant import AT_REST, SampledPlant, State
+from harness.plant import AT_REST, Plant, SampledPlant, State
 from harness.run import Run
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
@@ -32,19 +32,30 @@ def changes(run: Run) -> list[NDArray[np.float64]]:
     displacement = conditions.channels["displacement"]
     variance_lsb2 = displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2
     usable = ~run.missing
+    period_s = conditions.sample_period_problem_s
+    ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
     state = AT_REST
-    before: SampledPlant | None = None
+    before: Plant | None = None
     out: list[NDArray[np.float64]] = []
     for start, end, plant in run.segments:
-        now = SampledPlant.of(plant, conditions.sample_period_problem_s)
+        steps = _steps(before or plant, plant, ramps_n[start], end - start, period_s)
         if before is not None:
-            difference_m = _displacement_difference(before, now, state, force_n[start : end - 1])
+            unchanged = SampledPlant.of(before, period_s)
+            difference_m = _displacement_difference(unchanged, steps, state, force_n[start : end - 1])
             seen = np.where(usable[start + 1 : end], difference_m / displacement.lsb, 0.0)
             out.append(np.cumsum(seen**2) / (2.0 * variance_lsb2))
-        for force in force_n[start:end]:
-            state = now.next(state, force)
-        before = now
+        for step, force in zip(steps, force_n[start:end], strict=True):
+            state = step.next(state, force)
+        before = plant
     return out
+
+
+def _steps(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
+    """The plant in each of the sample periods after a change; on a ramp that of the period's middle."""
+    turning = [
+        SampledPlant.of(before.on_the_way(after, (k + 0.5) / ramp_n), period_s) for k in range(min(ramp_n, samples))
+    ]
+    return turning + [SampledPlant.of(after, period_s)] * (samples - len(turning))
 
 
 def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
@@ -54,12 +65,12 @@ def first_reaching(information: Sequence[float] | NDArray[np.float64], level: fl
 
 
 def _displacement_difference(
-    before: SampledPlant, after: SampledPlant, state: State, force_n: Sequence[float]
+    before: SampledPlant, after: Sequence[SampledPlant], state: State, force_n: Sequence[float]
 ) -> NDArray[np.float64]:
     """(n,) metres, after each of the n forces."""
     unchanged, changed = state, state
     out = np.empty(len(force_n))
     for k, force in enumerate(force_n):
-        unchanged, changed = before.next(unchanged, force), after.next(changed, force)
+        unchanged, changed = before.next(unchanged, force), after[k].next(changed, force)
         out[k] = changed[0] - unchanged[0]
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from emulator import TICKS_PER_SAMPLE, Deck
 from emulator.suspension import SOURCE
 from harness.errors import ConfigurationError
-from harness.rig import EmulatorRig, Rig
+from harness.rig import EmulatorRig, Rig, SetUp
 from harness.scenario import Scenario
 
 
@@ -23,6 +23,21 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
         samples=scenario.samples,
         sample_rate_hz=rate_hz,
         edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
-        turns=[(sample, setup.computer.dials_for(**settings)) for sample, settings in setup.tweaks],
+        turns=_turns(setup, scenario.samples),
         title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
     )
+
+
+def _turns(setup: SetUp, samples: int) -> list[tuple[int, dict[str, float]]]:
+    """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
+    dials = setup.computer.dials
+    turns: list[tuple[int, dict[str, float]]] = []
+    for sample, goals, ramp_n in setup.computer.planned(setup.tweaks, samples):
+        for k in range(min(ramp_n, samples - sample)):
+            part = (k + 0.5) / ramp_n
+            between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}
+            turns.append((sample + k, setup.computer.machine.resting(between)))
+        if sample + ramp_n < samples:
+            turns.append((sample + ramp_n, goals))
+        dials |= goals
+    return turns

@@ -28,6 +28,7 @@ from emulator import (
     Excitation,
     NoisySuspension,
     OpAmpGrade,
+    RampedTweak,
     Sampler,
     SuspensionComputer,
     acquired,
@@ -36,6 +37,7 @@ from emulator import (
 from emulator.opamp import preset
 from harness import config
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, RigError
+from harness.plant import Plant
 from harness.run import CHANNELS, Channel, Run, Segment
 from harness.scenario import Scenario
 
@@ -46,9 +48,6 @@ MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
 
 CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
-
-_SETTINGS = {"mass_kg": "M_kg", "damping_n_s_per_m": "B_n_s_per_m", "stiffness_n_per_m": "K_n_per_m"}
-"""Scenario's names of the parameters to the emulator's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +129,8 @@ class ComputerDescription:
     """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
     temperature_c: float = 25.0
     age_h: float = 0.0
+    wiper_noise_ohm: float = 0.0
+    """By how much the resistance of a wiper rises at most while its pot is turned (``ramp_n``)."""
     noise: bool = False
     """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
 
@@ -141,6 +142,10 @@ class ComputerDescription:
         stock = dataclasses.replace(
             COMPONENTS[self.components], temperature_c=self.temperature_c, age_h=self.age_h, seed=seed
         )
+        if self.wiper_noise_ohm:
+            stock = dataclasses.replace(
+                stock, pots=dataclasses.replace(stock.pots, wiper_noise_ohm=self.wiper_noise_ohm)
+            )
         graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
         return dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
 
@@ -226,7 +231,7 @@ class SetUp(NamedTuple):
 
     computer: SuspensionComputer
     excitation: Excitation
-    tweaks: tuple[tuple[int, dict[str, float]], ...]
+    tweaks: tuple[RampedTweak, ...]
 
 
 class EmulatorRig:
@@ -251,12 +256,12 @@ class EmulatorRig:
         with _emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
-        tweaks = []
+        tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with _emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = _settings(tweak.given())
+                settings = _settings(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
-            tweaks.append((tweak.sample, settings))
+            tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
@@ -286,7 +291,7 @@ class EmulatorRig:
             components=drawn.fitted(seed),
             sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
         )
-        computer.set(**_settings(scenario.plant.given()))
+        computer.set(**_settings(computer, scenario.plant.given()))
         return computer
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
@@ -398,5 +403,9 @@ def _emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configur
         raise as_error(f"{prefix}{error}") from error
 
 
-def _settings(given: Mapping[str, float]) -> dict[str, float]:
-    return {_SETTINGS[name]: value for name, value in given.items()}
+def _settings(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+    """The scenario's names of the parameters as the program has them."""
+    names = {
+        field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
+    }
+    return {names[name]: value for name, value in given.items()}

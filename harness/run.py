@@ -74,10 +74,11 @@ def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Segment:
-    """The plant from ``start`` (sample index) until the next segment."""
+    """The plant from ``start`` (sample index) until the next segment; ramp_n samples go by until it has become so."""
 
     start: int
     plant: Plant
+    ramp_n: int = 0
 
 
 @dataclass(frozen=True)
@@ -242,7 +243,7 @@ def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
 def _to_json(conditions: Conditions) -> dict[str, Any]:
     out = dict(vars(conditions))
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
-    out["segments"] = [{"start": s.start, "plant": vars(s.plant)} for s in conditions.segments]
+    out["segments"] = [{**vars(s), "plant": vars(s.plant)} for s in conditions.segments]
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -16,6 +17,11 @@ from harness.plant import Plant
 from harness.run import Segment
 from harness.verdict import Expectations
 
+MAX_RAMP_N = 100_000
+
+_MASS_DAMPER_SPRING = ("front", "shock")
+"""The programs that are one, which is what the harness's plant, its bounds and its estimates describe."""
+
 PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
 """The parameters with which each program of the computer starts."""
 
@@ -27,7 +33,7 @@ MAX_SAMPLES = 10_000_000
 class PlantChoice:
     """The program on the computer and where its pots stand at the start."""
 
-    set: Literal["front", "shock"] = "front"
+    set: Literal["front", "shock", "bump-stop", "two-mass"] = "front"
     mass_kg: float | None = None
     damping_n_s_per_m: float | None = None
     stiffness_n_per_m: float | None = None
@@ -45,17 +51,23 @@ class PlantChoice:
 
 @dataclass(frozen=True)
 class Tweak:
-    """Pots that jump at the instant of one sample; the next sample is the first that can tell."""
+    """Pots that jump at the instant of one sample; the next sample is the first that can tell.
+
+    With ramp_n they turn evenly from that instant on, and arrive ramp_n samples later.
+    """
 
     sample: int
     mass_kg: float | None = None
     damping_n_s_per_m: float | None = None
     stiffness_n_per_m: float | None = None
+    ramp_n: int = 0
 
     def __post_init__(self) -> None:
         _check_positive(self)
         if self.sample < 1:
             raise ValueError(f"sample must be at least 1, not {self.sample}")
+        if not 0 <= self.ramp_n <= MAX_RAMP_N:
+            raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
         if not _given(self):
             raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
 
@@ -86,6 +98,12 @@ class Scenario:
             raise ValueError(f"tweaks must come in the order of their samples, each sample once, not {instants}")
         if instants and instants[-1] >= self.samples:
             raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {self.samples} samples")
+        for tweak, following in itertools.pairwise(self.tweaks):
+            if tweak.sample + tweak.ramp_n > following.sample:
+                raise ValueError(
+                    f"the tweak at sample {tweak.sample} lasts {tweak.ramp_n} samples,"
+                    f" beyond the next one at {following.sample}"
+                )
 
     @classmethod
     def load(cls, name: str) -> Scenario:
@@ -111,14 +129,22 @@ class Scenario:
             return self.excitation
         return dataclasses.replace(self.excitation, phase=float(rng.uniform()))
 
+    @property
+    def caveats(self) -> tuple[str, ...]:
+        """Why runs of it are not judged; none for the programs of a mass, a damper and a spring."""
+        program = self.plant.set
+        if program in _MASS_DAMPER_SPRING:
+            return ()
+        return (f"the program {program} is not one mass, damper and spring, of which bounds and estimates speak",)
+
     def segments(self) -> tuple[Segment, ...]:
-        """The truth: the plant from the start and after each tweak."""
+        """The truth: the plant from the start and after each tweak; with two masses, the sprung one's."""
         out = [Segment(0, self.plant.plant())]
         for tweak in self.tweaks:
             changed = _changed(out[-1].plant, tweak)
             if changed == out[-1].plant:
                 continue  # a pot set to where it stood changes nothing, and nothing can be detected
-            out.append(Segment(tweak.sample, changed))
+            out.append(Segment(tweak.sample, changed, tweak.ramp_n))
         return tuple(out)
 
 

@@ -1,13 +1,14 @@
 """The verdict on a Run, computed from the Run alone, so that a recording can be judged again.
 
 An alarm belongs to the change in whose segment it falls; the first one there is its detection, every other alarm is a
-false alarm. The device is late when the information that had accumulated by its alarm was many times what is needed.
+false alarm, but for those while a change lasts. The device is late when the information that had accumulated by its
+alarm was many times what is needed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -193,14 +194,16 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tuple[TweakVerdict, ...], tuple[int, ...]]:
     alarms = run.alarm_index.tolist()
-    detected = set()
+    ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
+    detected: set[int] = set()
     tweaks = []
     for (_, _, before), (start, end, after), gathered in zip(
         run.segments, run.segments[1:], information.changes(run), strict=False
     ):
         # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
-        detection = next((index for index in alarms if start < index <= end), None)
-        detected.add(detection)
+        mine = [index for index in alarms if start < index <= end]
+        detection = mine[0] if mine else None
+        detected |= _belonging(mine, start + ramps_n[start])
         changed = before.changes_to(after)
         late = information.first_reaching(gathered, expect.late_information_ratio * level)
         tweaks.append(
@@ -215,6 +218,15 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+
+
+def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:
+    """Of the alarms after a change those that are no false ones: all while it lasts, and the first when it is over.
+
+    An alarm on a ramp makes the device learn a plant that goes on changing, which is to be noticed in its turn.
+    """
+    over = [index for index in alarms if index > ramp_end]
+    return {index for index in alarms if index <= ramp_end} | set(over[:1])
 
 
 def _invalidities(run: Run, expect: Expectations) -> list[str]:

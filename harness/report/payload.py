@@ -9,14 +9,14 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.plant import PARAMETERS
+from harness.plant import PARAMETERS, Plant
 from harness.run import CHANNELS, Run
 from harness.verdict import TweakVerdict, Verdict, trajectory
 
@@ -51,10 +51,23 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
         "alarms": [{"sample": index, "false": index in false_alarms} for index in run.alarm_index.tolist()],
         "overloads": [{"sample": sample, "label": name} for name, sample in sorted(verdict.overloads.items())],
         "segments": [
-            {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in run.segments
+            {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in _truth(run)
         ],
         "ceiling": finite(verdict.ceiling),
     }
+
+
+def _truth(run: Run) -> Iterator[tuple[int, int, Plant]]:
+    """The segments of the run, every sample of a ramp being one."""
+    ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
+    before: Plant | None = None
+    for start, end, plant in run.segments:
+        there = min(start + ramps_n[start], end) if before is not None else start
+        for k in range(start, there):
+            yield k, k + 1, (before or plant).on_the_way(plant, (k - start) / ramps_n[start])
+        if there < end:
+            yield there, end, plant
+        before = plant
 
 
 def as_script(data: Mapping[str, Any]) -> str:

@@ -46,7 +46,7 @@ def under_load(dial: float, load_ohm: float) -> float:
 
 
 def by_equation(goal_dials: dict[str, float], sample: int, ramp_n: int, samples: int) -> Volts:
-    """x and v in V (samples, 2) of the front suspension, its dials turning evenly; an ordinary differential equation.
+    """Displacement and velocity in V, (samples, 2), of the front suspension whose dials turn evenly, by integration.
 
     10 V: 2940 N, 0.1996 m, 2 m/s; k_M feeds 100k and 1 nF, k_B 33.2k and k_K 49.9k into a summer of 100k.
     """
