@@ -2,7 +2,8 @@
 
 The figure of a row is max |x - x_ideal| over SAMPLES samples of a 200 Hz square wave of 0..10 V, as the converter sees
 it, in LSB of 10 V / 4096; for what is drawn, the median over DRAWS seeds. Everything else is ideal. The front
-suspension plays the four changes of the thesis meanwhile.
+suspension plays the four changes of the thesis meanwhile, the shock absorber the same in proportion but for the last,
+M / 4, which is beyond its mass pot.
 """
 
 from __future__ import annotations
@@ -20,13 +21,16 @@ from .excitation import Excitation
 from .noise import NoisySuspension
 from .opamp import IDEAL, PRESETS, OpAmpModel
 from .program import CHANNELS, Program
+from .quarter_car import FRONT, SHOCK
 from .sampler import Card, Sampler, drawn_levels
-from .suspension import PROGRAMS, SuspensionComputer, Tweak
+from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, in_full
 
 __all__ = ["DRAWS", "SAMPLES", "Effect", "measured_effects"]
 
 SAMPLES = 800
 DRAWS = 25
+_FEW_DRAWS = 5
+"""Where a draw takes long."""
 
 _CARD = Card(ranges_v=((-1.0, 9.0),) * len(CHANNELS))
 _DISPLACEMENT = CHANNELS.index("displacement")
@@ -42,15 +46,25 @@ class Effect:
     draws: int
 
 
+_FRONT_CHANGES: Sequence[Tweak] = (
+    (200, {"K_n_per_m": 18000.0}),
+    (400, {"B_n_s_per_m": 3453.0}),
+    (500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    (600, {"M_kg": 30.0}),
+)
+
+
+def _in_proportion(settings: Mapping[str, float]) -> dict[str, float]:
+    return {name: SHOCK.values[name] * value / FRONT.values[name] for name, value in settings.items()}
+
+
 _CHANGES: Mapping[str, Sequence[Tweak]] = {
-    "shock": (),
-    "front": (
-        (200, {"K_n_per_m": 18000.0}),
-        (400, {"B_n_s_per_m": 3453.0}),
-        (500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-        (600, {"M_kg": 30.0}),
-    ),
+    "shock": tuple((sample, _in_proportion(settings)) for sample, settings in _FRONT_CHANGES[:-1]),
+    "front": _FRONT_CHANGES,
 }
+
+_SLOW_CHANGE_N = 100
+"""Of the stiffness, to four fifths, for what a pot does while it turns."""
 
 _Operator = Callable[[SuspensionComputer, Mapping[str, float], np.random.Generator], Mapping[str, float]]
 """What somebody does who is told to set M_kg, B_n_s_per_m or K_n_per_m: other settings, perhaps."""
@@ -79,7 +93,10 @@ def _to_a_thousandth(
 
 @dataclass(frozen=True)
 class _Setup:
-    """A machine, ideal but for what is said here. quantised: compare codes and not what the converter sees."""
+    """A machine, ideal but for what is said here.
+
+    quantised: compare codes and not what the converter sees. turning: play one slow change instead of the usual ones.
+    """
 
     op_amp: OpAmpModel = IDEAL
     components: Components = NOMINAL
@@ -87,11 +104,14 @@ class _Setup:
     card: Card = _CARD
     operator: _Operator = _careful
     quantised: bool = False
+    turning: bool = False
 
     def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
         """How far the displacement is from the ideal machine's; that of noise, from the same machine's without."""
         reference_lsb = ideal_lsb
-        if self.noise is not None:
+        if self.turning:
+            reference_lsb = dataclasses.replace(self, components=NOMINAL).displacement_lsb(program, seed)
+        elif self.noise is not None:
             reference_lsb = dataclasses.replace(self, noise=None).displacement_lsb(program, seed)
         return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
 
@@ -102,12 +122,17 @@ class _Setup:
         machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
         rng = np.random.default_rng(seed)
         machine.set(**self.operator(machine, program.values, rng))
-        tweaks = [(sample, self.operator(machine, wanted, rng)) for sample, wanted in _CHANGES[program.name]]
+        tweaks = [(k, self.operator(machine, wanted, rng), ramp_n) for k, wanted, ramp_n in self._changes(program)]
         played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
         volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, tweaks, rng=rng)))
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.converted(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
+
+    def _changes(self, program: Program) -> list[RampedTweak]:
+        if self.turning:
+            return [(200, {"K_n_per_m": 0.8 * program.values["K_n_per_m"]}, _SLOW_CHANGE_N)]
+        return [in_full(tweak) for tweak in _CHANGES[program.name]]
 
 
 _Make = Callable[[int], _Setup]
@@ -115,7 +140,7 @@ _Make = Callable[[int], _Setup]
 
 
 def measured_effects(program: str) -> Iterator[Effect]:
-    """The table for a program ("shock" or "front"), row by row as they are measured (about 2 s in all)."""
+    """The table for a program ("shock" or "front"), row by row as they are measured (about 3 s in all)."""
     chosen = PROGRAMS[program]
     ideal_lsb = _Setup().displacement_lsb(chosen, 0)
     for name, draws, make in _rows():
@@ -157,6 +182,8 @@ def _pot_rows() -> Iterator[tuple[str, int, _Make]]:
     yield "pot loading ignored", 1, _fixed(_Setup(operator=_without_load))
     yield "pots set to 0.1 % of full scale", DRAWS, _fixed(_Setup(operator=_to_a_thousandth))
     yield "pots of 5000 windings", 1, _built_of(Components(pots=PotGrade(windings=5000)))
+    noisy = Components(pots=PotGrade(wiper_noise_ohm=100.0))
+    yield "wiper noise 100 ohm, K turned", _FEW_DRAWS, _fixed(_Setup(components=noisy, turning=True))
 
 
 def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
