@@ -119,6 +119,18 @@ def test_latency_of_a_ramp_counts_from_its_start(ramped: Path) -> None:
     assert as_json(judge(played(jump)))["tweaks"][0]["bound"] < tweak.bound_n
 
 
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_latencies_of_ramps_are_near_their_bounds(seed: int) -> None:
+    """The trigger comes near the bound for jumps; if it does for ramps, too, their bound is right."""
+    with open_rig("emulator") as rig, open_dut("host") as dut:
+        verdict = judge(Bench(rig, dut).play(Scenario.load("slow"), seed))
+    assert verdict.outcome == "passed"
+    for tweak in verdict.tweaks:
+        assert tweak.bound_n is not None
+        assert tweak.latency_n is not None
+        assert tweak.bound_n <= tweak.latency_n < 2 * tweak.bound_n
+
+
 def test_alarms_while_a_change_lasts_and_the_first_after_it_are_not_false() -> None:
     run = with_ramp(60)
     alarmed = dataclasses.replace(
