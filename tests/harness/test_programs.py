@@ -185,20 +185,26 @@ def test_information_of_a_jump_is_that_of_a_ramp_of_no_length() -> None:
     assert (longer <= jump).all()
 
 
-def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(ramped: Path) -> None:
-    """1/M, B and K change evenly in the harness, dials in the machine: the displacements stay within 5 LSB of 250."""
+@pytest.mark.parametrize(
+    ("given", "limit_lsb"), [({"stiffness_n_per_m": 18000.0}, 10.0), ({"mass_kg": 40.0}, 3.0)], ids=str
+)
+def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(
+    ramped: Path, given: dict[str, float], limit_lsb: float
+) -> None:
+    """1/M, B and K change evenly in the harness, dials in the machine, which the load of the pots tells apart."""
+    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(Tweak(300, ramp_n=60, **given),))
+    after = dataclasses.replace(FRONT, **given)
     with open_rig("emulator-ideal") as rig:
-        performance = rig.perform(Scenario.load(str(ramped)), 1)
-        volts = np.concatenate([block.volts for block in performance.blocks])
+        volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
     state, plants = (0.0, 0.0), [FRONT] * 300
-    plants += [FRONT.on_the_way(SOFT, (k + 0.5) / 60) for k in range(60)] + [SOFT] * 340
+    plants += [FRONT.on_the_way(after, (k + 0.5) / 60) for k in range(60)] + [after] * 340
     seen = []
     for plant, force_v in zip(plants, volts[:, 0], strict=True):
         seen.append(state[0] / 0.01996)
         state = SampledPlant.of(plant, 0.01).next(state, force_v * 294.0)
     error_lsb = np.abs(np.array(seen) - volts[:, 1]) / (10.0 / 4096)
-    assert error_lsb[:300].max() < 3.0
-    assert error_lsb[300:].max() < 15.0
+    assert error_lsb[:300].max() < 0.01
+    assert error_lsb[300:].max() < limit_lsb
 
 
 def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
