@@ -27,8 +27,8 @@ def figures(first_seed: int = DEFAULT_SEEDS[0], end_seed: int = DEFAULT_SEEDS[1]
     for scenario, rig in CASES:
         detection = detect(scenario, rig, range(first_seed, end_seed))
         name = f"{scenario} on {rig}"
-        yield Figure(f"{name}: missed", detection.missed, "changes", f"{detection.latencies_n.size} changes")
-        runs = f"{detection.runs} runs of 1800 samples"
+        yield Figure(f"{name}: missed", detection.missed, "changes", f"of {detection.latencies_n.size} changes")
+        runs = f"in {detection.runs} runs of 1800 samples"
         yield Figure(f"{name}: false alarms", detection.false_alarms, "alarms", runs)
         for what, ratio, error in zip(CHANGES, detection.ratios(), detection.ratio_errors(), strict=True):
             bounds = (float(ratio - 2 * error), float(ratio + 2 * error))

@@ -82,22 +82,23 @@ def play(excitation: Excitation, samples: int, block_samples: int = BLOCK_SAMPLE
         pass
 
 
+def front(seed: int, *, noisy: bool) -> SuspensionComputer | NoisySuspension:
+    computer = SuspensionComputer("front")
+    if not noisy:
+        return computer
+    return NoisySuspension(computer, np.random.default_rng(seed), op_amps=OP_AMP_GRADES["tl07x"])
+
+
 def run_trials(count: int, *, noisy: bool = False) -> None:
     for seed in range(count):
-        machine: SuspensionComputer | NoisySuspension = SuspensionComputer("front")
-        if noisy:
-            machine = NoisySuspension(machine, np.random.default_rng(seed), op_amps=OP_AMP_GRADES["tl07x"])
-        for _ in machine.play(Excitation(), 800, THESIS_TWEAKS):
+        for _ in front(seed, noisy=noisy).play(Excitation(), 800, THESIS_TWEAKS):
             pass
 
 
 def digitise(card: Card, samples: int, *, noisy: bool) -> None:
     """Circuit and card, 4 channels, in blocks."""
-    machine: SuspensionComputer | NoisySuspension = SuspensionComputer("front")
-    if noisy:
-        machine = NoisySuspension(machine, np.random.default_rng(1), op_amps=OP_AMP_GRADES["tl07x"])
     sampler = Sampler(card, np.random.default_rng(1))
-    for volts in machine.play(Excitation(), samples, (), 4096):
+    for volts in front(1, noisy=noisy).play(Excitation(), samples, (), 4096):
         sampler.sample(volts)
 
 
@@ -152,7 +153,7 @@ def emulator_figures() -> Iterator[Figure]:
 
 def card_figures() -> Iterator[Figure]:
     cards = {"ideal card": (CARDS["ideal"], False), "card of 1 LSB noise": (Card(noise_lsb=(1.0,) * 4), False)}
-    cards |= {"noisy circuit, dt2821": (CARDS["dt2821"], True)}
+    cards |= {"noisy circuit, dt2821 without aperture": (CARDS["dt2821"], True)}
     samples = 100_000
     for name, (card, noisy) in cards.items():
         rate = samples / best_s(functools.partial(digitise, card, samples, noisy=noisy))

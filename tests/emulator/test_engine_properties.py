@@ -183,6 +183,19 @@ def test_a_tweak_to_the_same_value_changes_nothing(
     assert np.array_equal(np.concatenate(list(touched.play(excitation, 300, [tweak]))), untouched)
 
 
+def test_cost_grows_linearly_with_samples() -> None:
+    """Of the work that the engine counts: sixteen times the samples, sixteen times the steps, to within a period."""
+
+    def steps(samples: int) -> int:
+        excitation = Excitation(clock="free", phase=0.137, drift_ppm=20.0)
+        engine = Engine(piecewise_linear(SuspensionComputer("front").circuit), ["u5"])
+        engine.run(samples, {"F": excitation.edges(*engine.window(samples), SAMPLE_RATE_HZ)})
+        return engine.counts.steps + engine.counts.quiet
+
+    few, many = steps(10_000), steps(160_000)
+    assert 15.5 < many / few < 16.5
+
+
 # ---- overload
 
 ACCELERATION_SCALED = ("u1", "u2", "u3", "u4", "u5")
