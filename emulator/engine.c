@@ -1542,7 +1542,7 @@ void engine_get_counts(const engine *self, struct engine_counts *counts)
 /* The short step: change = exp(a h) - I, and cov by the Taylor series of dP/dt = a P + P a' + q. */
 static void gather_shortly(int n, double step_s, const double *a, const double *q, double *change, double *cov)
 {
-    double power[MAX_SQUARE], term[MAX_SQUARE], grown[MAX_SQUARE];
+    double power[MAX_SQUARE] = {0.0}, term[MAX_SQUARE] = {0.0}, grown[MAX_SQUARE];
     for (int i = 0; i < n * n; i++) {
         change[i] = power[i] = a[i] * step_s;
         cov[i] = term[i] = q[i] * step_s;
@@ -1565,7 +1565,7 @@ static void gather_shortly(int n, double step_s, const double *a, const double *
 /* Twice the step: P + Phi P Phi' and Phi Phi - I, with Phi = I + change, so that slow states lose no digits. */
 static void gather_twice(int n, double *change, double *cov)
 {
-    double grown[MAX_SQUARE], turned[MAX_SQUARE], both[MAX_SQUARE];
+    double grown[MAX_SQUARE] = {0.0}, turned[MAX_SQUARE] = {0.0}, both[MAX_SQUARE];
     multiply(n, change, cov, false, grown);
     for (int i = 0; i < n * n; i++) {
         turned[i] = grown[(i % n) * n + i / n];
