@@ -16,7 +16,6 @@ PRODUCTS := harness/_catalogue.py emulator/_engine.so harness/_device.so harness
             harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
 NATIVE_SOURCES := $(wildcard emulator/*.[ch] estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
-BENCHES := $(patsubst tests/benchmarks/%.py,%,$(wildcard tests/benchmarks/bench_*.py))
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -52,8 +51,8 @@ format: $(PRODUCTS) ## lay out the Python sources
 	@$(BIN)/ruff check --quiet --select I --fix $(PYTHON_SOURCES)
 	@$(BIN)/ruff format $(PYTHON_SOURCES)
 
-bench: $(PRODUCTS) ## measure: one line per figure (name, value, unit)
-	@for bench in $(BENCHES); do $(BIN)/python -m tests.benchmarks.$$bench || exit 1; done
+bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
+	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

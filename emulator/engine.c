@@ -1525,3 +1525,122 @@ void engine_get_counts(const engine *self, struct engine_counts *counts)
 {
     *counts = self->counts;
 }
+
+/* ---- noise
+ * ------------------------------------------------------------------------------------------------------------------
+ * */
+
+/* The short step h of engine_noise_gather: |a h| up to this, and so many terms end the series within 1e-19 of its sum. */
+#define NOISE_NORM 1e-2
+#define NOISE_TERMS 8
+
+/* What Cholesky leaves of a variance counts as none below this part of it. */
+#define NO_VARIANCE 1e-12
+
+#define MAX_SQUARE (ENGINE_MAX_STATES * ENGINE_MAX_STATES)
+
+/* The short step: change = exp(a h) - I, and cov by the Taylor series of dP/dt = a P + P a' + q. */
+static void gather_shortly(int n, double step_s, const double *a, const double *q, double *change, double *cov)
+{
+    double power[MAX_SQUARE] = {0.0}, term[MAX_SQUARE] = {0.0}, grown[MAX_SQUARE];
+    for (int i = 0; i < n * n; i++) {
+        change[i] = power[i] = a[i] * step_s;
+        cov[i] = term[i] = q[i] * step_s;
+    }
+    for (int k = 2; k <= NOISE_TERMS; k++) {
+        const double h = step_s / (double)k;
+        multiply(n, a, term, false, grown);
+        for (int i = 0; i < n * n; i++) {
+            term[i] = (grown[i] + grown[(i % n) * n + i / n]) * h;
+            cov[i] += term[i];
+        }
+        multiply(n, power, a, false, grown);
+        for (int i = 0; i < n * n; i++) {
+            power[i] = grown[i] * h;
+            change[i] += power[i];
+        }
+    }
+}
+
+/* Twice the step: P + Phi P Phi' and Phi Phi - I, with Phi = I + change, so that slow states lose no digits. */
+static void gather_twice(int n, double *change, double *cov)
+{
+    double grown[MAX_SQUARE] = {0.0}, turned[MAX_SQUARE] = {0.0}, both[MAX_SQUARE];
+    multiply(n, change, cov, false, grown);
+    for (int i = 0; i < n * n; i++) {
+        turned[i] = grown[(i % n) * n + i / n];
+    }
+    multiply(n, change, turned, false, both);
+    for (int i = 0; i < n * n; i++) {
+        cov[i] = 2.0 * cov[i] + grown[i] + turned[i] + both[i];
+    }
+    multiply(n, change, change, false, both);
+    for (int i = 0; i < n * n; i++) {
+        change[i] = 2.0 * change[i] + both[i];
+    }
+}
+
+/* Cholesky. */
+static void factorise(int n, const double *cov, double *factor)
+{
+    for (int j = 0; j < n; j++) {
+        for (int i = 0; i < n; i++) {
+            double left = i < j ? 0.0 : cov[i * n + j];
+            for (int k = 0; k < j && i >= j; k++) {
+                left -= factor[i * n + k] * factor[j * n + k];
+            }
+            factor[i * n + j] = left;
+        }
+        const double left = factor[j * n + j];
+        const double scale = left > NO_VARIANCE * cov[j * n + j] ? 1.0 / sqrt(left) : 0.0;
+        for (int i = j; i < n; i++) {
+            factor[i * n + j] *= scale;
+        }
+    }
+}
+
+int engine_noise_gather(int n, double period_s, const double *a, const double *q, double *phi, double *cov, double *factor)
+{
+    double step_s = period_s;
+    int doublings = 0;
+    bool finite = true;
+    const double rate = norm(n, n, a);
+    while (rate * step_s > NOISE_NORM && doublings < 2 * MAX_HALVINGS) {
+        step_s *= 0.5;
+        doublings++;
+    }
+    gather_shortly(n, step_s, a, q, phi, cov);
+    while (doublings-- > 0) {
+        gather_twice(n, phi, cov);
+    }
+    for (int i = 0; i < n; i++) {
+        phi[i * n + i] += 1.0;
+    }
+    factorise(n, cov, factor);
+    for (int i = 0; i < n * n; i++) {
+        finite = finite && isfinite(phi[i]) && isfinite(cov[i]);
+    }
+    return finite ? 1 : 0;
+}
+
+void engine_noise_run(
+    int n, int outputs, int64_t samples, const double *phi, const double *factor, const double *reading,
+    const double *normal, double *x, double *y)
+{
+    double next[ENGINE_MAX_STATES];
+    for (int64_t sample = 0; sample < samples; sample++, normal += n, y += outputs) {
+        for (int i = 0; i < outputs; i++) {
+            y[i] = 0.0;
+            for (int j = 0; j < n; j++) {
+                y[i] += reading[i * n + j] * x[j];
+            }
+        }
+        for (int i = 0; i < n; i++) {
+            next[i] = 0.0;
+            for (int j = 0; j < n; j++) {
+                next[i] += phi[i * n + j] * x[j] + factor[i * n + j] * normal[j];
+            }
+        }
+        memcpy(x, next, (size_t)n * sizeof x[0]);
+    }
+}

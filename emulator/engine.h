@@ -108,4 +108,14 @@ void engine_get_counts(const engine *self, struct engine_counts *counts);
  * exceeds that). Here and not in LAPACK: the same bits on every machine. */
 int engine_solve(int n, int columns, double *a, double *b);
 
+/* White noise of intensity q (n x n, symmetric) drives dx/dt = a x for period_s. phi (n x n) is exp(a period_s); cov is
+ * the covariance gathered, integral of exp(a s) q exp(a' s) ds; factor is lower triangular with factor factor' = cov,
+ * with columns of zeros for directions without noise. Returns whether all are finite. n <= ENGINE_MAX_STATES. */
+int engine_noise_gather(int n, double period_s, const double *a, const double *q, double *phi, double *cov, double *factor);
+
+/* For each of the samples y = reading x (outputs), then x = phi x + factor (the next n of normal). */
+void engine_noise_run(
+    int n, int outputs, int64_t samples, const double *phi, const double *factor, const double *reading,
+    const double *normal, double *x, double *y);
+
 #endif

@@ -45,6 +45,8 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_get_overdue", None, (c_void_p, c_void_p)),
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
     ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
+    ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
+    ("engine_noise_run", None, (c_int, c_int, c_int64, *(c_void_p,) * 6)),
 )
 
 

@@ -178,7 +178,7 @@ class Nodal:
         """
         left = self._left.copy()
         np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, closed or {}), _STAMP).ravel())
-        solution = self._solve(left)
+        solution = self._solve(left, self._right)
         abc, g, cde, w_phi = self._flow(solution)
         voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(
@@ -193,6 +193,21 @@ class Nodal:
             lmn=voltages[:, : self._columns],
             v_phi=self._spread(voltages),
         )
+
+    def disturbances(self, dials: Mapping[str, float]) -> dict[str, Matrix]:
+        """What small sources add to dx/dt while nothing limits, each (n,), with the pots named in dials set so.
+
+        By node: a current of 1 A into it; by op-amp: 1 V in series with its + input; for ground, 0. Raises as at().
+        """
+        size = len(self._unknowns)
+        left = self._left.copy()
+        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, {}), _STAMP).ravel())
+        slopes = self._laws.slopes(self._solve(left, np.eye(size + 1)))[: len(self._state)]
+        columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
+        amps = {amp.name: amp for amp in self._poles}
+        own = np.eye(len(self._state))
+        poles = {name: own[self._state[name]] * amp.model.gain_rate for name, amp in amps.items()}
+        return columns | {name: slopes[:, row] for name, row in self._branch.items() if name not in amps} | poles
 
     # ---- entering the elements
 
@@ -281,13 +296,13 @@ class Nodal:
 
     # ---- reading the solution
 
-    def _solve(self, left: Matrix) -> Matrix:
-        """Every unknown as a function of [x | u | 1 | phi of the limiters], and a last row for ground, of zeros."""
+    def _solve(self, left: Matrix, right: Matrix) -> Matrix:
+        """Every unknown as a function of what the columns of right stand for, and a last row for ground, of zeros."""
         size = len(self._unknowns)
         matrix = np.ascontiguousarray(left[:size, :size])
-        solution = np.zeros((size + 1, self._right.shape[1]))
-        solution[:size] = self._right[:size]
-        failed = library.load().engine_solve(size, self._right.shape[1], matrix.ctypes.data, solution.ctypes.data)
+        solution = np.zeros((size + 1, right.shape[1]))
+        solution[:size] = right[:size]
+        failed = library.load().engine_solve(size, right.shape[1], matrix.ctypes.data, solution.ctypes.data)
         if failed >= 0:
             raise CircuitError(f"the circuit is singular: nothing determines the {self._unknowns[failed]}")
         return solution
@@ -381,6 +396,10 @@ class _Laws:
         drives /= self.capacity
         drives[self.poles, self.poles] -= self.leak
         return drives
+
+    def slopes(self, solution: Matrix) -> Matrix:
+        """The same rows without offsets and leaks: what the voltages and currents do by themselves."""
+        return np.asarray((solution[self.plus] - solution[self.minus]) * self.gain / self.capacity)
 
 
 def _limits(amp: OpAmp, *, slews: bool) -> bool:

@@ -33,7 +33,8 @@ Tweak = tuple[int, Mapping[str, float]]
 RampedTweak = tuple[int, Mapping[str, float], int]
 """(sample, settings, ramp_n): the pots turn evenly from that sample on, and arrive ramp_n samples later."""
 
-BLOCK_SAMPLES = 4096
+BLOCK_SAMPLES = 32768
+"""1 MB: in smaller blocks the calls cost more than a quiet stretch."""
 
 
 class PlannedTurn(NamedTuple):

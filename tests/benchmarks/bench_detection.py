@@ -6,32 +6,41 @@ python -m tests.benchmarks.bench_detection [FIRST_SEED END_SEED]
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 
 from harness.plant import PARAMETERS
 from tests.thesis.detection import detect
 
+from .figure import Figure
+
 DEFAULT_SEEDS = (0, 100)
+
+CHANGES = ("K-27%", "B+14%", "B-39% K+11%", "M-74%")
 
 CASES = [(scenario, rig) for rig in ("emulator", "emulator-0-10v") for scenario in ("thesis", "thesis-free-running")]
 
 
-def main() -> None:
-    """Print one line a figure: name, value, unit."""
-    seeds = range(*(map(int, sys.argv[1:3]) if len(sys.argv) > 2 else DEFAULT_SEEDS))
+def figures(first_seed: int = DEFAULT_SEEDS[0], end_seed: int = DEFAULT_SEEDS[1]) -> Iterator[Figure]:
+    """What the device missed, raised falsely and estimated; bounds are two standard errors either side."""
     for scenario, rig in CASES:
-        detection = detect(scenario, rig, seeds)
+        detection = detect(scenario, rig, range(first_seed, end_seed))
         name = f"{scenario} on {rig}"
-        print(f"{name}: missed\t{detection.missed}\tof {detection.latencies_n.size} changes")
-        print(f"{name}: false alarms\t{detection.false_alarms}\tin {detection.runs} runs of 1800 samples")
-        pairs = zip(
-            ("K-27%", "B+14%", "B-39% K+11%", "M-74%"), detection.ratios(), detection.ratio_errors(), strict=True
-        )
-        for what, ratio, error in pairs:
-            print(f"{name}: mean latency over mean bound, {what}\t{ratio:.2f}\t+- {error:.2f} (standard error)")
+        yield Figure(f"{name}: missed", detection.missed, "changes", f"of {detection.latencies_n.size} changes")
+        runs = f"in {detection.runs} runs of 1800 samples"
+        yield Figure(f"{name}: false alarms", detection.false_alarms, "alarms", runs)
+        for what, ratio, error in zip(CHANGES, detection.ratios(), detection.ratio_errors(), strict=True):
+            bounds = (float(ratio - 2 * error), float(ratio + 2 * error))
+            yield Figure(f"{name}: mean latency, {what}", float(ratio), "mean bounds", bounds=bounds)
         for parameter, error in zip(PARAMETERS, np.sqrt(np.nanmean(detection.errors**2, axis=(0, 1))), strict=True):
-            print(f"{name}: rms error of {parameter} at the end of a stretch\t{100.0 * error:.2f}\t%")
+            yield Figure(f"{name}: rms error of {parameter} at the end of a stretch", 100.0 * float(error), "%")
+
+
+def main() -> None:
+    """Print the figures for other seeds; bench.json keeps those of DEFAULT_SEEDS."""
+    for figure in figures(*map(int, sys.argv[1:3])):
+        print(figure, flush=True)
 
 
 if __name__ == "__main__":

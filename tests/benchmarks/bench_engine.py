@@ -1,43 +1,46 @@
 """How fast the emulator is, beside ngspice on the same deck.
 
-Prints lines of name, value, unit, and, where there is one, what it is compared with and the ratio.
+python -m tests.benchmarks engine
 
-python -m tests.benchmarks.bench_engine
-
-The figures go to build/bench.json too. Times are of the processor, not of the clock on the wall: the machine is shared.
+Times are of the processor, not of the clock on the wall: the machine is shared.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-import json
 import resource
 import shutil
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator import (
+    CARDS,
+    OP_AMP_GRADES,
     TICKS_PER_SAMPLE,
     Capacitor,
+    Card,
     Circuit,
     Engine,
     Excitation,
+    NoisySuspension,
     Resistor,
+    Sampler,
     SuspensionComputer,
     piecewise_linear,
     to_spice,
 )
 from emulator.spice import Accuracy
-from emulator.suspension import Tweak
+from emulator.suspension import BLOCK_SAMPLES, Tweak
 from tests.emulator.conftest import _read_raw
+
+from .figure import Figure
 
 THESIS_TWEAKS: tuple[Tweak, ...] = (
     (200, {"K_n_per_m": 18000.0}),
@@ -46,11 +49,9 @@ THESIS_TWEAKS: tuple[Tweak, ...] = (
     (600, {"M_kg": 30.0}),
 )
 
-RESULTS = Path("build/bench.json")
 REPEATS = 5
 """The best of so many is reported."""
 
-BLOCK_SAMPLES = 32768
 RATE_HZ = 20e3
 LSB_V = 10.0 / 4096
 TOLERATED_LSB = 0.2
@@ -62,22 +63,6 @@ ACCURACIES = (
     Accuracy(reltol=1e-6, vntol_v=1e-7, trtol=1.0, max_step_s=1e-4),
 )
 """What ngspice is offered; each is tried with and without time points on the samples."""
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One line of the report; ratio says how many times better the value is than what it is compared with."""
-
-    name: str
-    value: float
-    unit: str
-    compared_with: str = ""
-    ratio: float | None = None
-
-    def __str__(self) -> str:
-        """Tab-separated, as all benchmarks print."""
-        line = f"{self.name}\t{self.value:.4g}\t{self.unit}"
-        return line if self.ratio is None else f"{line}\t{self.compared_with}\t{self.ratio:.1f}"
 
 
 def best_s(job: Callable[[], object]) -> float:
@@ -92,14 +77,29 @@ def best_s(job: Callable[[], object]) -> float:
 # ---- the emulator
 
 
-def play(excitation: Excitation, samples: int, tweaks: Sequence[Tweak] = ()) -> None:
-    for _ in SuspensionComputer("front").play(excitation, samples, tweaks, BLOCK_SAMPLES):
+def play(excitation: Excitation, samples: int, block_samples: int = BLOCK_SAMPLES) -> None:
+    for _ in SuspensionComputer("front").play(excitation, samples, (), block_samples):
         pass
 
 
-def run_trials(count: int) -> None:
-    for _ in range(count):
-        play(Excitation(), 800, THESIS_TWEAKS)
+def front(seed: int, *, noisy: bool) -> SuspensionComputer | NoisySuspension:
+    computer = SuspensionComputer("front")
+    if not noisy:
+        return computer
+    return NoisySuspension(computer, np.random.default_rng(seed), op_amps=OP_AMP_GRADES["tl07x"])
+
+
+def run_trials(count: int, *, noisy: bool = False) -> None:
+    for seed in range(count):
+        for _ in front(seed, noisy=noisy).play(Excitation(), 800, THESIS_TWEAKS):
+            pass
+
+
+def digitise(card: Card, samples: int, *, noisy: bool) -> None:
+    """Circuit and card, 4 channels, in blocks."""
+    sampler = Sampler(card, np.random.default_rng(1))
+    for volts in front(1, noisy=noisy).play(Excitation(), samples, (), 4096):
+        sampler.sample(volts)
 
 
 def turn(computer: SuspensionComputer, count: int) -> None:
@@ -135,6 +135,11 @@ def emulator_figures() -> Iterator[Figure]:
     for name, excitation in streams():
         rate = samples / best_s(functools.partial(play, excitation, samples))
         yield Figure(f"emulator, {name}", rate, "samples/s")
+    for block in (1, 64, 4096):
+        samples = min(samples, 20_000 * block)
+        rate = samples / best_s(functools.partial(play, Excitation(), samples, block))
+        yield Figure(f"emulator, 200 Hz square wave, blocks of {block}", rate, "samples/s")
+    yield from card_figures()
     turns = 200
     turn_s = best_s(functools.partial(turn, SuspensionComputer("front"), turns)) / turns
     yield Figure("emulator, pot turned", 1e6 * turn_s, "us")
@@ -143,12 +148,21 @@ def emulator_figures() -> Iterator[Figure]:
         yield Figure(f"emulator, square wave, {states} states", 1e9 * spent_s, "ns/sample")
         yield Figure(f"emulator, square wave, {states} states, each", 1e9 * spent_s / states, "ns/sample/state")
     few, many = (best_s(functools.partial(run_states, 7, count)) for count in (100_000, 800_000))
-    yield Figure("emulator, 8 times as many samples", many / few, "times as long")
+    yield Figure("emulator, 8 times as many samples", many / few, "times as long", "8 times", 8 * few / many)
 
 
-def trial_s() -> float:
+def card_figures() -> Iterator[Figure]:
+    cards = {"ideal card": (CARDS["ideal"], False), "card of 1 LSB noise": (Card(noise_lsb=(1.0,) * 4), False)}
+    cards |= {"noisy circuit, dt2821 without aperture": (CARDS["dt2821"], True)}
+    samples = 100_000
+    for name, (card, noisy) in cards.items():
+        rate = samples / best_s(functools.partial(digitise, card, samples, noisy=noisy))
+        yield Figure(f"emulator and card, {name}", rate, "samples/s")
+
+
+def trial_s(*, noisy: bool = False) -> float:
     trials = 50
-    return best_s(functools.partial(run_trials, trials)) / trials
+    return best_s(functools.partial(run_trials, trials, noisy=noisy)) / trials
 
 
 # ---- ngspice
@@ -197,27 +211,8 @@ def figures() -> Iterator[Figure]:
     reference_s = fastest_ngspice_s(800, THESIS_TWEAKS) if found else None
     name = "emulator, trial of 800 samples with 4 tweaks"
     yield compared(name, spent_s, 1e3 * spent_s, "ms", reference_s)
+    noisy_s = trial_s(noisy=True)
+    yield Figure(f"{name}, noisy", 1e3 * noisy_s, "ms", "the quiet trial", spent_s / noisy_s)
     spent_s = best_s(functools.partial(play, Excitation(), 500_000)) * 800 / 500_000
     reference_s = fastest_ngspice_s(800, ()) if found else None
     yield compared("emulator, 200 Hz square wave", spent_s, 800 / spent_s, "samples/s", reference_s)
-
-
-def keep(measured: Sequence[Figure]) -> None:
-    """Put the figures into RESULTS, in place of older ones of the same name."""
-    older = json.loads(RESULTS.read_text()) if RESULTS.exists() else []
-    names = {figure.name for figure in measured}
-    RESULTS.parent.mkdir(exist_ok=True)
-    kept = [entry for entry in older if entry["name"] not in names]
-    RESULTS.write_text(json.dumps(kept + [asdict(figure) for figure in measured], indent=1) + "\n")
-
-
-def main() -> None:
-    measured = []
-    for figure in figures():
-        print(figure, flush=True)
-        measured.append(figure)
-    keep(measured)
-
-
-if __name__ == "__main__":
-    main()

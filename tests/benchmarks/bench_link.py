@@ -1,15 +1,18 @@
-"""How fast samples go through a device, with all elements of the estimate returned for every one: name, value, unit.
+"""How fast samples go through a device, with all elements of the estimate returned for every one.
 
-python tests/benchmarks/bench_link.py
+python -m tests.benchmarks link
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 import numpy as np
 
 from harness.dut import DeviceDescription, connect
+
+from .figure import Figure
 
 SAMPLES = 20_000
 REPEATS = 5
@@ -35,12 +38,8 @@ def samples_per_s(description: DeviceDescription) -> float:
         return SAMPLES / (time.perf_counter() - start_s)
 
 
-def main() -> None:
-    """Print one line a figure."""
+def figures() -> Iterator[Figure]:
+    """One for each way of exchange; the bounds are the slowest and the fastest run."""
     for description in CASES:
-        best = max(samples_per_s(description) for _ in range(REPEATS))
-        print(f"{description.name}\t{best:.0f}\tsamples/s")
-
-
-if __name__ == "__main__":
-    main()
+        rates = [samples_per_s(description) for _ in range(REPEATS)]
+        yield Figure(f"link, {description.name}", max(rates), "samples/s", bounds=(min(rates), max(rates)))
