@@ -156,7 +156,12 @@ def test_halving_the_block_size_changes_no_code(
 @deterministic
 @given(programs, factors, excitations, st.integers(1, 40), st.floats(-0.4, 0.4), st.integers(1, 3))
 def test_block_size_changes_no_bit_while_a_pot_turns(
-    program: Program, by: tuple[float, float, float], excitation: Excitation, block: int, turn: float, pieces: int
+    program: SuspensionProgram,
+    by: tuple[float, float, float],
+    excitation: Excitation,
+    block: int,
+    turn: float,
+    pieces: int,
 ) -> None:
     nodal = Nodal(SuspensionComputer(scaled(program, by)).circuit)
 

@@ -29,22 +29,22 @@ def test_nothing_overloads_at_the_programs_own_values(program: str) -> None:
 @pytest.mark.parametrize(
     ("program", "good", "bad", "lamps"),
     [
-        ("front", {"step_v": 13.5}, {"step_v": 16.0}, {"U1"}),
-        ("shock", {"step_v": 16.0}, {"step_v": 20.0}, {"U2", "U4"}),
-        ("two-mass", {"step_v": 13.0}, {"step_v": 14.0}, {"U1"}),
-        ("front", {"K_n_per_m": 9.8e3}, {"K_n_per_m": 8.6e3}, {"U3"}),
-        ("shock", {"K_n_per_m": 6e3}, {"K_n_per_m": 4.9e3}, {"U3"}),
-        ("two-mass", {"K2_n_per_m": 12e3}, {"K2_n_per_m": 9.8e3}, {"U11"}),
-        ("shock", {"B_n_s_per_m": 540.0}, {"B_n_s_per_m": 450.0}, {"U2", "U4"}),
-        ("front", {"B_n_s_per_m": 150.0}, QUIET, set()),
-        ("front", {"M_kg": 29.5}, QUIET, set()),
-        ("shock", {"M_kg": 1.5}, QUIET, set()),
+        ("front", {"step_v": 13.5}, {"step_v": 16.0}, ("U1",)),
+        ("shock", {"step_v": 16.0}, {"step_v": 20.0}, ("U2", "U4")),
+        ("two-mass", {"step_v": 13.0}, {"step_v": 14.0}, ("U1",)),
+        ("front", {"K_n_per_m": 9.8e3}, {"K_n_per_m": 8.6e3}, ("U3",)),
+        ("shock", {"K_n_per_m": 6e3}, {"K_n_per_m": 4.9e3}, ("U3",)),
+        ("two-mass", {"K2_n_per_m": 12e3}, {"K2_n_per_m": 9.8e3}, ("U11",)),
+        ("shock", {"B_n_s_per_m": 540.0}, {"B_n_s_per_m": 450.0}, ("U2", "U4")),
+        ("front", {"B_n_s_per_m": 150.0}, QUIET, ()),
+        ("front", {"M_kg": 29.5}, QUIET, ()),
+        ("shock", {"M_kg": 1.5}, QUIET, ()),
     ],
     ids=str,
 )
-def test_what_overloads(program: str, good: dict[str, float], bad: dict[str, float], lamps: set[str]) -> None:
+def test_what_overloads(program: str, good: dict[str, float], bad: dict[str, float], lamps: tuple[str, ...]) -> None:
     assert lit(program, **good) == set()  # type: ignore[arg-type]
-    assert lit(program, **bad) == lamps  # type: ignore[arg-type]
+    assert lit(program, **bad) == set(lamps)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
