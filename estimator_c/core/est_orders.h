@@ -1,12 +1,11 @@
 /// The orders of the model, at run time from the configuration, or fixed by the build with -DEST_FIXED_NA=2U, _NB, _NK, _NC
-/// and _OFFSET, all of them: the loops over the parameters are then unrolled, which takes a third of the time.
+/// and _OFFSET, all of them: the loops over the parameters are then unrolled, which saves a third of the time.
 
 #ifndef EST_ORDERS_H_INCLUDED
 #define EST_ORDERS_H_INCLUDED
 
 #ifdef EST_FIXED_NA
 #define NA(config) EST_FIXED_NA
-#define NA_OF(na) EST_FIXED_NA
 #define NB(config) EST_FIXED_NB
 #define NK(config) EST_FIXED_NK
 #define NC(config) EST_FIXED_NC
@@ -15,7 +14,6 @@
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define NA(config) ((config)->na)
-#define NA_OF(na) (na)
 #define NB(config) ((config)->nb)
 #define NK(config) ((config)->nk)
 #define NC(config) ((config)->nc)
@@ -23,5 +21,14 @@
 #define COUNT(count) (count)
 #define EST_UNROLL
 #endif
+
+/// A loop over the constant EST_NA_MAX, which is small.
+#ifdef __GNUC__
+#define EST_UNROLL_NA _Pragma("GCC unroll 2")
+#else
+#define EST_UNROLL_NA
+#endif
+
+#define PARAMETERS(config) COUNT((uint8_t)((uint32_t)NA(config) + NB(config) + NC(config) + (OFFSET(config) ? 1U : 0U)))
 
 #endif  // EST_ORDERS_H_INCLUDED

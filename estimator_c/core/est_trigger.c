@@ -19,8 +19,8 @@ static float mean_between_faults(est_trigger_t* const self, const bool absolute,
     return magnitude(*mean);
 }
 
-static float cusum(const float before, const float innovation, const float variance) {
-    const float sum = before + ((CUSUM_GAIN * innovation * innovation) / variance) - CUSUM_DRIFT;
+static float cusum(const float before, const float innovation, const float precision) {
+    const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
     return (sum > 0.0F) ? sum : 0.0F;
 }
 
@@ -28,12 +28,12 @@ static float cusum(const float before, const float innovation, const float varia
 static est_finding_t find_by_cusum(est_trigger_t* const self,
                                    const float          ceiling,
                                    const float          readings[EST_READINGS],
-                                   const float          variance,
+                                   const float          precision,
                                    const uint16_t       doubt_n) {
-    self->statistic = cusum(self->statistic, readings[0], variance);
+    self->statistic = cusum(self->statistic, readings[0], precision);
     bool explained  = false;
     for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = (doubt_n > 0U) ? cusum(self->rival[i], readings[i + 1U], variance) : self->statistic;
+        self->rival[i] = (doubt_n > 0U) ? cusum(self->rival[i], readings[i + 1U], precision) : self->statistic;
         explained      = explained || (self->rival[i] < ceiling);
     }
     if (self->statistic < ceiling) {
@@ -92,7 +92,7 @@ bool est_trigger_in_doubt(const est_trigger_t* const self) {
 est_finding_t est_trigger_step(est_trigger_t* const              self,
                                const est_trigger_config_t* const config,
                                const float                       readings[EST_READINGS],
-                               const float                       variance,
+                               const float                       precision,
                                const uint16_t                    doubt_n) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
@@ -106,11 +106,11 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
         self->statistic = mean_between_faults(self, config->absolute, readings[0]);
         break;
     case EST_TRIGGER_CUSTOM:
-        self->statistic = config->custom(config->context, readings[0], variance, self->mean_n == 0U);
+        self->statistic = config->custom(config->context, readings[0], 1.0F / precision, self->mean_n == 0U);
         self->mean_n    = 1U;
         break;
     case EST_TRIGGER_CUSUM:
-        return find_by_cusum(self, config->ceiling, readings, variance, doubt_n);
+        return find_by_cusum(self, config->ceiling, readings, precision, doubt_n);
     case EST_TRIGGER_NONE:
     default:
         return EST_QUIET;
