@@ -68,10 +68,20 @@ static bool codes_valid(const est_config_t* const config) {
            (config->edge_instants >= EST_EDGES_LOCKED) && (config->edge_instants <= EST_EDGES_ANYWHERE);
 }
 
+static bool adaptive(const est_config_t* const config) {
+    return (config->nc > 0U) || config->noise_estimated || (config->refresh_n > 0U) || (config->random_walk > 0.0F);
+}
+
+static bool in_this_build(const est_config_t* const config) {
+    return (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
+           (EST_WITH_ADAPTATION || !adaptive(config)) &&
+           (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
+}
+
 bool est_config_valid(const est_config_t* const config) {
     EST_ASSERT(config != 0);
     return orders_valid(config) && est_whitener_accepts(config->c, config->na) && variances_valid(config) &&
-           codes_valid(config) && est_trigger_config_valid(&config->trigger);
+           codes_valid(config) && in_this_build(config) && est_trigger_config_valid(&config->trigger);
 }
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
@@ -81,6 +91,23 @@ static void shift(float* const x, const uint8_t n, const float newest) {
         x[i] = x[i - 1U];
     }
     x[0] = newest;
+}
+
+/// All of the past is kept, whatever the order needs: a loop of fixed length is the faster one.
+static void shift_u(est_t* const self, const float newest) {
+    EST_UNROLL_PAST
+    for (uint8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
+        self->u[i] = self->u[i - 1U];
+    }
+    self->u[0] = newest;
+}
+
+static void shift_y(est_t* const self, const float newest) {
+    EST_UNROLL_NA
+    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+        self->y[i] = self->y[i - 1U];
+    }
+    self->y[0] = newest;
 }
 
 /// How many samples before its own an equation reaches back to.
@@ -153,8 +180,11 @@ static void doubt_edge(est_t* const self) {
 }
 
 static void enter_edge(est_t* const self) {
-    self->idle_n = 0U;
-    if (self->config->edge_instants == EST_EDGES_MAY_SLIP) {
+    self->edge_at = self->counters.updated;
+    if (!EST_WITH_EDGES) {
+        return;
+    }
+    if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         doubt_edge(self);
     } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
         restart(self, NA(self->config));
@@ -166,14 +196,15 @@ static void enter_edge(est_t* const self) {
 /// Takes in u(k). The equation of this sample can be made unless the samples that it reaches back to are not all known.
 static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     const est_config_t* const config = self->config;
-    shift(self->u, (uint8_t)(NB(config) + NK(config) + 1U), sample.u);
+    shift_u(self, sample.u);
     const bool edge = self->known && est_edges_is_edge(config, self->u);
-    if (stuck(self, sample.y, edge)) {
+    if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
         count(&self->counters.stuck);
         return EST_REFUSED;
     }
-    count(&self->idle_n);
-    est_edges_age(&self->edges);
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        est_edges_age(&self->edges);
+    }
     if (edge) {
         enter_edge(self);
     }
@@ -201,6 +232,14 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
+EST_INLINE float* append(float* const out, const float* const from, const uint8_t n) {
+    EST_UNROLL
+    for (uint8_t i = 0U; i < n; i++) {
+        out[i] = from[i];
+    }
+    return &out[n];
+}
+
 /// The regressor in the order of theta, and y(k) last.
 static void fill_equation(const est_t* const self, const float y, float* const phi) {
     const est_config_t* const config = self->config;
@@ -209,14 +248,8 @@ static void fill_equation(const est_t* const self, const float y, float* const p
     for (uint8_t i = 0U; i < NA(config); i++) {
         *out++ = -self->y[i];
     }
-    EST_UNROLL
-    for (uint8_t i = 0U; i < NB(config); i++) {
-        *out++ = self->u[NK(config) + i];
-    }
-    EST_UNROLL
-    for (uint8_t i = 0U; i < NC(config); i++) {
-        *out++ = self->residual[i];
-    }
+    out = append(out, &self->u[NK(config)], NB(config));
+    out = append(out, self->residual, NC(config));
     if (OFFSET(config)) {
         *out++ = 1.0F;
     }
@@ -315,7 +348,7 @@ static void react(est_t* const self, const est_finding_t finding) {
     if (finding == EST_QUIET) {
         return;
     }
-    if (finding == EST_ALARM) {
+    if (!EST_WITH_EDGES || (finding == EST_ALARM)) {
         count(&self->counters.alarms);
         estimate_afresh(self);
     } else {
@@ -327,15 +360,19 @@ static void react(est_t* const self, const est_finding_t finding) {
 
 static void enter_gap(est_t* const self, const est_status_t status) {
     count_long((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
-    if (self->known && (self->edges.age_n > 0U)) {
+    if (EST_WITH_EDGES && self->known && (self->edges.age_n > 0U)) {
         react(self, est_trigger_end_doubt(&self->trigger, &self->config->trigger));
     }
     forget_samples(self);
 }
 
-/// What an innovation says of the noise and of C, besides theta.
-static void adapt(est_t* const self, const float innovation, const float precision) {
+/// What an equation says besides theta.
+static void adapt(est_t* const self, const float* const phi, const float innovation, const float precision) {
     const est_config_t* const config = self->config;
+    if (config->random_walk > 0.0F) {
+        est_factors_walk(&self->factors, config);
+    }
+    keep_residual(self, phi);
     if (config->noise_estimated) {
         follow_noise(self, innovation, precision);
     }
@@ -351,23 +388,21 @@ static void enter_equation(est_t* const self, const float y, est_step_t* const s
     float                     readings[EST_READINGS];
     fill_equation(self, y, phi);
     est_equation_t equation = { .phi = phi, .count = self->count };
-    equation.variance       = est_whitener_advance(&self->whitener);
+    equation.variance       = self->whitener.settled ? 1.0F : est_whitener_advance(&self->whitener);
     equation.innovation     = est_whitener_apply(&self->whitener, self->count, phi, self->theta);
     readings[0]             = equation.innovation;
-    if (self->edges.age_n > 0U) {
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
         read_otherwise(self, phi, readings);
     }
-    const float precision = config->forgetting * est_factors_measure(&self->factors, config, equation, self->theta);
-    if (self->walks) {
-        est_factors_walk(&self->factors, config);
+    const float precision = config->forgetting * est_factors_measure(&self->factors, config, &equation, self->theta);
+    if (EST_WITH_ADAPTATION && self->adaptive) {
+        adapt(self, phi, readings[0], precision);
     }
-    keep_residual(self, phi);
     const est_finding_t finding = est_trigger_step(
         &self->trigger, &config->trigger, readings, precision / self->noise_variance, self->edges.age_n);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
     step->alarm      = finding == EST_ALARM;
-    adapt(self, equation.innovation, precision);
     react(self, finding);
 }
 
@@ -380,9 +415,9 @@ est_config_t est_config_default(void) {
         .nk             = 0U,
         .nc             = 0U,
         .offset         = true,
-        .stuck_n        = 16U,
-        .idle_n         = 1000U,
-        .edge_instants  = EST_EDGES_MAY_SLIP,
+        .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
+        .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
+        .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,
         .forgetting     = 0.9925F,
         .random_walk    = 0.0F,
         .p0             = 10.0F,
@@ -413,13 +448,18 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     }
     *self                = (est_t){ .config = config };
     self->count          = PARAMETERS(config);
-    self->walks          = config->random_walk > 0.0F;
+    self->adaptive       = adaptive(config);
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
     restart(self, past_n(config));
     est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;
+}
+
+/// At the end of the counter's range the excitation is never lost again.
+static bool idle(const est_t* const self) {
+    return (self->config->idle_n > 0U) && ((self->counters.updated - self->edge_at) >= self->config->idle_n);
 }
 
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
@@ -433,9 +473,9 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         if (step.status == EST_UPDATED) {
             enter_equation(self, sample.y, &step);
         }
-        shift(self->y, NA(self->config), sample.y);
+        shift_y(self, sample.y);
     }
-    step.idle = (self->config->idle_n > 0U) && (self->idle_n >= self->config->idle_n);
+    step.idle = EST_WITH_WATCH && idle(self);
     return step;
 }
 

@@ -244,11 +244,11 @@ typedef struct {
     est_trigger_t       trigger;
     est_counters_t      counters;
     uint16_t            equations_n;  ///< since the last reset of the covariance or refresh of C
-    uint16_t            idle_n;       ///< samples since the last edge of u
     uint16_t            same_n;       ///< samples since an edge of u for which y has been the same
+    uint32_t            edge_at;      ///< the counter of samples at the last edge of u
     uint8_t             count;        ///< of parameters
     uint8_t             pending_n;    ///< samples to come before the next equation is complete
-    bool                walks;        ///< the random walk is not zero
+    bool                adaptive;     ///< there is more to adapt than theta
     bool                known;        ///< the sample before this one is known
 } est_t;
 

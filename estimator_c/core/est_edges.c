@@ -4,20 +4,7 @@
 
 void est_edges_forget(est_edges_t* const self) { self->age_n = 0U; }
 
-void est_edges_age(est_edges_t* const self) {
-    if (self->age_n >= EST_DOUBT_N) {
-        self->age_n = 0U;
-    } else if (self->age_n > 0U) {
-        self->age_n++;
-    } else {
-        // no doubt
-    }
-}
-
-bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
-    const float step = u[0] - u[1];
-    return ((step >= config->edge_codes) || (step <= -config->edge_codes));
-}
+void est_edges_age(est_edges_t* const self) { self->age_n = (self->age_n < EST_DOUBT_N) ? (uint8_t)(self->age_n + 1U) : 0U; }
 
 static float height(const est_config_t* const config, const float* const u) {
     return est_edges_is_edge(config, u) ? (u[0] - u[1]) : 0.0F;

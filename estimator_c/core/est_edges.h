@@ -14,11 +14,14 @@
 /// No edge is in doubt.
 void est_edges_forget(est_edges_t* self);
 
-/// One sample later. A doubt that has lasted its term has been decided by est_trigger_step().
+/// One sample later, with an edge in doubt. A doubt that has lasted its term has been decided by est_trigger_step().
 void est_edges_age(est_edges_t* self);
 
 /// True iff u[0] comes after an edge, the values of u newest first.
-bool est_edges_is_edge(const est_config_t* config, const float* u);
+static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
+    const float step = u[0] - u[1];
+    return (step >= config->edge_codes) || (step <= -config->edge_codes);
+}
 
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
 /// sample before had an equation, which an edge one sample early would have entered.

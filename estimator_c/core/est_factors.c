@@ -25,16 +25,17 @@ void est_factors_reset(est_factors_t* const self, const est_config_t* const conf
     }
 }
 
-float est_factors_measure(est_factors_t* const      self,
-                          const est_config_t* const config,
-                          const est_equation_t      equation,
-                          float* const              theta) {
-    const uint8_t      count       = COUNT(equation.count);
+EST_INLINE float measure(est_factors_t* const        self,
+                         const est_config_t* const   config,
+                         const est_equation_t* const equation,
+                         float* const                theta,
+                         const uint8_t               count) {
     const float        remembering = 1.0F / config->forgetting;
-    const float* const phi         = equation.phi;
+    const float* const phi         = equation->phi;
     float              gain[EST_THETA_MAX];  // P phi, unscaled
-    float              alpha   = config->forgetting * equation.variance;
-    float              inverse = (equation.variance > 1.0F) ? (remembering / equation.variance) : remembering;
+    float              alpha   = config->forgetting * equation->variance;
+    float              inverse = (equation->variance > 1.0F) ? (remembering / equation->variance) : remembering;
+    float              d       = 0.0F;
     float*             column  = self->upper;
     EST_UNROLL
     for (uint8_t j = 0U; j < count; j++) {
@@ -43,13 +44,13 @@ float est_factors_measure(est_factors_t* const      self,
         for (uint8_t i = 0U; i < j; i++) {
             f += column[i] * phi[i];
         }
-        const float d      = self->d[j];
-        const float v      = d * f;
+        const float v      = self->d[j] * f;
         const float p      = f * inverse;
-        const float shrunk = d * (alpha * remembering);
+        const float shrunk = self->d[j] * (alpha * remembering);
         alpha += f * v;
         inverse    = 1.0F / alpha;
-        self->d[j] = limited(shrunk * inverse, prior_of(config, count, j));
+        d          = shrunk * inverse;
+        self->d[j] = limited(d, config->p0);
         EST_UNROLL
         for (uint8_t i = 0U; i < j; i++) {
             const float u = *column;
@@ -58,12 +59,23 @@ float est_factors_measure(est_factors_t* const      self,
         }
         gain[j] = v;
     }
-    const float scale = equation.innovation * inverse;
+    if (OFFSET(config)) {
+        self->d[count - 1U] = limited(d, config->p0_offset);
+    }
+    const float scale = equation->innovation * inverse;
     EST_UNROLL
     for (uint8_t i = 0U; i < count; i++) {
         theta[i] += gain[i] * scale;
     }
     return inverse;
+}
+
+float est_factors_measure(est_factors_t* const        self,
+                          const est_config_t* const   config,
+                          const est_equation_t* const equation,
+                          float* const                theta) {
+#define MEASURE(count) measure(self, config, equation, theta, (count))
+    return EST_FOR_COUNT(equation->count, MEASURE);
 }
 
 /// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.

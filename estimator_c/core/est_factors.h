@@ -23,7 +23,8 @@ void est_factors_reset(est_factors_t* self, const est_config_t* config);
 /// No d leaves the range that makes sense. Without the upper limit the variance of a direction that is not excited grows by
 /// 1 / forgetting per equation, without end ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it
 /// was at the start. Without the lower one a direction excited beyond all measure would be lost to underflow.
-float est_factors_measure(est_factors_t* self, const est_config_t* config, est_equation_t equation, float* theta);
+float est_factors_measure(
+    est_factors_t* self, const est_config_t* config, const est_equation_t* equation, float* theta);
 
 /// Every parameter walks: P := P + random_walk I, no d beyond the prior. The factors of Thornton's time update, "Triangular
 /// covariance factorizations for Kalman filtering" (1976), by rank-one updates, which need no work space.

@@ -79,9 +79,6 @@ static void remember(est_whitener_t* const self, const float* const gain, const 
 
 /// One row of the Cholesky factor of the banded covariance matrix of the noise. c[] is zero beyond its order.
 float est_whitener_advance(est_whitener_t* const self) {
-    if (self->settled) {
-        return 1.0F;
-    }
     float gain[EST_NA_MAX];
     float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
     float variance = autocovariance(self->c, 0U);
@@ -101,7 +98,7 @@ float est_whitener_advance(est_whitener_t* const self) {
 }
 
 /// One signal. A loop of fixed length is the faster one.
-static float filter(const float* const gain, est_past_t* const past, const float x) {
+EST_INLINE float filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
     EST_UNROLL_NA
     for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
@@ -117,14 +114,26 @@ float est_whitener_filter(const est_whitener_t* const self, est_past_t* const pa
     return filter(self->gain[0], past, x);
 }
 
-float est_whitener_apply(est_whitener_t* const self, const uint8_t count, float* const phi, const float* const theta) {
+EST_INLINE float
+apply(est_whitener_t* const self, float* const phi, const float* const theta, const uint8_t count) {
+    float gain[EST_NA_MAX];
     float predicted = 0.0F;
+    EST_UNROLL_NA
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        gain[i] = self->gain[0][i];
+    }
     EST_UNROLL
-    for (uint8_t j = 0U; j < COUNT(count); j++) {
-        const float x = filter(self->gain[0], &self->past[j], phi[j]);
+    for (uint8_t j = 0U; j < count; j++) {
+        const float x = filter(gain, &self->past[j], phi[j]);
         phi[j]        = x;
         predicted += x * theta[j];
     }
-    phi[COUNT(count)] = filter(self->gain[0], &self->past[COUNT(count)], phi[COUNT(count)]);
-    return phi[COUNT(count)] - predicted;
+    phi[count] = filter(gain, &self->past[count], phi[count]);
+    return phi[count] - predicted;
+}
+
+float
+est_whitener_apply(est_whitener_t* const self, const uint8_t count, float* const phi, const float* const theta) {
+#define APPLY(count) apply(self, phi, theta, (count))
+    return EST_FOR_COUNT(count, APPLY);
 }

@@ -17,7 +17,7 @@ void est_whitener_set(est_whitener_t* self, const float* c, uint8_t na);
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
 
-/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1.
+/// Goes on to the next equation, unless the filter has settled. Returns the variance of its noise once whitened, in variances of e; at least 1.
 float est_whitener_advance(est_whitener_t* self);
 
 /// Whitens the present equation in place, the regressor phi[0 .. count-1] and, last, the output phi[count].
