@@ -43,14 +43,6 @@ static bool within(const float x, const float low, const float high) { return (x
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-static uint8_t parameters(const est_config_t* const config) {
-    return (uint8_t)((uint32_t)NA(config) + NB(config) + NC(config) + (OFFSET(config) ? 1U : 0U));
-}
-
-static est_prior_t prior_of(const est_config_t* const config) {
-    return (est_prior_t){ .p0 = config->p0, .p0_last = OFFSET(config) ? config->p0_offset : config->p0 };
-}
-
 static bool orders_fixed(const est_config_t* const config) {
     return (config->na == NA(config)) && (config->nb == NB(config)) && (config->nk == NK(config)) &&
            (config->nc == NC(config)) && (config->offset == OFFSET(config));
@@ -59,7 +51,7 @@ static bool orders_fixed(const est_config_t* const config) {
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
            (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) && orders_fixed(config) &&
-           (parameters(config) <= EST_THETA_MAX);
+           (PARAMETERS(config) <= EST_THETA_MAX);
 }
 
 static bool variances_valid(const est_config_t* const config) {
@@ -76,26 +68,46 @@ static bool codes_valid(const est_config_t* const config) {
            (config->edge_instants >= EST_EDGES_LOCKED) && (config->edge_instants <= EST_EDGES_ANYWHERE);
 }
 
+static bool adaptive(const est_config_t* const config) {
+    return (config->nc > 0U) || config->noise_estimated || (config->refresh_n > 0U) || (config->random_walk > 0.0F);
+}
+
+static bool in_this_build(const est_config_t* const config) {
+    return (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
+           (EST_WITH_ADAPTATION || !adaptive(config)) &&
+           (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
+}
+
 bool est_config_valid(const est_config_t* const config) {
     EST_ASSERT(config != 0);
     return orders_valid(config) && est_whitener_accepts(config->c, config->na) && variances_valid(config) &&
-           codes_valid(config) && est_trigger_config_valid(&config->trigger);
+           codes_valid(config) && in_this_build(config) && est_trigger_config_valid(&config->trigger);
 }
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
-
-/// False for NaN too.
-static bool plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
-
-static bool saturated(const est_config_t* const config, const float code) {
-    return (code <= config->code_low) || (code >= config->code_high);
-}
 
 static void shift(float* const x, const uint8_t n, const float newest) {
     for (uint8_t i = (uint8_t)(n - 1U); i > 0U; i--) {
         x[i] = x[i - 1U];
     }
     x[0] = newest;
+}
+
+/// All of the past is kept, whatever the order needs: a loop of fixed length is the faster one.
+static void shift_u(est_t* const self, const float newest) {
+    EST_UNROLL_PAST
+    for (uint8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
+        self->u[i] = self->u[i - 1U];
+    }
+    self->u[0] = newest;
+}
+
+static void shift_y(est_t* const self, const float newest) {
+    EST_UNROLL_NA
+    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+        self->y[i] = self->y[i - 1U];
+    }
+    self->y[0] = newest;
 }
 
 /// How many samples before its own an equation reaches back to.
@@ -127,43 +139,106 @@ static void forget_samples(est_t* const self) {
     }
 }
 
-/// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant.
+/// Of this world. False for NaN too.
+static bool plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
+
+/// Within the range of the converter. False for NaN and the infinities too.
+static bool inside(const est_config_t* const config, const float code) {
+    return (code > config->code_low) && (code < config->code_high);
+}
+
+/// Whether the two are the same number, to the bit.
+static bool same(const float a, const float b) {
+    const union {
+        float    number;
+        uint32_t bits;
+    } first = { .number = a }, second = { .number = b };
+    return first.bits == second.bits;
+}
+
+/// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant. It may
+/// rest while u does.
 static bool stuck(est_t* const self, const float y, const bool edge) {
-    const bool same = self->known && !((y < self->y[0]) || (y > self->y[0]));
-    if (!same) {
+    if (!self->known || !same(y, self->y[0])) {
         self->same_n = 0U;
     } else if (edge || (self->same_n > 0U)) {
         count(&self->same_n);
     } else {
-        // y may rest while u does
+        // no edge that it has not answered
     }
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
 
 /// An edge joins the doubt about earlier ones if another reading of those is ahead, and otherwise begins a doubt of its own.
-/// A doubt that has lasted its term has been decided by est_trigger_step().
-static void enter_edge(est_t* const self, const float height) {
-    const bool expired = self->edges.age_n >= EST_DOUBT_N;
-    if (expired) {
-        est_edges_forget(&self->edges);
+static void doubt_edge(est_t* const self) {
+    if ((self->edges.age_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+        return;
     }
-    const bool edge  = (height > 0.0F) || (height < 0.0F);
-    const bool joins = !expired && est_trigger_in_doubt(&self->trigger);
-    if (edge && (self->config->edge_instants == EST_EDGES_ANYWHERE)) {
+    const float step = self->u[0] - self->u[1];
+    est_edges_begin(&self->edges, self->config, self->theta, self->count, step, self->pending_n == 0U);
+    est_trigger_begin_doubt(&self->trigger);
+}
+
+static void enter_edge(est_t* const self) {
+    self->edge_at = self->counters.updated;
+    if (!EST_WITH_EDGES) {
+        return;
+    }
+    if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
+        doubt_edge(self);
+    } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
         restart(self, NA(self->config));
-    }
-    if (edge && !joins && (self->config->edge_instants == EST_EDGES_MAY_SLIP)) {
-        est_edges_begin(&self->edges, self->config, self->theta, self->count, height, self->pending_n == 0U);
-        est_trigger_begin_doubt(&self->trigger);
-        self->edges.age_n = 1U;
-    } else if (self->edges.age_n > 0U) {
-        self->edges.age_n++;
     } else {
-        // no doubt
+        // the b's take it in
     }
 }
 
+/// Takes in u(k). The equation of this sample can be made unless the samples that it reaches back to are not all known.
+static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
+    const est_config_t* const config = self->config;
+    shift_u(self, sample.u);
+    const bool edge = self->known && est_edges_is_edge(config, self->u);
+    if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
+        count(&self->counters.stuck);
+        return EST_REFUSED;
+    }
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        est_edges_age(&self->edges);
+    }
+    if (edge) {
+        enter_edge(self);
+    }
+    self->known = true;
+    if (self->pending_n > 0U) {
+        gather(self);
+        return EST_GATHERING;
+    }
+    return EST_UPDATED;
+}
+
+/// Whether the sample is one, and what will become of it.
+static est_status_t examine(est_t* const self, const est_sample_t sample) {
+    if (!sample.valid) {
+        return EST_MISSING;
+    }
+    if (inside(self->config, sample.u) && inside(self->config, sample.y)) {
+        return enter_input(self, sample);
+    }
+    if (plausible(sample.u) && plausible(sample.y)) {
+        count(&self->counters.saturated);
+    }
+    return EST_REFUSED;
+}
+
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
+
+EST_INLINE float* append(float* const out, const float* const from, const uint8_t n) {
+    EST_UNROLL
+    for (uint8_t i = 0U; i < n; i++) {
+        out[i] = from[i];
+    }
+    return &out[n];
+}
 
 /// The regressor in the order of theta, and y(k) last.
 static void fill_equation(const est_t* const self, const float y, float* const phi) {
@@ -173,14 +248,8 @@ static void fill_equation(const est_t* const self, const float y, float* const p
     for (uint8_t i = 0U; i < NA(config); i++) {
         *out++ = -self->y[i];
     }
-    EST_UNROLL
-    for (uint8_t i = 0U; i < NB(config); i++) {
-        *out++ = self->u[NK(config) + i];
-    }
-    EST_UNROLL
-    for (uint8_t i = 0U; i < NC(config); i++) {
-        *out++ = self->residual[i];
-    }
+    out = append(out, &self->u[NK(config)], NB(config));
+    out = append(out, self->residual, NC(config));
     if (OFFSET(config)) {
         *out++ = 1.0F;
     }
@@ -189,44 +258,21 @@ static void fill_equation(const est_t* const self, const float y, float* const p
 
 static float predicted(const est_t* const self, const float* const phi, const float* const theta) {
     float out = 0.0F;
-    EST_UNROLL
     for (uint8_t i = 0U; i < COUNT(self->count); i++) {
         out += phi[i] * theta[i];
     }
     return out;
 }
 
-/// Three readings of the innovation: as recorded, and with the edges in doubt moved by one sample. The estimate has
-/// followed what was recorded since, so the other two are taken against what was believed before the doubt.
-static void read_innovation(est_t* const self, const float* const phi, float* const readings) {
-    const float y = phi[COUNT(self->count)];
-    readings[0]   = y - predicted(self, phi, self->theta);
-    if (self->edges.age_n == 0U) {
-        return;
-    }
-    const float e = y - predicted(self, phi, self->edges.theta);
+/// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
+/// they are taken against what was believed before the doubt.
+static void read_otherwise(est_t* const self, const float* const phi, float* const readings) {
+    const float e = phi[COUNT(self->count)] - predicted(self, phi, self->edges.theta);
     float       early;
     float       late;
     est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
     readings[1] = e - early;
     readings[2] = e - late;
-}
-
-/// Thesis Equ 3.19, 3.21 on the whitened equation. Returns the innovation's variance over that of the noise.
-static float update_estimate(est_t* const self, const float* const phi, const float innovation, const float variance) {
-    const est_config_t* const config = self->config;
-    float                     gain[EST_THETA_MAX];
-    const float               alpha = est_factors_measure(
-        &self->factors, self->count, prior_of(config), phi, config->forgetting, variance, gain);
-    const float scale = innovation / alpha;
-    EST_UNROLL
-    for (uint8_t i = 0U; i < COUNT(self->count); i++) {
-        self->theta[i] += gain[i] * scale;
-    }
-    if (config->random_walk > 0.0F) {
-        est_factors_walk(&self->factors, self->count, prior_of(config), config->random_walk);
-    }
-    return alpha / config->forgetting;
 }
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
@@ -236,11 +282,12 @@ static void keep_residual(est_t* const self, const float* const phi) {
     }
 }
 
-static void follow_noise(est_t* const self, const float innovation, const float variance) {
-    const float square  = (innovation * innovation) / variance;
-    const float ceiling = NOISE_CLIP * self->noise_variance;
-    const float clipped = (square < ceiling) ? square : ceiling;
-    const float noise   = self->noise_variance + (NOISE_RATE * ((clipped / NOISE_KEPT) - self->noise_variance));
+/// `precision`: the reciprocal of the innovation's variance over that of the noise.
+static void follow_noise(est_t* const self, const float innovation, const float precision) {
+    const float square   = innovation * innovation * precision;
+    const float ceiling  = NOISE_CLIP * self->noise_variance;
+    const float clipped  = (square < ceiling) ? square : ceiling;
+    const float noise    = self->noise_variance + (NOISE_RATE * ((clipped / NOISE_KEPT) - self->noise_variance));
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
@@ -272,7 +319,7 @@ static void follow_slip(est_t* const self) {
     for (uint8_t i = 0U; i < self->count; i++) {
         self->theta[i] = self->edges.theta[i];
     }
-    est_factors_inflate(&self->factors, self->count, prior_of(self->config), SLIP_DOUBT);
+    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
     if (est_trigger_settle_late(&self->trigger)) {
         shift(b, nb, 0.0F);
         return;
@@ -293,7 +340,7 @@ static void estimate_afresh(est_t* const self) {
         zero(self->theta, self->count);
     }
     self->equations_n = 0U;
-    est_factors_reset(&self->factors, self->count, prior_of(self->config));
+    est_factors_reset(&self->factors, self->config);
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
 }
 
@@ -301,7 +348,7 @@ static void react(est_t* const self, const est_finding_t finding) {
     if (finding == EST_QUIET) {
         return;
     }
-    if (finding == EST_ALARM) {
+    if (!EST_WITH_EDGES || (finding == EST_ALARM)) {
         count(&self->counters.alarms);
         estimate_afresh(self);
     } else {
@@ -311,23 +358,52 @@ static void react(est_t* const self, const est_finding_t finding) {
     forget_samples(self);  // they belong to the plant, or the clock, as it was
 }
 
-static bool idle(const est_t* const self) {
-    return (self->config->idle_n > 0U) && (self->idle_n >= self->config->idle_n);
-}
-
-static est_step_t no_equation(const est_t* const self, const est_status_t status) {
-    return (est_step_t){
-        .status = status, .alarm = false, .idle = idle(self), .innovation = 0.0F, .statistic = self->trigger.statistic
-    };
-}
-
-static est_step_t enter_gap(est_t* const self, const est_status_t status) {
+static void enter_gap(est_t* const self, const est_status_t status) {
     count_long((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
-    if (self->known && (self->edges.age_n > 0U)) {
+    if (EST_WITH_EDGES && self->known && (self->edges.age_n > 0U)) {
         react(self, est_trigger_end_doubt(&self->trigger, &self->config->trigger));
     }
     forget_samples(self);
-    return no_equation(self, status);
+}
+
+/// What an equation says besides theta.
+static void adapt(est_t* const self, const float* const phi, const float innovation, const float precision) {
+    const est_config_t* const config = self->config;
+    if (config->random_walk > 0.0F) {
+        est_factors_walk(&self->factors, config);
+    }
+    keep_residual(self, phi);
+    if (config->noise_estimated) {
+        follow_noise(self, innovation, precision);
+    }
+    count(&self->equations_n);
+    if ((config->refresh_n > 0U) && (self->equations_n >= config->refresh_n) && (self->edges.age_n == 0U)) {
+        refresh_prefilter(self);
+    }
+}
+
+static void enter_equation(est_t* const self, const float y, est_step_t* const step) {
+    const est_config_t* const config = self->config;
+    float                     phi[EST_THETA_MAX + 1U];
+    float                     readings[EST_READINGS];
+    fill_equation(self, y, phi);
+    est_equation_t equation = { .phi = phi, .count = self->count };
+    equation.variance       = self->whitener.settled ? 1.0F : est_whitener_advance(&self->whitener);
+    equation.innovation     = est_whitener_apply(&self->whitener, self->count, phi, self->theta);
+    readings[0]             = equation.innovation;
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        read_otherwise(self, phi, readings);
+    }
+    const float precision = config->forgetting * est_factors_measure(&self->factors, config, &equation, self->theta);
+    if (EST_WITH_ADAPTATION && self->adaptive) {
+        adapt(self, phi, readings[0], precision);
+    }
+    const est_finding_t finding = est_trigger_step(
+        &self->trigger, &config->trigger, readings, precision / self->noise_variance, self->edges.age_n);
+    step->innovation = equation.innovation;
+    step->statistic  = self->trigger.statistic;
+    step->alarm      = finding == EST_ALARM;
+    react(self, finding);
 }
 
 // ---------------------------------------------          API           ---------------------------------------------
@@ -339,9 +415,9 @@ est_config_t est_config_default(void) {
         .nk             = 0U,
         .nc             = 0U,
         .offset         = true,
-        .stuck_n        = 16U,
-        .idle_n         = 1000U,
-        .edge_instants  = EST_EDGES_MAY_SLIP,
+        .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
+        .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
+        .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,
         .forgetting     = 0.9925F,
         .random_walk    = 0.0F,
         .p0             = 10.0F,
@@ -371,88 +447,35 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;
     }
     *self                = (est_t){ .config = config };
-    self->count          = parameters(config);
+    self->count          = PARAMETERS(config);
+    self->adaptive       = adaptive(config);
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
     restart(self, past_n(config));
-    est_factors_reset(&self->factors, self->count, prior_of(config));
+    est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;
 }
 
-/// Takes in u(k); the equation of this sample can be made unless the samples before are not all known. False: stuck.
-static bool enter_input(est_t* const self, const est_sample_t sample) {
-    const est_config_t* const config = self->config;
-    shift(self->u, (uint8_t)(NB(config) + NK(config) + 1U), sample.u);
-    const float height = self->known ? est_edges_height(config, self->u) : 0.0F;
-    const bool  edge   = (height > 0.0F) || (height < 0.0F);
-    if (stuck(self, sample.y, edge)) {
-        return false;
-    }
-    if (edge) {
-        self->idle_n = 0U;
-    } else {
-        count(&self->idle_n);
-    }
-    enter_edge(self, height);
-    self->known = true;
-    return true;
-}
-
-static est_step_t enter_equation(est_t* const self, const float y) {
-    const est_config_t* const config = self->config;
-    float                     phi[EST_THETA_MAX + 1U];
-    float                     readings[EST_READINGS] = { 0.0F };
-    fill_equation(self, y, phi);
-    const float whitened = est_whitener_advance(&self->whitener, NA(config));
-    est_whitener_apply(&self->whitener, NA(config), self->count, phi);
-    read_innovation(self, phi, readings);
-    const float variance = update_estimate(self, phi, readings[0], whitened);
-    keep_residual(self, phi);
-    count(&self->equations_n);
-
-    const est_finding_t finding = est_trigger_step(
-        &self->trigger, &config->trigger, readings, variance * self->noise_variance, self->edges.age_n);
-    const est_step_t step = { .status     = EST_UPDATED,
-                              .alarm      = finding == EST_ALARM,
-                              .idle       = idle(self),
-                              .innovation = readings[0],
-                              .statistic  = self->trigger.statistic };
-    if (config->noise_estimated) {
-        follow_noise(self, readings[0], variance);
-    }
-    react(self, finding);
-    if ((config->refresh_n > 0U) && (self->equations_n >= config->refresh_n) && (self->edges.age_n == 0U)) {
-        refresh_prefilter(self);
-    }
-    return step;
+/// At the end of the counter's range the excitation is never lost again.
+static bool idle(const est_t* const self) {
+    return (self->config->idle_n > 0U) && ((self->counters.updated - self->edge_at) >= self->config->idle_n);
 }
 
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != 0);
-    if (!sample.valid) {
-        return enter_gap(self, EST_MISSING);
-    }
-    if (!plausible(sample.u) || !plausible(sample.y)) {
-        return enter_gap(self, EST_REFUSED);
-    }
-    if (saturated(self->config, sample.u) || saturated(self->config, sample.y)) {
-        count(&self->counters.saturated);
-        return enter_gap(self, EST_REFUSED);
-    }
-    if (!enter_input(self, sample)) {
-        count(&self->counters.stuck);
-        return enter_gap(self, EST_REFUSED);
-    }
-    count_long(&self->counters.updated);
-    est_step_t step;
-    if (self->pending_n > 0U) {
-        gather(self);
-        step = no_equation(self, EST_GATHERING);
+    est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
+    step.statistic  = self->trigger.statistic;
+    if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
+        enter_gap(self, step.status);
     } else {
-        step = enter_equation(self, sample.y);
+        count_long(&self->counters.updated);
+        if (step.status == EST_UPDATED) {
+            enter_equation(self, sample.y, &step);
+        }
+        shift_y(self, sample.y);
     }
-    shift(self->y, NA(self->config), sample.y);
+    step.idle = EST_WITH_WATCH && idle(self);
     return step;
 }
 
@@ -482,7 +505,7 @@ est_counters_t est_counters(const est_t* const self) {
 }
 
 bool est_invariants_hold(const est_t* const self) {
-    if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != parameters(self->config))) {
+    if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != PARAMETERS(self->config))) {
         return false;
     }
     for (uint8_t i = 0U; i < self->count; i++) {

@@ -196,20 +196,25 @@ typedef struct {
     float upper[(EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
 } est_factors_t;
 
+/// The last values of one whitened signal, newest first. Private.
+typedef struct {
+    float x[EST_NA_MAX];
+} est_past_t;
+
 /// Makes the noise of consecutive equations white. Private to est_whitener.c.
 typedef struct {
     float c[EST_NA_MAX];
     float gain[EST_NA_MAX][EST_NA_MAX];          ///< of the newest equation first
-    float variance[EST_NA_MAX];                  ///< of the noise of the whitened equations, newest first
-    float past[EST_NA_MAX][EST_THETA_MAX + 1U];  ///< the whitened equations, newest first
-    uint8_t n;                                   ///< how many equations there were, as far as it matters
+    float precision[EST_NA_MAX];  ///< of the whitened equations, newest first
+    est_past_t past[EST_THETA_MAX + 1U];  ///< of the elements of the equation
+    uint8_t n;                                   ///< how many equations there were, at most EST_NA_MAX
     bool    settled;                             ///< the gains are c and the variance is 1
 } est_whitener_t;
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
-    float   early[EST_NA_MAX];     ///< their share in the whitened equations, newest first
-    float   late[EST_NA_MAX];
+    est_past_t early;  ///< their share in the whitened equations
+    est_past_t late;
     float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
     uint8_t age_n;                 ///< samples since the first of these edges, that one included; 0: no doubt
 } est_edges_t;
@@ -239,10 +244,11 @@ typedef struct {
     est_trigger_t       trigger;
     est_counters_t      counters;
     uint16_t            equations_n;  ///< since the last reset of the covariance or refresh of C
-    uint16_t            idle_n;       ///< samples since the last edge of u
     uint16_t            same_n;       ///< samples since an edge of u for which y has been the same
+    uint32_t            edge_at;      ///< the counter of samples at the last edge of u
     uint8_t             count;        ///< of parameters
     uint8_t             pending_n;    ///< samples to come before the next equation is complete
+    bool                adaptive;     ///< there is more to adapt than theta
     bool                known;        ///< the sample before this one is known
 } est_t;
 

@@ -4,24 +4,25 @@
 
 void est_edges_forget(est_edges_t* const self) { self->age_n = 0U; }
 
-float est_edges_height(const est_config_t* const config, const float* const u) {
-    const float step = u[0] - u[1];
-    return ((step >= config->edge_codes) || (step <= -config->edge_codes)) ? step : 0.0F;
+void est_edges_age(est_edges_t* const self) { self->age_n = (self->age_n < EST_DOUBT_N) ? (uint8_t)(self->age_n + 1U) : 0U; }
+
+static float height(const est_config_t* const config, const float* const u) {
+    return est_edges_is_edge(config, u) ? (u[0] - u[1]) : 0.0F;
 }
 
 void est_edges_begin(est_edges_t* const        self,
                      const est_config_t* const config,
                      const float* const        theta,
                      const uint8_t             count,
-                     const float               height,
+                     const float               step,
                      const bool                after_equation) {
-    self->age_n = 0U;
-    for (uint8_t i = 0U; i < NA(config); i++) {
-        self->early[i] = 0.0F;
-        self->late[i]  = 0.0F;
+    self->age_n = 1U;
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        self->early.x[i] = 0.0F;
+        self->late.x[i]  = 0.0F;
     }
     if (after_equation && (NK(config) == 0U)) {
-        self->early[0] = theta[NA(config)] * height;
+        self->early.x[0] = theta[NA(config)] * step;
     }
     for (uint8_t i = 0U; i < COUNT(count); i++) {
         self->theta[i] = theta[i];
@@ -38,12 +39,15 @@ void est_edges_shares(est_edges_t* const          self,
     const float* const b         = &self->theta[NA(config)];
     float              early_raw = 0.0F;
     float              late_raw  = 0.0F;
-    for (uint8_t lag = 0U; (lag < (NK(config) + NB(config))) && (lag < self->age_n); lag++) {
-        const float   height = est_edges_height(config, &u[lag]);
-        const uint8_t next   = (uint8_t)(lag + 1U);
-        late_raw -= (lag >= NK(config)) ? (b[lag - NK(config)] * height) : 0.0F;
-        early_raw += ((next >= NK(config)) && ((next - NK(config)) < NB(config))) ? (b[next - NK(config)] * height) : 0.0F;
+    for (uint8_t j = 0U; j < NB(config); j++) {
+        const uint8_t lag = (uint8_t)(NK(config) + j);
+        if (lag < self->age_n) {
+            late_raw -= b[j] * height(config, &u[lag]);
+        }
+        if ((lag > 0U) && (lag <= self->age_n)) {
+            early_raw += b[j] * height(config, &u[lag - 1U]);
+        }
     }
-    *early = est_whitener_filter(whitener, NA(config), self->early, early_raw);
-    *late  = est_whitener_filter(whitener, NA(config), self->late, late_raw);
+    *early = est_whitener_filter(whitener, &self->early, early_raw);
+    *late  = est_whitener_filter(whitener, &self->late, late_raw);
 }

@@ -14,13 +14,19 @@
 /// No edge is in doubt.
 void est_edges_forget(est_edges_t* self);
 
-/// The height of the edge at u[0], the values of u newest first; 0 if it is none.
-float est_edges_height(const est_config_t* config, const float* u);
+/// One sample later, with an edge in doubt. A doubt that has lasted its term has been decided by est_trigger_step().
+void est_edges_age(est_edges_t* self);
 
-/// An edge of this height has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
+/// True iff u[0] comes after an edge, the values of u newest first.
+static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
+    const float step = u[0] - u[1];
+    return (step >= config->edge_codes) || (step <= -config->edge_codes);
+}
+
+/// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
 /// sample before had an equation, which an edge one sample early would have entered.
 void est_edges_begin(
-    est_edges_t* self, const est_config_t* config, const float* theta, uint8_t count, float height, bool after_equation);
+    est_edges_t* self, const est_config_t* config, const float* theta, uint8_t count, float step, bool after_equation);
 
 /// What the edges, had they come early, and late, would have added to the present equation, whitened.
 void est_edges_shares(est_edges_t*          self,

@@ -1,41 +1,37 @@
 /// The covariance of theta in factors: P = U D U' with U unit upper triangular, in units of the noise variance. A product of
-/// this form cannot lose symmetry, and stays positive as long as D does. A build of fixed order unrolls its loops.
+/// this form cannot lose symmetry, and stays positive as long as D does.
 
 #ifndef EST_FACTORS_H_INCLUDED
 #define EST_FACTORS_H_INCLUDED
 
 #include "est.h"
 
-/// The variances that a reset gives: of all parameters but the last, and of the last.
+/// One equation: the regressor and what was not foreseen of its output.
 typedef struct {
-    float p0;
-    float p0_last;
-} est_prior_t;
+    const float* phi;
+    uint8_t      count;  ///< of its elements
+    float        innovation;
+    float        variance;  ///< of the equation's noise, in noise variances
+} est_equation_t;
 
 /// P := P0.
-void est_factors_reset(est_factors_t* self, uint8_t count, est_prior_t prior);
+void est_factors_reset(est_factors_t* self, const est_config_t* config);
 
 /// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
-/// forgetting factor of thesis Equ 3.21. gain[] receives P phi, unscaled.
-/// Returns alpha = forgetting * variance + phi' P phi, where variance is that of the measurement's noise.
+/// forgetting factor of thesis Equ 3.21. Moves theta, and returns 1 / (forgetting * variance + phi' P phi).
 ///
 /// No d leaves the range that makes sense. Without the upper limit the variance of a direction that is not excited grows by
 /// 1 / forgetting per equation, without end ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it
 /// was at the start. Without the lower one a direction excited beyond all measure would be lost to underflow.
-float est_factors_measure(est_factors_t* self,
-                          uint8_t        count,
-                          est_prior_t    prior,
-                          const float*   phi,
-                          float          forgetting,
-                          float          variance,
-                          float*         gain);
+float est_factors_measure(
+    est_factors_t* self, const est_config_t* config, const est_equation_t* equation, float* theta);
 
-/// Every parameter walks: P := P + variance I, no d beyond the prior. Thornton, "Triangular covariance factorizations for
-/// Kalman filtering" (1976): modified weighted Gram-Schmidt on (U, I).
-void est_factors_walk(est_factors_t* self, uint8_t count, est_prior_t prior, float variance);
+/// Every parameter walks: P := P + random_walk I, no d beyond the prior. The factors of Thornton's time update, "Triangular
+/// covariance factorizations for Kalman filtering" (1976), by rank-one updates, which need no work space.
+void est_factors_walk(est_factors_t* self, const est_config_t* config);
 
 /// Every parameter is less certain by this factor.
-void est_factors_inflate(est_factors_t* self, uint8_t count, est_prior_t prior, float factor);
+void est_factors_inflate(est_factors_t* self, const est_config_t* config, float factor);
 
 /// One diagonal element of P.
 float est_factors_variance(const est_factors_t* self, uint8_t count, uint8_t index);

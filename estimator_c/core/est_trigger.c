@@ -1,6 +1,7 @@
 #include "est_trigger.h"
 
 #include "est_edges.h"
+#include "est_orders.h"
 
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
@@ -19,21 +20,45 @@ static float mean_between_faults(est_trigger_t* const self, const bool absolute,
     return magnitude(*mean);
 }
 
-static float cusum(const float before, const float innovation, const float variance) {
-    const float sum = before + ((CUSUM_GAIN * innovation * innovation) / variance) - CUSUM_DRIFT;
+static float custom(est_trigger_t* const              self,
+                    const est_trigger_config_t* const config,
+                    const float                       innovation,
+                    const float                       variance) {
+    const bool anew = self->mean_n == 0U;
+    self->mean_n    = 1U;
+    return config->custom(config->context, innovation, variance, anew);
+}
+
+/// Of the triggers that know nothing of edges.
+static float other_statistic(est_trigger_t* const              self,
+                             const est_trigger_config_t* const config,
+                             const float                       innovation,
+                             const float                       precision) {
+    switch (config->kind) {
+    case EST_TRIGGER_PREDICTION_ERROR:
+        return magnitude(innovation);
+    case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
+        return mean_between_faults(self, config->absolute, innovation);
+    case EST_TRIGGER_CUSTOM:
+        return custom(self, config, innovation, 1.0F / precision);
+    case EST_TRIGGER_NONE:
+    case EST_TRIGGER_CUSUM:
+    default:
+        return 0.0F;
+    }
+}
+
+static float cusum(const float before, const float innovation, const float precision) {
+    const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
     return (sum > 0.0F) ? sum : 0.0F;
 }
 
 /// The plant has changed only if no reading of the edges explains the innovations.
-static est_finding_t find_by_cusum(est_trigger_t* const self,
-                                   const float          ceiling,
-                                   const float          readings[EST_READINGS],
-                                   const float          variance,
-                                   const uint16_t       doubt_n) {
-    self->statistic = cusum(self->statistic, readings[0], variance);
-    bool explained  = false;
+static est_finding_t
+find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const readings, const float precision, const bool expires) {
+    bool explained = false;
     for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = (doubt_n > 0U) ? cusum(self->rival[i], readings[i + 1U], variance) : self->statistic;
+        self->rival[i] = cusum(self->rival[i], readings[i + 1U], precision);
         explained      = explained || (self->rival[i] < ceiling);
     }
     if (self->statistic < ceiling) {
@@ -42,11 +67,12 @@ static est_finding_t find_by_cusum(est_trigger_t* const self,
     if (!explained) {
         return EST_ALARM;
     }
-    return (doubt_n >= EST_DOUBT_N) ? EST_SLIP : EST_QUIET;
+    return expires ? EST_SLIP : EST_QUIET;
 }
 
 bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
+                       (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
                        ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != 0));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
@@ -92,28 +118,21 @@ bool est_trigger_in_doubt(const est_trigger_t* const self) {
 est_finding_t est_trigger_step(est_trigger_t* const              self,
                                const est_trigger_config_t* const config,
                                const float                       readings[EST_READINGS],
-                               const float                       variance,
+                               const float                       precision,
                                const uint16_t                    doubt_n) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
         return EST_QUIET;
     }
-    switch (config->kind) {
-    case EST_TRIGGER_PREDICTION_ERROR:
-        self->statistic = magnitude(readings[0]);
-        break;
-    case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
-        self->statistic = mean_between_faults(self, config->absolute, readings[0]);
-        break;
-    case EST_TRIGGER_CUSTOM:
-        self->statistic = config->custom(config->context, readings[0], variance, self->mean_n == 0U);
-        self->mean_n    = 1U;
-        break;
-    case EST_TRIGGER_CUSUM:
-        return find_by_cusum(self, config->ceiling, readings, variance, doubt_n);
-    case EST_TRIGGER_NONE:
-    default:
-        return EST_QUIET;
+    if (config->kind == EST_TRIGGER_CUSUM) {
+        self->statistic = cusum(self->statistic, readings[0], precision);
+        if (EST_WITH_EDGES && (doubt_n > 0U)) {
+            return find_in_doubt(self, config->ceiling, readings, precision, doubt_n >= EST_DOUBT_N);
+        }
+    } else if (EST_WITH_TRIGGERS) {
+        self->statistic = other_statistic(self, config, readings[0], precision);
+    } else {
+        // no trigger
     }
     return (self->statistic >= config->ceiling) ? EST_ALARM : EST_QUIET;
 }

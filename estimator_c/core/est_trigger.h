@@ -32,12 +32,12 @@ bool est_trigger_settle_late(est_trigger_t* self);
 /// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
 bool est_trigger_in_doubt(const est_trigger_t* self);
 
-/// Enters one innovation [codes] in every reading of the edges in doubt, the first as recorded, and its predicted
-/// variance [codes^2]. doubt_n: samples since the doubt began; 0: no doubt, and only the first reading counts.
+/// Enters one innovation [codes] in every reading of the edges in doubt, the first as recorded, and the
+/// reciprocal of its predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and only the first reading counts.
 est_finding_t est_trigger_step(est_trigger_t*              self,
                                const est_trigger_config_t* config,
                                const float                 readings[EST_READINGS],
-                               float                       variance,
+                               float                       precision,
                                uint16_t                    doubt_n);
 
 #endif  // EST_TRIGGER_H_INCLUDED

@@ -2,8 +2,8 @@
 
 #include "est_orders.h"
 
-/// The gains have come to C once they are as near as this; what is left makes no noise worth the name.
-#define SETTLED 1.0e-3F
+/// The gains have come to C once the variance of the noise is below this; what is left makes no difference worth the name.
+#define SETTLED 1.0001F
 
 /// Reflection coefficients beyond this belong to a C that filters the data into overflow.
 #define REFLECTION_MAX 0.9999F
@@ -41,95 +41,99 @@ void est_whitener_set(est_whitener_t* const self, const float* const c, const ui
 void est_whitener_restart(est_whitener_t* const self) {
     self->n       = 0U;
     self->settled = false;
-    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->variance[i] = 1.0F;
-        for (uint8_t j = 0U; j < EST_NA_MAX; j++) {
-            self->gain[i][j] = 0.0F;
-        }
-        for (uint8_t j = 0U; j <= EST_THETA_MAX; j++) {
-            self->past[i][j] = 0.0F;
+    for (uint8_t j = 0U; j <= EST_THETA_MAX; j++) {
+        for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+            self->past[j].x[i] = 0.0F;
         }
     }
 }
 
 /// The autocovariance of C(z) e at this lag.
-static float autocovariance(const est_whitener_t* const self, const uint8_t na, const uint8_t lag) {
-    float sum = (lag == 0U) ? 1.0F : self->c[lag - 1U];
-    for (uint8_t i = 0U; (i + lag) < na; i++) {
-        sum += self->c[i] * self->c[i + lag];
+static float autocovariance(const float* const c, const uint8_t lag) {
+    float sum = (lag == 0U) ? 1.0F : c[lag - 1U];
+    EST_UNROLL_NA
+    for (uint8_t i = lag; i < EST_NA_MAX; i++) {
+        sum += c[i] * c[i - lag];
     }
     return sum;
 }
 
-static void shift_gains(est_whitener_t* const self, const uint8_t na) {
-    for (uint8_t row = (uint8_t)(na - 1U); row > 0U; row--) {
-        for (uint8_t i = 0U; i < na; i++) {
+/// The gains of a new equation.
+static void remember(est_whitener_t* const self, const float* const gain, const float variance) {
+    EST_UNROLL_NA
+    for (uint8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
+        self->precision[row] = self->precision[row - 1U];
+        EST_UNROLL_NA
+        for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
             self->gain[row][i] = self->gain[row - 1U][i];
         }
     }
+    self->precision[0] = 1.0F / variance;
+    self->settled      = variance < SETTLED;
+    self->n            = (uint8_t)(self->n + ((self->n < EST_NA_MAX) ? 1U : 0U));
+    EST_UNROLL_NA
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        self->gain[0][i] = self->settled ? self->c[i] : gain[i];
+    }
 }
 
-static bool near(const float a, const float b) { return ((a - b) < SETTLED) && ((b - a) < SETTLED); }
-
-static void settle(est_whitener_t* const self, const uint8_t na) {
-    for (uint8_t i = 0U; i < na; i++) {
-        if (!near(self->gain[0][i], self->c[i])) {
-            return;
+/// One row of the Cholesky factor of the banded covariance matrix of the noise. c[] is zero beyond its order.
+float est_whitener_advance(est_whitener_t* const self) {
+    float gain[EST_NA_MAX];
+    float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
+    float variance = autocovariance(self->c, 0U);
+    EST_UNROLL_NA
+    for (uint8_t i = EST_NA_MAX; i > 0U; i--) {
+        float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
+        EST_UNROLL_NA
+        for (uint8_t m = EST_NA_MAX; m > i; m--) {
+            sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];
         }
+        covariance[i - 1U] = sum;
+        gain[i - 1U]       = sum * self->precision[i - 1U];
+        variance -= sum * gain[i - 1U];
     }
-    self->settled = true;
+    remember(self, gain, variance);
+    return self->settled ? 1.0F : variance;
 }
 
-/// One row of the Cholesky factor of the banded covariance matrix of the noise, scaled by its diagonal.
-float est_whitener_advance(est_whitener_t* const self, const uint8_t na) {
-    if (self->settled) {
-        return 1.0F;
-    }
-    const uint8_t reach = (self->n < na) ? self->n : na;
-    float         rest  = autocovariance(self, na, 0U);
-    shift_gains(self, na);
-    for (uint8_t i = na; i > 0U; i--) {
-        float gain = 0.0F;
-        if (i <= reach) {
-            gain = autocovariance(self, na, i);
-            for (uint8_t m = (uint8_t)(i + 1U); m <= reach; m++) {
-                gain -= self->gain[0][m - 1U] * self->gain[i][m - i - 1U] * self->variance[m - 1U];
-            }
-            gain /= self->variance[i - 1U];
-            rest -= gain * gain * self->variance[i - 1U];
-        }
-        self->gain[0][i - 1U] = gain;
-    }
-    for (uint8_t i = (uint8_t)(na - 1U); i > 0U; i--) {
-        self->variance[i] = self->variance[i - 1U];
-    }
-    self->variance[0] = (rest > 1.0F) ? rest : 1.0F;
-    self->n           = (uint8_t)(reach + 1U);
-    settle(self, na);
-    return self->variance[0];
-}
-
-float est_whitener_filter(const est_whitener_t* const self, const uint8_t na, float* const past, const float x) {
+/// One signal. A loop of fixed length is the faster one.
+EST_INLINE float filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
-    for (uint8_t i = NA_OF(na); i > 0U; i--) {
-        out -= self->gain[0][i - 1U] * past[i - 1U];
-        past[i - 1U] = (i > 1U) ? past[i - 2U] : out;
+    EST_UNROLL_NA
+    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+        out -= gain[i] * past->x[i];
+        past->x[i] = past->x[i - 1U];
     }
-    past[0] = out;
+    out -= gain[0] * past->x[0];
+    past->x[0] = out;
     return out;
 }
 
-void est_whitener_apply(est_whitener_t* const self, const uint8_t na, const uint8_t count, float* const phi) {
-    EST_UNROLL
-    for (uint8_t j = 0U; j <= COUNT(count); j++) {
-        float out = phi[j];
-        EST_UNROLL
-        for (uint8_t i = (uint8_t)(NA_OF(na) - 1U); i > 0U; i--) {
-            out -= self->gain[0][i] * self->past[i][j];
-            self->past[i][j] = self->past[i - 1U][j];
-        }
-        out -= self->gain[0][0] * self->past[0][j];
-        self->past[0][j] = out;
-        phi[j]           = out;
+float est_whitener_filter(const est_whitener_t* const self, est_past_t* const past, const float x) {
+    return filter(self->gain[0], past, x);
+}
+
+EST_INLINE float
+apply(est_whitener_t* const self, float* const phi, const float* const theta, const uint8_t count) {
+    float gain[EST_NA_MAX];
+    float predicted = 0.0F;
+    EST_UNROLL_NA
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        gain[i] = self->gain[0][i];
     }
+    EST_UNROLL
+    for (uint8_t j = 0U; j < count; j++) {
+        const float x = filter(gain, &self->past[j], phi[j]);
+        phi[j]        = x;
+        predicted += x * theta[j];
+    }
+    phi[count] = filter(gain, &self->past[count], phi[count]);
+    return phi[count] - predicted;
+}
+
+float
+est_whitener_apply(est_whitener_t* const self, const uint8_t count, float* const phi, const float* const theta) {
+#define APPLY(count) apply(self, phi, theta, (count))
+    return EST_FOR_COUNT(count, APPLY);
 }

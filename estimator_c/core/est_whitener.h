@@ -17,13 +17,14 @@ void est_whitener_set(est_whitener_t* self, const float* c, uint8_t na);
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
 
-/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1.
-float est_whitener_advance(est_whitener_t* self, uint8_t na);
+/// Goes on to the next equation, unless the filter has settled. Returns the variance of its noise once whitened, in variances of e; at least 1.
+float est_whitener_advance(est_whitener_t* self);
 
-/// Whitens the present equation in place: the regressor phi[0 .. count-1] and, last, the output phi[count].
-void est_whitener_apply(est_whitener_t* self, uint8_t na, uint8_t count, float* phi);
+/// Whitens the present equation in place, the regressor phi[0 .. count-1] and, last, the output phi[count].
+/// Returns its residual phi[count] - phi' theta.
+float est_whitener_apply(est_whitener_t* self, uint8_t count, float* phi, const float* theta);
 
-/// Whitens another signal along with the equations. past[] has its last na values, newest first.
-float est_whitener_filter(const est_whitener_t* self, uint8_t na, float* past, float x);
+/// Whitens another signal along with the equations.
+float est_whitener_filter(const est_whitener_t* self, est_past_t* past, float x);
 
 #endif  // EST_WHITENER_H_INCLUDED
