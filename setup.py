@@ -49,6 +49,8 @@ OTHER_SOURCES = (
 )
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
+# A computer has room for extended least squares as well.
+ROOM = ("-DEST_NC_MAX=2U",)
 BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
 SHARED = ("-shared", "-fPIC")
 POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals; the port alone may know an operating system
@@ -88,7 +90,7 @@ class BuildProducts(Command):
             (destination / product).parent.mkdir(parents=True, exist_ok=True)
         generate_codecs(generated, destination / CATALOGUE)
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
-        include = tuple(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated))
+        include = (*ROOM, *(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated)))
         compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
         compile_c(destination / DEVICE, device, (*SHARED, *include))
         compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))

@@ -180,7 +180,7 @@ static void doubt_edge(est_t* const self) {
 }
 
 static void enter_edge(est_t* const self) {
-    self->edge_at = self->counters.updated;
+    self->idle_n = 0U;
     if (!EST_WITH_EDGES) {
         return;
     }
@@ -201,6 +201,9 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
         count(&self->counters.stuck);
         return EST_REFUSED;
+    }
+    if (EST_WITH_WATCH) {
+        count(&self->idle_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
         est_edges_age(&self->edges);
@@ -249,7 +252,9 @@ static void fill_equation(const est_t* const self, const float y, float* const p
         *out++ = -self->y[i];
     }
     out = append(out, &self->u[NK(config)], NB(config));
+#if EST_NC_MAX > 0
     out = append(out, self->residual, NC(config));
+#endif
     if (OFFSET(config)) {
         *out++ = 1.0F;
     }
@@ -277,9 +282,14 @@ static void read_otherwise(est_t* const self, const float* const phi, float* con
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
 static void keep_residual(est_t* const self, const float* const phi) {
+#if EST_NC_MAX > 0
     if (NC(self->config) > 0U) {
         shift(self->residual, NC(self->config), phi[COUNT(self->count)] - predicted(self, phi, self->theta));
     }
+#else
+    (void)self;
+    (void)phi;
+#endif
 }
 
 /// `precision`: the reciprocal of the innovation's variance over that of the noise.
@@ -359,7 +369,11 @@ static void react(est_t* const self, const est_finding_t finding) {
 }
 
 static void enter_gap(est_t* const self, const est_status_t status) {
-    count_long((status == EST_REFUSED) ? &self->counters.refused : &self->counters.missing);
+    if (status == EST_REFUSED) {
+        count(&self->counters.refused);
+    } else {
+        count_long(&self->counters.missing);
+    }
     if (EST_WITH_EDGES && self->known && (self->edges.age_n > 0U)) {
         react(self, est_trigger_end_doubt(&self->trigger, &self->config->trigger));
     }
@@ -457,11 +471,6 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     return true;
 }
 
-/// At the end of the counter's range the excitation is never lost again.
-static bool idle(const est_t* const self) {
-    return (self->config->idle_n > 0U) && ((self->counters.updated - self->edge_at) >= self->config->idle_n);
-}
-
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != 0);
     est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
@@ -475,7 +484,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         }
         shift_y(self, sample.y);
     }
-    step.idle = EST_WITH_WATCH && idle(self);
+    step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->idle_n >= self->config->idle_n);
     return step;
 }
 

@@ -51,7 +51,7 @@ extern "C" {
 #define EST_NK_MAX 1U
 #endif
 #ifndef EST_NC_MAX
-#define EST_NC_MAX 2U
+#define EST_NC_MAX 0U
 #endif
 #ifndef EST_THETA_MAX
 #define EST_THETA_MAX 6U
@@ -181,7 +181,7 @@ typedef struct {
 typedef struct {
     uint32_t updated;    ///< samples taken in, those without an equation included
     uint32_t missing;
-    uint32_t refused;    ///< not finite or absurd, saturated, stuck
+    uint16_t refused;    ///< not finite or absurd, saturated, stuck
     uint16_t saturated;  ///< of those
     uint16_t stuck;      ///< of those
     uint16_t alarms;
@@ -196,6 +196,9 @@ typedef struct {
     float upper[(EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
 } est_factors_t;
 
+/// The gains of so many equations are needed to find those of the next.
+#define EST_GAINS_KEPT ((EST_NA_MAX > 1U) ? (EST_NA_MAX - 1U) : 1U)
+
 /// The last values of one whitened signal, newest first. Private.
 typedef struct {
     float x[EST_NA_MAX];
@@ -203,20 +206,20 @@ typedef struct {
 
 /// Makes the noise of consecutive equations white. Private to est_whitener.c.
 typedef struct {
+    uint8_t n;        ///< how many equations there were, at most EST_NA_MAX
+    bool    settled;  ///< the gains are c and the variance is 1
     float c[EST_NA_MAX];
-    float gain[EST_NA_MAX][EST_NA_MAX];          ///< of the newest equation first
+    float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< of the newest equation first
     float precision[EST_NA_MAX];  ///< of the whitened equations, newest first
     est_past_t past[EST_THETA_MAX + 1U];  ///< of the elements of the equation
-    uint8_t n;                                   ///< how many equations there were, at most EST_NA_MAX
-    bool    settled;                             ///< the gains are c and the variance is 1
 } est_whitener_t;
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
+    uint8_t age_n;  ///< samples since the first of these edges, that one included; 0: no doubt
     est_past_t early;  ///< their share in the whitened equations
     est_past_t late;
     float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
-    uint8_t age_n;                 ///< samples since the first of these edges, that one included; 0: no doubt
 } est_edges_t;
 
 /// The readings of the recent edges: as recorded, one sample early, one sample late.
@@ -230,26 +233,29 @@ typedef struct {
     uint16_t mean_n;                    ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
 } est_trigger_t;
 
-/// The state of an estimator. The fields are private; read them through the functions below.
+/// The state of an estimator. The fields are private; read them through the functions below. The small ones come first: an
+/// offset below 128 bytes is a shorter instruction.
 typedef struct {
     const est_config_t* config;
-    est_factors_t       factors;
-    float               theta[EST_THETA_MAX];
-    float               y[EST_NA_MAX];                 ///< y(k-1), y(k-2), ...
-    float               u[EST_INPUT_PAST_MAX + 2U];    ///< u(k), u(k-1), ...
-    float               residual[EST_NC_MAX + 1U];     ///< of the equations before this one, newest first
-    float               noise_variance;                ///< [codes^2]
-    est_whitener_t      whitener;
-    est_edges_t         edges;
+    uint8_t             count;      ///< of parameters
+    uint8_t             pending_n;  ///< samples to come before the next equation is complete
+    bool                adaptive;   ///< there is more to adapt than theta
+    bool                known;      ///< the sample before this one is known
+    uint16_t            equations_n;     ///< since the last reset of the covariance or refresh of C
+    uint16_t            same_n;          ///< samples since an edge of u for which y has been the same
+    uint16_t            idle_n;          ///< samples since the last edge of u
+    float               noise_variance;  ///< [codes^2]
+    float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
+    float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
     est_trigger_t       trigger;
     est_counters_t      counters;
-    uint16_t            equations_n;  ///< since the last reset of the covariance or refresh of C
-    uint16_t            same_n;       ///< samples since an edge of u for which y has been the same
-    uint32_t            edge_at;      ///< the counter of samples at the last edge of u
-    uint8_t             count;        ///< of parameters
-    uint8_t             pending_n;    ///< samples to come before the next equation is complete
-    bool                adaptive;     ///< there is more to adapt than theta
-    bool                known;        ///< the sample before this one is known
+    float               theta[EST_THETA_MAX];
+    est_factors_t       factors;
+    est_whitener_t      whitener;
+    est_edges_t         edges;
+#if EST_NC_MAX > 0
+    float               residual[EST_NC_MAX];  ///< of the equations before this one, newest first
+#endif
 } est_t;
 
 /// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C fixed at

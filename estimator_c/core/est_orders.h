@@ -43,7 +43,7 @@
 #endif
 
 /// Loops over the constants EST_NA_MAX and EST_INPUT_PAST_MAX, which are small.
-#ifdef __GNUC__
+#if defined(__GNUC__) && !defined(__OPTIMIZE_SIZE__)
 #define EST_UNROLL_NA _Pragma("GCC unroll 2")
 #define EST_UNROLL_PAST _Pragma("GCC unroll 8")
 #else

@@ -63,7 +63,8 @@ static void remember(est_whitener_t* const self, const float* const gain, const 
     EST_UNROLL_NA
     for (uint8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
         self->precision[row] = self->precision[row - 1U];
-        EST_UNROLL_NA
+    }
+    for (uint8_t row = EST_GAINS_KEPT - 1U; row > 0U; row--) {
         for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
             self->gain[row][i] = self->gain[row - 1U][i];
         }

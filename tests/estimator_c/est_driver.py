@@ -22,6 +22,7 @@ STRICT = [
     "-pedantic",
     "-Werror",
     "-ffp-contract=off",
+    "-DEST_NC_MAX=2U",
 ]
 COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes")
 
