@@ -1,9 +1,7 @@
 #include "est.h"
 #include "est_edges.h"
-#include "est_factors.h"
-#include "est_orders.h"
+#include "est_equation.h"
 #include "est_trigger.h"
-#include "est_whitener.h"
 
 #include <float.h>
 
@@ -44,14 +42,15 @@ static bool within(const float x, const float low, const float high) { return (x
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
 static bool orders_fixed(const est_config_t* const config) {
-    return (config->na == NA(config)) && (config->nb == NB(config)) && (config->nk == NK(config)) &&
-           (config->nc == NC(config)) && (config->offset == OFFSET(config));
+    const est_shape_t shape = est_shape_of(config);
+    return (config->na == shape.na) && (config->nb == shape.nb) && (config->nk == shape.nk) && (config->nc == shape.nc) &&
+           (config->offset == shape.offset);
 }
 
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
            (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) && orders_fixed(config) &&
-           (PARAMETERS(config) <= EST_THETA_MAX);
+           (est_shape_count(est_shape_of(config)) <= EST_THETA_MAX);
 }
 
 static bool variances_valid(const est_config_t* const config) {
@@ -95,7 +94,7 @@ static void shift(float* const x, const uint8_t n, const float newest) {
 
 /// All of the past is kept, whatever the order needs: a loop of fixed length is the faster one.
 static void shift_u(est_t* const self, const float newest) {
-    EST_UNROLL_PAST
+    EST_UNROLL
     for (uint8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
         self->u[i] = self->u[i - 1U];
     }
@@ -103,7 +102,7 @@ static void shift_u(est_t* const self, const float newest) {
 }
 
 static void shift_y(est_t* const self, const float newest) {
-    EST_UNROLL_NA
+    EST_UNROLL
     for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
         self->y[i] = self->y[i - 1U];
     }
@@ -112,7 +111,7 @@ static void shift_y(est_t* const self, const float newest) {
 
 /// How many samples before its own an equation reaches back to.
 static uint8_t past_n(const est_config_t* const config) {
-    return larger(NA(config), (uint8_t)(NB(config) + NK(config) - 1U));
+    return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
 }
 
 /// The next equation is at least `pending_n` samples away, and the first of its kind.
@@ -187,7 +186,7 @@ static void enter_edge(est_t* const self) {
     if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         doubt_edge(self);
     } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
-        restart(self, NA(self->config));
+        restart(self, self->config->na);
     } else {
         // the b's take it in
     }
@@ -235,35 +234,9 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-EST_INLINE float* append(float* const out, const float* const from, const uint8_t n) {
-    EST_UNROLL
-    for (uint8_t i = 0U; i < n; i++) {
-        out[i] = from[i];
-    }
-    return &out[n];
-}
-
-/// The regressor in the order of theta, and y(k) last.
-static void fill_equation(const est_t* const self, const float y, float* const phi) {
-    const est_config_t* const config = self->config;
-    float*                    out    = phi;
-    EST_UNROLL
-    for (uint8_t i = 0U; i < NA(config); i++) {
-        *out++ = -self->y[i];
-    }
-    out = append(out, &self->u[NK(config)], NB(config));
-#if EST_NC_MAX > 0
-    out = append(out, self->residual, NC(config));
-#endif
-    if (OFFSET(config)) {
-        *out++ = 1.0F;
-    }
-    *out = y;
-}
-
 static float predicted(const est_t* const self, const float* const phi, const float* const theta) {
     float out = 0.0F;
-    for (uint8_t i = 0U; i < COUNT(self->count); i++) {
+    for (uint8_t i = 0U; i < self->count; i++) {
         out += phi[i] * theta[i];
     }
     return out;
@@ -272,7 +245,7 @@ static float predicted(const est_t* const self, const float* const phi, const fl
 /// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
 /// they are taken against what was believed before the doubt.
 static void read_otherwise(est_t* const self, const float* const phi, float* const readings) {
-    const float e = phi[COUNT(self->count)] - predicted(self, phi, self->edges.theta);
+    const float e = phi[self->count] - predicted(self, phi, self->edges.theta);
     float       early;
     float       late;
     est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
@@ -283,8 +256,8 @@ static void read_otherwise(est_t* const self, const float* const phi, float* con
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
 static void keep_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
-    if (NC(self->config) > 0U) {
-        shift(self->residual, NC(self->config), phi[COUNT(self->count)] - predicted(self, phi, self->theta));
+    if (self->config->nc > 0U) {
+        shift(self->residual, self->config->nc, phi[self->count] - predicted(self, phi, self->theta));
     }
 #else
     (void)self;
@@ -303,7 +276,7 @@ static void follow_noise(est_t* const self, const float innovation, const float 
 
 /// After convergence the noise of the equations is coloured by A itself (thesis section 3.5: noise on the output).
 static void refresh_prefilter(est_t* const self) {
-    const uint8_t na = NA(self->config);
+    const uint8_t na = self->config->na;
     float         c[EST_NA_MAX];
     float         factor = 1.0F;
     bool          moved  = false;
@@ -324,8 +297,8 @@ static void refresh_prefilter(est_t* const self) {
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
 /// did on u(k), or the other way round. The statistic goes on as this reading has it, so that a change is not lost in it.
 static void follow_slip(est_t* const self) {
-    const uint8_t nb = NB(self->config);
-    float* const  b  = &self->theta[NA(self->config)];
+    const uint8_t nb = self->config->nb;
+    float* const  b  = &self->theta[self->config->na];
     for (uint8_t i = 0U; i < self->count; i++) {
         self->theta[i] = self->edges.theta[i];
     }
@@ -396,21 +369,21 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     }
 }
 
-static void enter_equation(est_t* const self, const float y, est_step_t* const step) {
+EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
-    float                     phi[EST_THETA_MAX + 1U];
-    float                     readings[EST_READINGS];
-    fill_equation(self, y, phi);
-    est_equation_t equation = { .phi = phi, .count = self->count };
-    equation.variance       = self->whitener.settled ? 1.0F : est_whitener_advance(&self->whitener);
-    equation.innovation     = est_whitener_apply(&self->whitener, self->count, phi, self->theta);
-    readings[0]             = equation.innovation;
+    est_equation_t            equation;
+    est_equation_fill(self, shape, y, equation.phi);
+    equation.variance = self->whitener.settled ? 1.0F : est_whitener_advance(&self->whitener);
+    est_equation_whiten(&equation, shape, &self->whitener, self->theta);
+    float readings[EST_READINGS];
+    readings[0] = equation.innovation;
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        read_otherwise(self, phi, readings);
+        read_otherwise(self, equation.phi, readings);
     }
-    const float precision = config->forgetting * est_factors_measure(&self->factors, config, &equation, self->theta);
+    const float precision =
+        config->forgetting * est_equation_measure(&self->factors, config, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && self->adaptive) {
-        adapt(self, phi, readings[0], precision);
+        adapt(self, equation.phi, equation.innovation, precision);
     }
     const est_finding_t finding = est_trigger_step(
         &self->trigger, &config->trigger, readings, precision / self->noise_variance, self->edges.age_n);
@@ -418,6 +391,29 @@ static void enter_equation(est_t* const self, const float y, est_step_t* const s
     step->statistic  = self->trigger.statistic;
     step->alarm      = finding == EST_ALARM;
     react(self, finding);
+}
+
+EST_INLINE bool alike(const est_shape_t a, const est_shape_t b) {
+    return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
+}
+
+/// The usual shapes have code of their own, unless the build has one anyway, or room is scarce.
+static void enter_equation_of_any_shape(est_t* const self, const float y, est_step_t* const step) {
+    const est_shape_t shape = est_shape_of(self->config);
+#if !defined(EST_FIXED_NA) && !defined(__OPTIMIZE_SIZE__) && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) &&               \
+    (EST_NK_MAX >= 1U) && (EST_THETA_MAX >= 6U)
+    const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = false };
+    const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = true };
+    if (alike(shape, free_running)) {
+        enter_equation(self, free_running, y, step);
+        return;
+    }
+    if (alike(shape, locked)) {
+        enter_equation(self, locked, y, step);
+        return;
+    }
+#endif
+    enter_equation(self, shape, y, step);
 }
 
 // ---------------------------------------------          API           ---------------------------------------------
@@ -461,7 +457,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;
     }
     *self                = (est_t){ .config = config };
-    self->count          = PARAMETERS(config);
+    self->count          = est_shape_count(est_shape_of(config));
     self->adaptive       = adaptive(config);
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
@@ -480,7 +476,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
     } else {
         count_long(&self->counters.updated);
         if (step.status == EST_UPDATED) {
-            enter_equation(self, sample.y, &step);
+            enter_equation_of_any_shape(self, sample.y, &step);
         }
         shift_y(self, sample.y);
     }
@@ -514,7 +510,7 @@ est_counters_t est_counters(const est_t* const self) {
 }
 
 bool est_invariants_hold(const est_t* const self) {
-    if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != PARAMETERS(self->config))) {
+    if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != est_shape_count(est_shape_of(self->config)))) {
         return false;
     }
     for (uint8_t i = 0U; i < self->count; i++) {

@@ -1,7 +1,5 @@
 #include "est_edges.h"
 
-#include "est_orders.h"
-
 void est_edges_forget(est_edges_t* const self) { self->age_n = 0U; }
 
 void est_edges_age(est_edges_t* const self) { self->age_n = (self->age_n < EST_DOUBT_N) ? (uint8_t)(self->age_n + 1U) : 0U; }
@@ -21,10 +19,10 @@ void est_edges_begin(est_edges_t* const        self,
         self->early.x[i] = 0.0F;
         self->late.x[i]  = 0.0F;
     }
-    if (after_equation && (NK(config) == 0U)) {
-        self->early.x[0] = theta[NA(config)] * step;
+    if (after_equation && (config->nk == 0U)) {
+        self->early.x[0] = theta[config->na] * step;
     }
-    for (uint8_t i = 0U; i < COUNT(count); i++) {
+    for (uint8_t i = 0U; i < count; i++) {
         self->theta[i] = theta[i];
     }
 }
@@ -36,11 +34,11 @@ void est_edges_shares(est_edges_t* const          self,
                       const float* const          u,
                       float* const                early,
                       float* const                late) {
-    const float* const b         = &self->theta[NA(config)];
+    const float* const b         = &self->theta[config->na];
     float              early_raw = 0.0F;
     float              late_raw  = 0.0F;
-    for (uint8_t j = 0U; j < NB(config); j++) {
-        const uint8_t lag = (uint8_t)(NK(config) + j);
+    for (uint8_t j = 0U; j < config->nb; j++) {
+        const uint8_t lag = (uint8_t)(config->nk + j);
         if (lag < self->age_n) {
             late_raw -= b[j] * height(config, &u[lag]);
         }

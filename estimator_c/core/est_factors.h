@@ -4,27 +4,19 @@
 #ifndef EST_FACTORS_H_INCLUDED
 #define EST_FACTORS_H_INCLUDED
 
-#include "est.h"
+#include "est_shape.h"
 
-/// One equation: the regressor and what was not foreseen of its output.
-typedef struct {
-    const float* phi;
-    uint8_t      count;  ///< of its elements
-    float        innovation;
-    float        variance;  ///< of the equation's noise, in noise variances
-} est_equation_t;
+/// No d leaves the range that makes sense. Without the upper limit the variance of a direction that is not excited grows by
+/// 1 / forgetting per equation, without end ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it
+/// was at the start. Without the lower one, certain beyond the precision of float32 by any measure of the data, a direction
+/// excited beyond all measure would be lost to underflow.
+EST_INLINE float est_limited(const float d, const float upper) {
+    const float positive = d + 1.0e-30F;
+    return (positive < upper) ? positive : upper;
+}
 
 /// P := P0.
 void est_factors_reset(est_factors_t* self, const est_config_t* config);
-
-/// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
-/// forgetting factor of thesis Equ 3.21. Moves theta, and returns 1 / (forgetting * variance + phi' P phi).
-///
-/// No d leaves the range that makes sense. Without the upper limit the variance of a direction that is not excited grows by
-/// 1 / forgetting per equation, without end ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it
-/// was at the start. Without the lower one a direction excited beyond all measure would be lost to underflow.
-float est_factors_measure(
-    est_factors_t* self, const est_config_t* config, const est_equation_t* equation, float* theta);
 
 /// Every parameter walks: P := P + random_walk I, no d beyond the prior. The factors of Thornton's time update, "Triangular
 /// covariance factorizations for Kalman filtering" (1976), by rank-one updates, which need no work space.

@@ -1,7 +1,7 @@
 #include "est_trigger.h"
 
 #include "est_edges.h"
-#include "est_orders.h"
+#include "est_shape.h"
 
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most

@@ -1,7 +1,5 @@
 #include "est_whitener.h"
 
-#include "est_orders.h"
-
 /// The gains have come to C once the variance of the noise is below this; what is left makes no difference worth the name.
 #define SETTLED 1.0001F
 
@@ -51,7 +49,7 @@ void est_whitener_restart(est_whitener_t* const self) {
 /// The autocovariance of C(z) e at this lag.
 static float autocovariance(const float* const c, const uint8_t lag) {
     float sum = (lag == 0U) ? 1.0F : c[lag - 1U];
-    EST_UNROLL_NA
+    EST_UNROLL
     for (uint8_t i = lag; i < EST_NA_MAX; i++) {
         sum += c[i] * c[i - lag];
     }
@@ -60,7 +58,7 @@ static float autocovariance(const float* const c, const uint8_t lag) {
 
 /// The gains of a new equation.
 static void remember(est_whitener_t* const self, const float* const gain, const float variance) {
-    EST_UNROLL_NA
+    EST_UNROLL
     for (uint8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
         self->precision[row] = self->precision[row - 1U];
     }
@@ -72,7 +70,7 @@ static void remember(est_whitener_t* const self, const float* const gain, const 
     self->precision[0] = 1.0F / variance;
     self->settled      = variance < SETTLED;
     self->n            = (uint8_t)(self->n + ((self->n < EST_NA_MAX) ? 1U : 0U));
-    EST_UNROLL_NA
+    EST_UNROLL
     for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
         self->gain[0][i] = self->settled ? self->c[i] : gain[i];
     }
@@ -83,10 +81,10 @@ float est_whitener_advance(est_whitener_t* const self) {
     float gain[EST_NA_MAX];
     float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
     float variance = autocovariance(self->c, 0U);
-    EST_UNROLL_NA
+    EST_UNROLL
     for (uint8_t i = EST_NA_MAX; i > 0U; i--) {
         float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
-        EST_UNROLL_NA
+        EST_UNROLL
         for (uint8_t m = EST_NA_MAX; m > i; m--) {
             sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];
         }
@@ -98,43 +96,6 @@ float est_whitener_advance(est_whitener_t* const self) {
     return self->settled ? 1.0F : variance;
 }
 
-/// One signal. A loop of fixed length is the faster one.
-EST_INLINE float filter(const float* const gain, est_past_t* const past, const float x) {
-    float out = x;
-    EST_UNROLL_NA
-    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
-        out -= gain[i] * past->x[i];
-        past->x[i] = past->x[i - 1U];
-    }
-    out -= gain[0] * past->x[0];
-    past->x[0] = out;
-    return out;
-}
-
 float est_whitener_filter(const est_whitener_t* const self, est_past_t* const past, const float x) {
-    return filter(self->gain[0], past, x);
-}
-
-EST_INLINE float
-apply(est_whitener_t* const self, float* const phi, const float* const theta, const uint8_t count) {
-    float gain[EST_NA_MAX];
-    float predicted = 0.0F;
-    EST_UNROLL_NA
-    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
-        gain[i] = self->gain[0][i];
-    }
-    EST_UNROLL
-    for (uint8_t j = 0U; j < count; j++) {
-        const float x = filter(gain, &self->past[j], phi[j]);
-        phi[j]        = x;
-        predicted += x * theta[j];
-    }
-    phi[count] = filter(gain, &self->past[count], phi[count]);
-    return phi[count] - predicted;
-}
-
-float
-est_whitener_apply(est_whitener_t* const self, const uint8_t count, float* const phi, const float* const theta) {
-#define APPLY(count) apply(self, phi, theta, (count))
-    return EST_FOR_COUNT(count, APPLY);
+    return est_filter(self->gain[0], past, x);
 }

@@ -6,7 +6,7 @@
 #ifndef EST_WHITENER_H_INCLUDED
 #define EST_WHITENER_H_INCLUDED
 
-#include "est.h"
+#include "est_shape.h"
 
 /// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
 bool est_whitener_accepts(const float* c, uint8_t na);
@@ -20,9 +20,18 @@ void est_whitener_restart(est_whitener_t* self);
 /// Goes on to the next equation, unless the filter has settled. Returns the variance of its noise once whitened, in variances of e; at least 1.
 float est_whitener_advance(est_whitener_t* self);
 
-/// Whitens the present equation in place, the regressor phi[0 .. count-1] and, last, the output phi[count].
-/// Returns its residual phi[count] - phi' theta.
-float est_whitener_apply(est_whitener_t* self, uint8_t count, float* phi, const float* theta);
+/// One sample of one signal. A loop of fixed length is the faster one; the gains beyond the order of C are zero.
+EST_INLINE float est_filter(const float* const gain, est_past_t* const past, const float x) {
+    float out = x;
+    EST_UNROLL
+    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+        out -= gain[i] * past->x[i];
+        past->x[i] = past->x[i - 1U];
+    }
+    out -= gain[0] * past->x[0];
+    past->x[0] = out;
+    return out;
+}
 
 /// Whitens another signal along with the equations.
 float est_whitener_filter(const est_whitener_t* self, est_past_t* past, float x);

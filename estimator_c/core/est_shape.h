@@ -1,0 +1,64 @@
+/// What a build is made for: the shape of the model, what it can do, and how loops are unrolled. Private to the library.
+
+#ifndef EST_SHAPE_H_INCLUDED
+#define EST_SHAPE_H_INCLUDED
+
+#include "est.h"
+
+/// What a build can leave out, with -DEST_WITH_...=0: a configuration that asks for it is then refused.
+#ifndef EST_WITH_EDGES
+#define EST_WITH_EDGES 1  ///< edges that may slip, or come anywhere
+#endif
+#ifndef EST_WITH_TRIGGERS
+#define EST_WITH_TRIGGERS 1  ///< triggers other than the cumulative sum
+#endif
+#ifndef EST_WITH_ADAPTATION
+#define EST_WITH_ADAPTATION 1  ///< nc, random_walk, noise_estimated, refresh_n
+#endif
+#ifndef EST_WITH_WATCH
+#define EST_WITH_WATCH 1  ///< stuck_n, idle_n
+#endif
+
+/// gcc would rather call a long function than inline it for each shape.
+#ifdef __GNUC__
+#define EST_INLINE static inline __attribute__((always_inline))
+#else
+#define EST_INLINE static inline
+#endif
+
+/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUT_PAST_MAX, which are small.
+#if defined(__GNUC__) && (defined(EST_FIXED_NA) || !defined(__OPTIMIZE_SIZE__))
+#define EST_UNROLL _Pragma("GCC unroll 8")
+#else
+#define EST_UNROLL
+#endif
+
+/// The orders of the model.
+typedef struct {
+    uint8_t na;
+    uint8_t nb;
+    uint8_t nk;
+    uint8_t nc;
+    bool    offset;
+} est_shape_t;
+
+/// The orders that the configuration asks for, or that the build has fixed by -DEST_FIXED_NA=2U, _NB, _NK, _NC and _OFFSET.
+EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
+#ifdef EST_FIXED_NA
+    (void)config;
+    return (est_shape_t){ EST_FIXED_NA, EST_FIXED_NB, EST_FIXED_NK, EST_FIXED_NC, EST_FIXED_OFFSET };
+#else
+    return (est_shape_t){ .na     = config->na,
+                          .nb     = config->nb,
+                          .nk     = config->nk,
+                          .nc     = EST_WITH_ADAPTATION ? config->nc : 0U,
+                          .offset = config->offset };
+#endif
+}
+
+/// The number of parameters.
+EST_INLINE uint8_t est_shape_count(const est_shape_t shape) {
+    return (uint8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
+}
+
+#endif  // EST_SHAPE_H_INCLUDED
