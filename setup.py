@@ -38,12 +38,13 @@ GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c",)
+LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 OTHER_SOURCES = (
     "emulator/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
-    "estimator_c/ports/host/*.h",
+    "estimator_c/ports/*/*.h",
     "estimator_c/catalogue/*",
     *FIXTURES,
 )
@@ -92,7 +93,7 @@ class BuildProducts(Command):
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
         include = (*ROOM, *(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated)))
         compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
-        compile_c(destination / DEVICE, device, (*SHARED, *include))
+        compile_c(destination / DEVICE, (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
         compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)
@@ -104,7 +105,10 @@ class BuildProducts(Command):
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
-        return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *HOST_SOURCES, *OTHER_SOURCES))]
+        return [
+            str(path)
+            for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *HOST_SOURCES, *LIBRARY_SOURCES, *OTHER_SOURCES))
+        ]
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""

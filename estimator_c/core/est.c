@@ -131,8 +131,7 @@ static void gather(est_t* const self) {
 /// The samples before the next are unknown, or belong to another plant.
 static void forget_samples(est_t* const self) {
     if (self->known) {
-        self->known  = false;
-        self->same_n = 0U;
+        self->known = false;
         est_edges_forget(&self->edges);
         restart(self, past_n(self->config));
     }
@@ -155,10 +154,10 @@ static bool same(const float a, const float b) {
     return first.bits == second.bits;
 }
 
-/// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant. It may
-/// rest while u does.
+/// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant, until it
+/// is another. It may rest while u does.
 static bool stuck(est_t* const self, const float y, const bool edge) {
-    if (!self->known || !same(y, self->y[0])) {
+    if (!same(y, self->y[0])) {
         self->same_n = 0U;
     } else if (edge || (self->same_n > 0U)) {
         count(&self->same_n);

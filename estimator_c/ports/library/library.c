@@ -1,0 +1,52 @@
+#include "library.h"
+
+size_t library_size(void) { return sizeof(library_t); }
+
+void library_init(library_t* const self) { self->config = est_config_default(); }
+
+settings_result_t library_set(library_t* const self, const uint8_t key, const float value) {
+    return settings_set(&self->config, key, value);
+}
+
+bool library_start(library_t* const self) { return est_init(&self->estimator, &self->config); }
+
+static void keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
+    if (out->theta != 0) {
+        const uint8_t count = est_theta_count(&self->estimator);
+        for (uint8_t i = 0U; i < count; i++) {
+            out->theta[(k * count) + i] = est_theta(&self->estimator, i);
+        }
+    }
+    if (out->innovation != 0) {
+        out->innovation[k] = step->innovation;
+    }
+    if (out->statistic != 0) {
+        out->statistic[k] = step->statistic;
+    }
+    if (out->status != 0) {
+        out->status[k] = (uint8_t)step->status;
+    }
+    if (out->alarm != 0) {
+        out->alarm[k] = step->alarm ? 1U : 0U;
+    }
+}
+
+size_t library_run(library_t* const           self,
+                   const size_t               n,
+                   const float* const         u,
+                   const float* const         y,
+                   const uint8_t* const       valid,
+                   const library_out_t* const out) {
+    size_t alarms = 0U;
+    for (size_t k = 0U; k < n; k++) {
+        const est_sample_t sample = { .u = u[k], .y = y[k], .valid = (valid == 0) || (valid[k] != 0U) };
+        const est_step_t   step   = est_step(&self->estimator, sample);
+        alarms += step.alarm ? 1U : 0U;
+        keep(self, k, &step, out);
+    }
+    return alarms;
+}
+
+uint8_t library_theta_count(const library_t* const self) { return est_theta_count(&self->estimator); }
+
+est_counters_t library_counters(const library_t* const self) { return est_counters(&self->estimator); }

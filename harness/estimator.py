@@ -1,0 +1,140 @@
+"""The C estimator in this process, whole blocks at a time: no frames, no link, no device. For campaigns and exploring."""
+
+from __future__ import annotations
+
+import ctypes
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from harness.errors import ConfigurationError, LinkError
+from harness.estimator_config import EstimatorConfig
+from harness.link import LIBRARY
+
+
+class StepStatus(enum.IntEnum):
+    """As est_status_t of est.h."""
+
+    UPDATED = 0
+    MISSING = 1
+    REFUSED = 2
+    GATHERING = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What each of n samples gave."""
+
+    theta: NDArray[np.float32]
+    """(n, p) after the sample."""
+    innovation: NDArray[np.float32]
+    """(n,) codes; 0 where there was no equation."""
+    statistic: NDArray[np.float32]
+    """(n,)"""
+    status: NDArray[np.uint8]
+    """(n,) StepStatus."""
+    alarms: NDArray[np.int64]
+    """Indices of the samples with an alarm."""
+
+
+class _Out(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("theta", "innovation", "statistic", "status", "alarm")]
+
+
+class _Counters(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_uint32) for name in ("updated", "missing")),
+        *(
+            (name, ctypes.c_uint16)
+            for name in ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes")
+        ),
+    ]
+
+
+def _loaded(library: Path) -> ctypes.CDLL:
+    try:
+        c = ctypes.CDLL(str(library))
+    except OSError as error:
+        raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
+    c.library_size.restype = c.library_run.restype = ctypes.c_size_t
+    c.library_start.restype = ctypes.c_bool
+    c.library_theta_count.restype = ctypes.c_uint8
+    c.library_counters.restype = _Counters
+    return c
+
+
+class Estimator:
+    """One estimator; the samples of a run may come in blocks of any length."""
+
+    def __init__(self, config: EstimatorConfig | None = None, *, library: Path = LIBRARY) -> None:
+        """Ready for the first sample.
+
+        :raises ConfigurationError: the estimator refuses the configuration.
+        :raises LinkError: the library was not built.
+        """
+        self._c = _loaded(library)
+        self._state = ctypes.create_string_buffer(self._c.library_size())
+        self._c.library_init(self._state)
+        for key, value in (config or EstimatorConfig()).settings():
+            if self._c.library_set(self._state, int(key), ctypes.c_float(value)):
+                raise ConfigurationError(f"the estimator refuses {key.name.lower()} = {value:g}")
+        self.restart()
+
+    def restart(self) -> None:
+        """The next sample is the first.
+
+        :raises ConfigurationError: the fields of the configuration do not go together.
+        """
+        if not self._c.library_start(self._state):
+            raise ConfigurationError("the estimator refuses this configuration: its fields do not go together")
+
+    @property
+    def parameters(self) -> int:
+        """The number of elements of theta."""
+        return int(self._c.library_theta_count(self._state))
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since the start, by the names of est_counters_t."""
+        counters = self._c.library_counters(self._state)
+        return {name: getattr(counters, name) for name, _ in _Counters._fields_}
+
+    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Steps:
+        """Enter n samples and keep everything.
+
+        :param u: (n,) codes of force.
+        :param y: (n,) codes of displacement.
+        :param valid: (n,) false where the sample is missing.
+        """
+        n = np.size(u)
+        theta = np.empty((n, self.parameters), np.float32)
+        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
+        status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
+        out = _Out(*(array.ctypes.data for array in (theta, innovation, statistic, status, alarm)))
+        self._enter(u, y, valid, out)
+        return Steps(theta, innovation, statistic, status, np.flatnonzero(alarm))
+
+    def alarms(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> NDArray[np.int64]:
+        """As run(), for the alarms alone: several times as fast."""
+        alarm = np.empty(np.size(u), np.uint8)
+        out = _Out(alarm=alarm.ctypes.data)
+        return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
+
+    def _enter(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None, out: _Out) -> int:
+        inputs = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
+        mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
+        if inputs[0].ndim != 1 or any(x.shape != inputs[0].shape for x in (*inputs, *([] if mask is None else [mask]))):
+            raise ValueError("u, y and valid must be one-dimensional and of one length")
+        return int(
+            self._c.library_run(
+                self._state,
+                ctypes.c_size_t(len(inputs[0])),
+                *(ctypes.c_void_p(x.ctypes.data) for x in inputs),
+                ctypes.c_void_p(None if mask is None else mask.ctypes.data),
+                ctypes.byref(out),
+            )
+        )

@@ -1,0 +1,107 @@
+"""The C estimator against its twin in plain Python: two texts of one algorithm, in float32 and in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from harness.errors import ConfigurationError
+from harness.estimator import Estimator, StepStatus
+from harness.estimator_config import EstimatorConfig
+from harness.twin import Twin
+from tests.estimator_c.test_est_trigger import FRONT, suspension
+
+N = 900
+LOCKED: dict[str, Any] = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
+
+
+def record(drift: float = 0.0, seed: int = 4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The front suspension, softer from sample 520 on; with a drift its edges cross a sampling instant at 310."""
+    edges = np.arange(10.0, N, 50.0)
+    changes = [(0, FRONT), (520, (115.0, 3021.0, 18000.0))]
+    u, y = suspension(changes, edges + (edges - 300.0) * drift, N, 1.0, seed)
+    return u, y - 410.0
+
+
+CASES: dict[str, EstimatorConfig] = {
+    "default": EstimatorConfig(),
+    "locked": EstimatorConfig(**LOCKED),
+    "anywhere": EstimatorConfig(edge_instants="anywhere"),
+    "none": EstimatorConfig(trigger="none", c=()),
+    "walk": EstimatorConfig(**LOCKED, random_walk=1e-6),
+    "noise": EstimatorConfig(noise_estimated=True, noise_variance=3.0),
+    "refresh": EstimatorConfig(refresh_n=60, c=(-0.9, 0.2)),
+    "armax": EstimatorConfig(**(LOCKED | {"nc": 2, "c": (), "offset": False}), trigger="none"),
+    "prediction error": EstimatorConfig(
+        **LOCKED, c=(), trigger="prediction-error", ceiling=200.0, warm_up_n=30, hold_off_n=20, reset="all"
+    ),
+    "mean": EstimatorConfig(trigger="mean-between-faults", ceiling=30.0, warm_up_n=30, hold_off_n=4, absolute=True),
+}
+
+
+@pytest.mark.parametrize("missing", [[], [100, 314, 315, 700]], ids=["whole", "gaps"])
+@pytest.mark.parametrize("drift", [0.0, 2e-5, -2e-5], ids=["still", "late", "early"])
+@pytest.mark.parametrize("case", CASES)
+def test_estimator_and_twin_agree(case: str, drift: float, missing: list[int]) -> None:
+    u, y = record(drift)
+    valid = np.ones(N, bool)
+    valid[missing] = False
+    estimator, twin = Estimator(CASES[case]), Twin(CASES[case])
+    steps = estimator.run(u, y, valid)
+    expected = []
+    for k in range(N):
+        twin.step(float(u[k]), float(y[k]), valid=bool(valid[k]))
+        expected.append(list(twin.theta))
+    again = Twin(CASES[case]).run(u.tolist(), y.tolist(), valid.tolist())
+    assert steps.alarms.tolist() == [k for k, step in enumerate(again) if step.alarm]
+    scale = np.maximum(np.abs(np.array(expected)).max(axis=0), 1e-3)
+    after_n = 60  # the first equations determine little, and float32 less
+    settled = np.array([all(k - a > after_n for a in (0, *steps.alarms) if a <= k) for k in range(N)])
+    assert settled.sum() > 200
+    assert np.abs((steps.theta - expected) / scale)[settled].max() < 0.015
+    innovations = np.array([step.innovation for step in again])
+    assert np.sqrt(np.mean((steps.innovation - innovations)[settled] ** 2)) < 0.15
+    assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (twin.slips, twin.refreshes)
+
+
+def test_cases_show_what_they_are_for() -> None:
+    u, y = record(2e-5)
+    default, refresh = Estimator(CASES["default"]), Estimator(CASES["refresh"])
+    assert 520 < default.run(u, y).alarms[0] < 540
+    refresh.run(u, y)
+    assert default.counters["slips"] == 1
+    assert refresh.counters["refreshes"] >= 1
+
+
+def test_blocks_of_any_length_give_the_same_estimates() -> None:
+    u, y = record()
+    whole, pieces = Estimator(), Estimator()
+    steps = whole.run(u, y)
+    parts = [pieces.run(u[at : at + 37], y[at : at + 37]) for at in range(0, N, 37)]
+    assert np.concatenate([part.theta for part in parts]).tobytes() == steps.theta.tobytes()
+    whole.restart()
+    assert whole.alarms(u, y).tolist() == steps.alarms.tolist()
+    assert whole.counters == pieces.counters
+
+
+def test_missing_samples_are_told_by_their_status() -> None:
+    u, y = record()
+    valid = np.arange(N) != 100
+    status = Estimator().run(u, y, valid).status
+    assert [StepStatus(s).name for s in status[99:104]] == ["UPDATED", "MISSING", "GATHERING", "GATHERING", "UPDATED"]
+
+
+def test_configuration_that_the_estimator_cannot_take_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="forgetting = 2"):
+        Estimator(dataclasses.replace(EstimatorConfig(), forgetting=2.0))
+    with pytest.raises(ConfigurationError, match="do not go together"):
+        Estimator(EstimatorConfig(nb=3, nc=2))
+
+
+def test_samples_of_unlike_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="one length"):
+        Estimator().run(np.zeros(3), np.zeros(4))
