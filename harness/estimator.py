@@ -1,4 +1,4 @@
-"""The C estimator in this process, whole blocks at a time: no frames, no link, no device. For campaigns and exploring."""
+"""The C estimator in this process, whole blocks at a time: no frames, no link, no device."""
 
 from __future__ import annotations
 
