@@ -5,7 +5,7 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 
 from .acquisition import acquired, probes_per_sample
 from .bump_stop import BumpStop
-from .circuit import Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
+from .circuit import Capacitor, Circuit, CurrentSource, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
 from .components import (
     COMPONENTS,
     DIELECTRICS,
@@ -57,6 +57,7 @@ __all__ = [
     "CircuitError",
     "CircuitNoise",
     "Components",
+    "CurrentSource",
     "Deck",
     "Dielectric",
     "DiodeLimiter",

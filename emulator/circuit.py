@@ -20,6 +20,7 @@ __all__ = [
     "GROUND",
     "Capacitor",
     "Circuit",
+    "CurrentSource",
     "DiodeLimiter",
     "Element",
     "OpAmp",
@@ -130,6 +131,25 @@ class VoltageSource:
 
 
 @dataclass(frozen=True)
+class CurrentSource:
+    """A current from node plus through the source to node minus: an input of the circuit [A], or, when dc_a is given, a
+    constant. It holds no node at a voltage."""
+
+    name: str
+    plus: str
+    minus: str = GROUND
+    dc_a: float | None = None
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.plus, self.minus
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        return ()
+
+
+@dataclass(frozen=True)
 class DiodeLimiter:
     """A diode of straight pieces from a to b.
 
@@ -185,8 +205,8 @@ class Switch:
         return self.on_ohm if closed else self.off_ohm
 
 
-Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | DiodeLimiter | Switch
-_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, DiodeLimiter, Switch)
+Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch
+_E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
 
 _POSITIVE: Mapping[type, tuple[str, ...]] = {
     Resistor: ("ohm",),
@@ -219,6 +239,12 @@ class Circuit:
         """Every node but ground, in order of appearance."""
         seen = dict.fromkeys(node for element in self.elements for node in element.nodes)
         return tuple(node for node in seen if node != GROUND)
+
+    @property
+    def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
+        """The sources that are no constants: volts or amperes from outside, in netlist order."""
+        sources = (element for element in self.elements if isinstance(element, VoltageSource | CurrentSource))
+        return tuple(source for source in sources if constant_of(source) is None)
 
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
@@ -273,7 +299,7 @@ def _check_names(elements: tuple[Element, ...]) -> None:
 
 
 def _check_element(element: Element) -> None:
-    for a, b in element.bonds:
+    for a, b in (element.nodes,) if isinstance(element, CurrentSource) else element.bonds:
         if a == b:
             raise CircuitError(f"{label(element)}: both ends are on node {a}")
     for field in _POSITIVE.get(type(element), ()):
@@ -286,8 +312,10 @@ def _check_element(element: Element) -> None:
         raise CircuitError(f"{label(element)}: threshold_v must be finite, got {element.threshold_v!r}")
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
         raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
-    if isinstance(element, VoltageSource) and element.dc_v is not None and not math.isfinite(element.dc_v):
-        raise CircuitError(f"{label(element)}: dc_v must be finite, got {element.dc_v!r}")
+    if isinstance(element, VoltageSource | CurrentSource):
+        level, unit = constant_of(element), "v" if isinstance(element, VoltageSource) else "a"
+        if level is not None and not math.isfinite(level):
+            raise CircuitError(f"{label(element)}: dc_{unit} must be finite, got {level!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
@@ -303,6 +331,11 @@ def _check_nodes(elements: tuple[Element, ...]) -> None:
         for node in element.nodes:
             if node not in grounded:
                 raise CircuitError(f"{label(element)}: node {node} floats: no path to ground holds its voltage")
+
+
+def constant_of(source: VoltageSource | CurrentSource) -> float | None:
+    """The level of a source that is a constant [V or A]; None for an input."""
+    return source.dc_v if isinstance(source, VoltageSource) else source.dc_a
 
 
 def label(element: Element) -> str:

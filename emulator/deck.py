@@ -29,6 +29,7 @@ from .circuit import (
     GROUND,
     Capacitor,
     Circuit,
+    CurrentSource,
     DiodeLimiter,
     Element,
     OpAmp,
@@ -70,7 +71,6 @@ _UNSUPPORTED = {
     "f": "controlled sources",
     "g": "controlled sources",
     "h": "controlled sources",
-    "i": "current sources",
     "j": "transistors",
     "k": "coupled inductors",
     "l": "inductors",
@@ -272,7 +272,7 @@ class _Reading:
                 self._keep(place, card, self._resistor(place, words, values))
             case "c":
                 self._add_capacitor(place, card, words, values)
-            case "v":
+            case "v" | "i":
                 self._add_source(place, card, words, values)
             case "x":
                 self._add_instance(place, card, words, values)
@@ -312,14 +312,15 @@ class _Reading:
     def _add_source(self, place: _Place, card: Card, words: list[str], values: dict[str, str]) -> None:
         _nothing_more([], values)
         plus, minus = self._nodes_of(place, words[1:3], 2)
-        source = VoltageSource(_joined(place.path, words[0]), plus, minus)
+        kind = VoltageSource if card.kind == "v" else CurrentSource
+        name = _joined(place.path, words[0])
         dc, shape, points = _split_source(words[3:])
         if shape is None:
-            self._keep(place, card, replace(source, dc_v=place.scope.evaluate(dc)))
+            self._keep(place, card, kind(name, plus, minus, place.scope.evaluate(dc)))
             return
         numbers = [place.scope.evaluate(point) for point in points]
         steps = _pwl(numbers) if shape == "pwl" else _pulse(numbers, self._stop_s)
-        self._keep(place, card, source, steps=tuple(steps))
+        self._keep(place, card, kind(name, plus, minus), steps=tuple(steps))
 
     def _add_instance(self, place: _Place, card: Card, words: list[str], values: dict[str, str]) -> None:
         words = [word for word in words if word.lower() != "params:"]

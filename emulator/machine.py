@@ -248,7 +248,7 @@ class AnalogComputer:
         self._mode = mode
         self._dials |= self._wipers.contacts_at_rest(self._turns)
         self._turns = {}
-        self._levels_v = {source.name: 0.0 for source in self._patched.of(VoltageSource) if source.dc_v is None}
+        self._levels_v = {source.name: 0.0 for source in self._patched.inputs}
         self._powered: Engine | None = None
         self._solved: PiecewiseLinear | None = None
 

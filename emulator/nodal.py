@@ -25,7 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import library
-from .circuit import GROUND, Capacitor, Circuit, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
+from .circuit import (
+    GROUND,
+    Capacitor,
+    Circuit,
+    CurrentSource,
+    DiodeLimiter,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+    constant_of,
+)
 from .errors import CircuitError
 from .opamp import CLAMP_RATE
 from .pot import checked_dial, legs_ohm
@@ -140,7 +152,7 @@ class Nodal:
         self._switches = circuit.of(Switch)
         self._limiters = circuit.of(DiodeLimiter)
         self._capacitors = circuit.of(Capacitor)
-        self._inputs = tuple(source for source in circuit.of(VoltageSource) if source.dc_v is None)
+        self._inputs = circuit.inputs
         self._poles = tuple(amp for amp in circuit.of(OpAmp) if amp.model.has_state)
         branches = [element.name for element in self._capacitors] + [
             source.name for source in circuit.of(VoltageSource)
@@ -232,16 +244,25 @@ class Nodal:
             self._right[row, self._state[capacitor.name]] = 1.0
         for source in circuit.of(VoltageSource):
             row = self._voltage_branch(source.name, source.plus, source.minus)
-            if source.dc_v is None:
-                self._right[row, len(self._state) + self._inputs.index(source)] = 1.0
-            else:
-                self._right[row, self._columns - 1] = source.dc_v
+            column, volts = self._drive(source)
+            self._right[row, column] = volts
+        for drive in circuit.of(CurrentSource):
+            column, amperes = self._drive(drive)
+            self._right[self._row[drive.plus], column] -= amperes
+            self._right[self._row[drive.minus], column] += amperes
         for amp in circuit.of(OpAmp):
             self._enter_opamp(amp)
         for i, limiter in enumerate(self._limiters):
             self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
             self._right[self._row[limiter.a], self._columns + i] -= limiter.excess_siemens
             self._right[self._row[limiter.b], self._columns + i] += limiter.excess_siemens
+
+    def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
+        """The column of what drives a source, and by how much: the constant's, or that of an input."""
+        level = constant_of(source)
+        if level is None:
+            return len(self._state) + self._inputs.index(source), 1.0
+        return self._columns - 1, level
 
     def _conductance(self, left: Matrix, a: str, b: str, siemens: float) -> None:
         i, j = self._row[a], self._row[b]

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, VoltageSource, label
+from .circuit import GROUND, Capacitor, Circuit, CurrentSource, Element, OpAmp, Pot, VoltageSource, label
 from .errors import CircuitError
 
 __all__ = ["Patch", "is_part_of", "patches"]
@@ -113,6 +113,7 @@ def _open_end(element: Element, node: str) -> str:
 def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
     """Cords and passive elements that hang together must lead to an output somewhere, or rest an input on ground."""
     junctions = {amp.minus for amp in circuit.of(OpAmp)}
+    drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
     rests = {amp.plus for amp in circuit.of(OpAmp)}
     bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
     for element in circuit.elements:

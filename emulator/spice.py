@@ -18,7 +18,19 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import Capacitor, Circuit, DiodeLimiter, Element, OpAmp, Pot, Resistor, Switch, VoltageSource
+from .circuit import (
+    Capacitor,
+    Circuit,
+    CurrentSource,
+    DiodeLimiter,
+    Element,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+    constant_of,
+)
 from .errors import CircuitError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .opamp import CLAMP_RATE
@@ -138,7 +150,7 @@ class _Writer:
 
     def check(self, nodes: Sequence[str] | None) -> None:
         circuit = self._circuit
-        _known("input", self._edges, [source.name for source in circuit.of(VoltageSource) if source.dc_v is None])
+        _known("input", self._edges, [source.name for source in circuit.inputs])
         for _, dials in self._turns:
             circuit.with_dials(dials)
         amps = [amp.name for amp in circuit.of(OpAmp) if amp.model.has_state]
@@ -174,11 +186,8 @@ class _Writer:
             case Capacitor(name=name, a=a, b=b, farad=farad):
                 initial = f" IC={_number(self._initial_v[name])}" if name in self._initial_v else ""
                 yield f"{card} {a} {b} {_number(farad)}{initial}"
-            case VoltageSource(name=name, plus=plus, minus=minus, dc_v=None):
-                levels = _levels(self._edges.get(name, Edges.none()), self._period_s)
-                yield from _stepped(f"{card} {plus} {minus}", *levels)
-            case VoltageSource(plus=plus, minus=minus, dc_v=volts):
-                yield f"{card} {plus} {minus} DC {_number(volts or 0.0)}"
+            case VoltageSource() | CurrentSource():
+                yield from self._source(card, element)
             case Pot():
                 yield from self._pot(card, element)
             case OpAmp():
@@ -187,6 +196,13 @@ class _Writer:
                 yield self._instance("diode_limiter", card, element.nodes, threshold=volts, on=on, off=off)
             case Switch(on_ohm=on, off_ohm=off, closed=closed):
                 yield self._instance("switch", card, element.nodes, on=on, off=off, closed=closed)
+
+    def _source(self, card: str, source: VoltageSource | CurrentSource) -> Iterator[str]:
+        head, level = f"{card} {source.plus} {source.minus}", constant_of(source)
+        if level is None:
+            yield from _stepped(head, *_levels(self._edges.get(source.name, Edges.none()), self._period_s))
+        else:
+            yield f"{head} DC {_number(level)}"
 
     def _pot(self, card: str, pot: Pot) -> Iterator[str]:
         turns = [(sample, dials[pot.name]) for sample, dials in self._turns if pot.name in dials]
@@ -239,6 +255,7 @@ _LETTERS: Mapping[type, str] = {
     Resistor: "R",
     Capacitor: "C",
     VoltageSource: "V",
+    CurrentSource: "I",
     Pot: "X",
     OpAmp: "X",
     DiodeLimiter: "X",

@@ -45,14 +45,14 @@ class _Out(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in ("theta", "innovation", "statistic", "status", "alarm")]
 
 
+_COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromkeys(
+    ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes"), ctypes.c_uint16
+)
+"""The fields of est_counters_t."""
+
+
 class _Counters(ctypes.Structure):
-    _fields_ = [
-        *((name, ctypes.c_uint32) for name in ("updated", "missing")),
-        *(
-            (name, ctypes.c_uint16)
-            for name in ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes")
-        ),
-    ]
+    _fields_ = list(_COUNTERS.items())
 
 
 def _loaded(library: Path) -> ctypes.CDLL:
@@ -101,7 +101,7 @@ class Estimator:
     def counters(self) -> Mapping[str, int]:
         """Since the start, by the names of est_counters_t."""
         counters = self._c.library_counters(self._state)
-        return {name: getattr(counters, name) for name, _ in _Counters._fields_}
+        return {name: int(getattr(counters, name)) for name in _COUNTERS}
 
     def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Steps:
         """Enter n samples and keep everything.
@@ -125,9 +125,10 @@ class Estimator:
         return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
 
     def _enter(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None, out: _Out) -> int:
-        inputs = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
+        inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
         mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
-        if inputs[0].ndim != 1 or any(x.shape != inputs[0].shape for x in (*inputs, *([] if mask is None else [mask]))):
+        shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
+        if len(shapes) != 1 or inputs[0].ndim != 1:
             raise ValueError("u, y and valid must be one-dimensional and of one length")
         return int(
             self._c.library_run(

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
+    Circuit,
     CircuitError,
+    CurrentSource,
     Deck,
     EmulatorError,
     Excitation,
@@ -174,7 +176,6 @@ HEAD = "t\nV1 in 0 DC 5\n"
         ("X1 in w 0 pot dial=1.2\nR1 w 0 1k", r"deck:3: pot X1: dial 1.2 is beyond the track"),
         ("X1 in w 0 pot track=-10k", r"deck:3: Pot X1 \(in w 0\): track_ohm must be positive"),
         ("Q1 a b c bc547", "deck:3: Q1: transistors are not supported"),
-        ("I1 in 0 1m", "deck:3: I1: current sources are not supported"),
         (".include /etc/passwd", "deck:3: .include: is not supported"),
         (".control\nshell ls\n.endc", "deck:3: .control: is not supported"),
         ("V2 in 0 DC 4", "deck:3: the circuit is singular: nothing determines the current of V2"),
@@ -258,3 +259,49 @@ def test_a_file_is_named_in_its_errors(tmp_path: Path) -> None:
     path.write_bytes(b"t\xff\nQ1 a b c\n")
     with pytest.raises(CircuitError, match="wrong.cir:2: Q1: transistors"):
         Deck.load(path)
+
+
+CURRENTS = """a current switched into a filter, and another through its middle
+I1 0 a PULSE(0 2m 1.013m 1n 1n 1.011m)
+I2 b a DC 0.1m
+R1 a 0 2k
+R2 a b 1k
+C1 b 0 100n IC=0.5
+X1 0 m out opamp
+R3 b m 10k
+R4 m out 10k
+.tran 50u 5m uic
+.end
+"""
+
+
+def test_current_sources_agree_with_ngspice_and_are_read_back(ngspice: NgSpice) -> None:
+    deck = read_deck(CURRENTS)
+    assert deck.circuit.of(CurrentSource) == (CurrentSource("I1", "0", "a"), CurrentSource("I2", "b", "a", 0.1e-3))
+    nodes = ("a", "b", "out")
+    assert np.abs(deck.volts(nodes) - ngspice(deck.text(nodes), nodes, deck.samples)).max() < 0.05 * LSB_V
+    again = read_deck(deck.text())
+    assert again.circuit == deck.circuit
+    assert np.array_equal(again.volts(nodes), deck.volts(nodes))
+
+
+def test_current_comes_out_of_a_sources_second_node() -> None:
+    """1 mA into 2 kOhm and 1 nF: 2 V (1 - exp(-t / 2 us)), at rest by the first sample."""
+    circuit = Circuit(
+        [CurrentSource("I", "0", "a", 1e-3), Resistor("R", "a", "0", 2e3), Capacitor("C", "a", "0", 1e-9)]
+    )
+    assert Deck(circuit, samples=5).volts(["a"])[1:, 0] == pytest.approx(2.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("card", "message"),
+    [
+        ("I1 a 0 nan", "I1"),
+        ("I1 a a 1m", "both ends are on node a"),
+        ("I1 a b 1m", "node b floats"),
+        ("I1 a 0 SIN(0 1 1k)", "SIN sources are not supported"),
+    ],
+)
+def test_bad_current_source_is_named(card: str, message: str) -> None:
+    with pytest.raises(CircuitError, match=message):
+        read_deck(f"title\nR1 a 0 1k\n{card}\n.tran 50u 1m uic\n.end\n")
