@@ -22,8 +22,9 @@
 /// would remember for ever.
 #define CONTRACTION 0.99F
 
-/// C is left as it is while every coefficient of A is as near to it as this: the innovations are white enough.
-#define REFRESH_STEP 0.02F
+/// C is left as it is while every coefficient of A is as near to it as this: the innovations are then white enough, their
+/// variance at most 1 % too large with poles up to 0.95. 0.02 may put a zero of C on the unit circle.
+#define REFRESH_STEP 0.002F
 
 /// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
 /// counts as no more, so that a change of the plant is not taken for noise; of Gaussian noise that keeps NOISE_KEPT.

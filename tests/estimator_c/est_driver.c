@@ -59,6 +59,21 @@ int driver_run(size_t n, const double* u, const double* y, const unsigned char* 
     return held;
 }
 
+/* t runs of n samples, each from the start: where the alarms came, and theta at the end of each run, (t, count). */
+void driver_watch(size_t t, size_t n, const double* u, const double* y, unsigned char* alarm, float* theta) {
+    const est_config_t* const kept  = &config;
+    const uint8_t             count = est_theta_count(&self);
+    for (size_t run = 0; run < t; run++) {
+        (void)est_init(&self, kept);
+        for (size_t k = run * n; k < ((run + 1) * n); k++) {
+            alarm[k] = est_step(&self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true }).alarm;
+        }
+        for (uint8_t i = 0; i < count; i++) {
+            theta[(run * count) + i] = est_theta(&self, i);
+        }
+    }
+}
+
 int driver_theta_count(void) { return est_theta_count(&self); }
 
 float driver_variance(int index) { return est_variance(&self, (uint8_t)index); }

@@ -100,6 +100,16 @@ class Estimator:
             theta, innovation, statistic, np.flatnonzero(alarm), status, idle, named, variance, noise_variance
         )
 
+    def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Whole runs (t, n), each from the start: where the alarms came (t, n), and theta at the end (t, p). Fast."""
+        runs, samples = u.shape
+        alarm = np.zeros((runs, samples), np.bool_)
+        theta = np.zeros((runs, self._c.driver_theta_count()), np.float32)
+        arrays = (np.ascontiguousarray(u), np.ascontiguousarray(y), alarm, theta)
+        pointers = (ctypes.c_void_p(a.ctypes.data) for a in arrays)
+        self._c.driver_watch(ctypes.c_size_t(runs), ctypes.c_size_t(samples), *pointers)
+        return alarm, theta
+
 
 def compile_driver(folder: Path) -> Path:
     """The driver as a shared library, with the strict warnings of the project."""
