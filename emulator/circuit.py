@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeVar
 
@@ -222,7 +222,7 @@ class Circuit:
     """A checked netlist.
 
     Raises CircuitError for duplicate or malformed names, values that are not positive, an element across a single node,
-    and nodes that nothing holds at a voltage; PotError for a dial off its track.
+    nodes that nothing holds at a voltage, and op-amps without feedback; PotError for a dial off its track.
     """
 
     elements: tuple[Element, ...]
@@ -233,6 +233,7 @@ class Circuit:
         for element in self.elements:
             _check_element(element)
         _check_nodes(self.elements)
+        _check_feedback(self.elements)
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -331,6 +332,35 @@ def _check_nodes(elements: tuple[Element, ...]) -> None:
         for node in element.nodes:
             if node not in grounded:
                 raise CircuitError(f"{label(element)}: node {node} floats: no path to ground holds its voltage")
+
+
+def _check_feedback(elements: tuple[Element, ...]) -> None:
+    """Every op-amp's output must act on one of its own inputs, through whatever elements."""
+    acts: dict[str, list[str]] = {}
+    for element in elements:
+        if isinstance(element, OpAmp):
+            pairs = [(element.plus, element.out), (element.minus, element.out)]
+        else:
+            pairs = [pair for a, b in element.bonds for pair in ((a, b), (b, a))]
+        for cause, effect in pairs:
+            if GROUND not in {cause, effect}:
+                acts.setdefault(cause, []).append(effect)
+    for amp in elements:
+        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reached(amp.out, acts):
+            raise CircuitError(
+                f"{label(amp)}: no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
+                f" {amp.plus} and {amp.minus}"
+            )
+
+
+def _reached(start: str, acts: Mapping[str, Sequence[str]]) -> set[str]:
+    reached, front = {start}, [start]
+    while front:
+        for effect in acts.get(front.pop(), ()):
+            if effect not in reached:
+                reached.add(effect)
+                front.append(effect)
+    return reached
 
 
 def constant_of(source: VoltageSource | CurrentSource) -> float | None:

@@ -497,7 +497,6 @@ class _Reading:
     def _checked(self, elements: Sequence[Element], cards: Mapping[str, Card]) -> Circuit:
         try:
             circuit = Circuit(elements)
-            _check_feedback(circuit)
             Nodal(circuit).at({})
         except EmulatorError as error:
             raise type(error)(f"{self._where(str(error), elements, cards)}: {error}") from error
@@ -637,32 +636,3 @@ def _rate_hz(period_s: float) -> float:
     """The rate of that period, and of the rates that have it the roundest."""
     rounded = float(f"{1.0 / period_s:.12g}")
     return rounded if 1.0 / rounded == period_s else 1.0 / period_s
-
-
-def _check_feedback(circuit: Circuit) -> None:
-    """Every op-amp's output must act on one of its own inputs, through whatever elements."""
-    acts: dict[str, list[str]] = {}
-    for element in circuit.elements:
-        if isinstance(element, OpAmp):
-            pairs = [(element.plus, element.out), (element.minus, element.out)]
-        else:
-            pairs = [pair for a, b in element.bonds for pair in ((a, b), (b, a))]
-        for cause, effect in pairs:
-            if GROUND not in {cause, effect}:
-                acts.setdefault(cause, []).append(effect)
-    for amp in circuit.of(OpAmp):
-        if not {amp.plus, amp.minus} & _reached(amp.out, acts):
-            raise CircuitError(
-                f"OpAmp {amp.name} ({' '.join(amp.nodes)}): no feedback: its output, node {amp.out}, acts on neither of"
-                f" its inputs, nodes {amp.plus} and {amp.minus}"
-            )
-
-
-def _reached(start: str, acts: Mapping[str, Sequence[str]]) -> set[str]:
-    reached, front = {start}, [start]
-    while front:
-        for effect in acts.get(front.pop(), ()):
-            if effect not in reached:
-                reached.add(effect)
-                front.append(effect)
-    return reached

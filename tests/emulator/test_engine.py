@@ -93,7 +93,8 @@ def test_slewing_ends_when_the_law_says_so() -> None:
 
 
 def test_an_overdriven_output_stands_slew_over_clamp_rate_beyond_its_swing() -> None:
-    system = piecewise_linear(Circuit([SOURCE, OpAmp("U1", "in", "0", "out", OPAMP), Resistor("RL", "out", "0", 1e3)]))
+    load = [Resistor("RL", "out", "0", 1e3), Resistor("RF", "out", "in", 1e9)]  # the source does not mind the feedback
+    system = piecewise_linear(Circuit([SOURCE, OpAmp("U1", "in", "0", "out", OPAMP), *load]))
     engine = Engine(system, ["out"])
     volts = engine.run(3, steps((0.0, 1.0), (1.0, -1.0)))[:, 0]
     # The second sample: 50 us at 0.5 V/us reach the upper clamp; the third, from there down to the lower one, does not.

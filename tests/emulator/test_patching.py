@@ -50,7 +50,10 @@ def moved(name: str, **ends: Any) -> Change:
         (moved("R5", a="nowhere"), r"Resistor R5 \(nowhere s5\): nothing feeds its node nowhere"),
         (moved("U5", minus="x"), r"OpAmp U5 \(0 x u5\): node x floats"),
         (moved("U5", plus="x"), r"OpAmp U5 \(x s5 u5\): node x floats"),
-        (without("R5FB"), r"OpAmp U5 \(0 s5 u5\): no feedback leads from its output, node u5, to node s5"),
+        (
+            without("R5FB"),
+            r"OpAmp U5 \(0 s5 u5\): no feedback: its output, node u5, acts on neither of its inputs, nodes 0 and s5",
+        ),
         (without("RFB"), r"OpAmp U1 \(0 s1 u1\): no feedback leads from its output, node u1, to node s1"),
         (without("C2"), r"OpAmp U3 \(0 s3 u3\): no feedback"),
         (without("R4"), r"OpAmp U4 \(0 s4 u4\): nothing feeds its input at node s4"),
