@@ -52,7 +52,7 @@ class EstimatorConfig:
     offset: bool = True
     noise_estimated: bool = False
     """Follow the variance of the noise, beginning with ``noise_variance``."""
-    refresh_n: int = 0
+    refresh_n: int = 50
     """Take C from the estimate of A after so many equations, and each time A has moved; 0: never."""
     stuck_n: int = 16
     """The displacement is stuck once it was the same for so many samples after an edge of the force; 0: never."""
@@ -82,7 +82,7 @@ class EstimatorConfig:
     arl0: float | None = None
     """Mean samples between false alarms; for ``cusum``."""
     hold_off_n: int = 0
-    warm_up_n: int = 0
+    warm_up_n: int = 150
     absolute: bool = False
     reset: ResetName = "covariance"
 

@@ -425,6 +425,7 @@ est_config_t est_config_default(void) {
         .nk             = 0U,
         .nc             = 0U,
         .offset         = true,
+        .refresh_n      = EST_WITH_ADAPTATION ? 50U : 0U,
         .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
         .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
         .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,
@@ -441,7 +442,7 @@ est_config_t est_config_default(void) {
                             .reset      = EST_RESET_COVARIANCE,
                             .absolute   = false,
                             .hold_off_n = 0U,
-                            .warm_up_n  = 0U,
+                            .warm_up_n  = 150U,
                             .ceiling    = 11.512925F },
     };
 #if EST_NA_MAX >= 2

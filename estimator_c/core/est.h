@@ -258,8 +258,8 @@ typedef struct {
 #endif
 } est_t;
 
-/// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C fixed at
-/// (1 - 0.8 z^-1)^2, forgetting 0.9925, the cumulative sum with ARL0 = 1e5. Constant time. Cannot fail.
+/// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C at first
+/// (1 - 0.8 z^-1)^2 and then from A, forgetting 0.9925, the cumulative sum with ARL0 = 1e5 after 150 samples. Constant time. Cannot fail.
 est_config_t est_config_default(void);
 
 /// True iff every value of the configuration is in the range stated at its field. Cost: constant. Cannot fail.

@@ -64,7 +64,7 @@ def batch(
     return np.asarray(np.linalg.solve(normal, (phi.T * weight) @ target))
 
 
-SETTINGS = {"nb": 2, "nk": 0, "p0": 10.0, "p0_offset": 1e4, "kind": NONE}
+SETTINGS = {"nb": 2, "nk": 0, "refresh_n": 0, "p0": 10.0, "p0_offset": 1e4, "kind": NONE}
 
 
 @pytest.mark.parametrize("c", [(0.0, 0.0), (-1.6, 0.64)], ids=["no prefilter", "prefilter"])
@@ -93,7 +93,7 @@ def test_variance_is_that_of_least_squares(estimator: Estimator) -> None:
 
 def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:
     """Thesis Fig. 3.5: a1 = 0.5, a2 = 0.8, b0 = -0.9."""
-    assert estimator.init(na=2, nb=1, nk=1, offset=0, c=(0.0, 0.0), kind=NONE, forgetting=1.0)
+    assert estimator.init(na=2, nb=1, nk=1, offset=0, c=(0.0, 0.0), kind=NONE, forgetting=1.0, refresh_n=0)
     theta = estimator.run(*record()).theta
     assert theta[30] == pytest.approx([0.5, 0.8, -0.9], abs=1e-3)
 
@@ -102,7 +102,7 @@ def test_noise_free_estimate_is_the_plant(estimator: Estimator) -> None:
 def test_offset_is_that_of_the_model(estimator: Estimator, c: tuple[float, float]) -> None:
     """y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1) + d, by the definition of est.h: y shifts by d / A(1)."""
     data = record(offset=100.0)
-    assert estimator.init(nb=1, nk=1, kind=NONE, c=c, forgetting=1.0)
+    assert estimator.init(nb=1, nk=1, kind=NONE, c=c, forgetting=1.0, refresh_n=0)
     theta = estimator.run(*data).theta[-1]
     assert theta == pytest.approx([0.5, 0.8, -0.9, 100.0 * (1.0 + 0.5 + 0.8)], rel=1e-3)
 

@@ -31,6 +31,8 @@ PLAIN: dict[str, float | tuple[float, float]] = {
     "c": (0.0, 0.0),
     "forgetting": 1.0,
     "edge_instants": LOCKED,
+    "refresh_n": 0,
+    "warm_up_n": 0,
 }
 
 
