@@ -446,6 +446,18 @@ def test_initial_voltages_that_cannot_be_are_refused(initial_v: Mapping[str, flo
         machine(ic_ohm=-1.0)
 
 
+@pytest.mark.parametrize("wrong", [{"sample_rate_hz": math.nan}, {"sample_rate_hz": math.inf}, {"sample_rate_hz": 0.0}])
+def test_a_sample_rate_that_cannot_be_is_refused(wrong: Mapping[str, float]) -> None:
+    with pytest.raises(EngineError, match="sample_rate_hz must be positive and finite"):
+        AnalogComputer(SuspensionComputer().circuit, ["u1"], **wrong)
+
+
+@pytest.mark.parametrize("delay_s", [math.nan, math.inf, -1.0])
+def test_a_lamp_delay_that_cannot_be_is_refused(delay_s: float) -> None:
+    with pytest.raises(EngineError, match="lamp_delay_s must be finite and not negative"):
+        AnalogComputer(SuspensionComputer().circuit, ["u1"], lamp_delay_s=delay_s)
+
+
 # ---- overload
 
 
