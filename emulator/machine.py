@@ -111,6 +111,8 @@ class AnalogComputer:
             raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
         if not 0 <= lamp_delay_s < math.inf:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
+        # First, for it refuses a circuit that is too large at once.
+        self._nodals = {Mode.OPERATE: Nodal(circuit)}
         self._patched = circuit
         self._readings = tuple(readings)
         self._patches = patches(circuit)
@@ -122,7 +124,6 @@ class AnalogComputer:
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
         self._turns: dict[str, _Turn] = {}
         self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
-        self._nodals: dict[Mode, Nodal] = {}
         self._check_integrators(self._initial_v)
         self.restart()
 

@@ -44,7 +44,7 @@ def test_the_cost_of_checking_a_ladder_grows_linearly_with_its_length() -> None:
 
     def lines(length: int) -> int:
         ladder = [Resistor(f"R{i}", f"n{i}", f"n{i + 1}", 1.0) for i in range(length)]
-        elements = [VoltageSource("V1", "n0"), *ladder, Resistor("Rend", f"n{length}", "0", 1.0)]
+        elements: list[Element] = [VoltageSource("V1", "n0"), *ladder, Resistor("Rend", f"n{length}", "0", 1.0)]
         count = 0
 
         def trace(_frame: FrameType, _event: str, _arg: object) -> Any:
