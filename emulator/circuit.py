@@ -208,6 +208,9 @@ class Switch:
 Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | CurrentSource | DiodeLimiter | Switch
 _E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
 
+_LEAST = 1e-100
+"""Of ohms and farads, so that no reciprocal of theirs, nor of an end stop's part of a track, overflows."""
+
 _POSITIVE: Mapping[type, tuple[str, ...]] = {
     Resistor: ("ohm",),
     Capacitor: ("farad",),
@@ -307,6 +310,8 @@ def _check_element(element: Element) -> None:
         value = getattr(element, field)
         if not (math.isfinite(value) and value > 0):
             raise CircuitError(f"{label(element)}: {field} must be positive and finite, got {value!r}")
+        if value < _LEAST:
+            raise CircuitError(f"{label(element)}: {field} must be at least {_LEAST:g}, got {value!r}")
     if isinstance(element, Pot):
         checked_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter) and not math.isfinite(element.threshold_v):
@@ -321,13 +326,16 @@ def _check_element(element: Element) -> None:
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
     """Every node must have a path to ground that can hold its voltage (found by growing the set of grounded nodes)."""
-    grounded = {GROUND}
-    bonds = [bond for element in elements for bond in element.bonds]
-    while True:
-        reached = {node for bond in bonds if grounded.intersection(bond) for node in bond} - grounded
-        if not reached:
-            break
-        grounded |= reached
+    neighbours: dict[str, list[str]] = {}
+    for element in elements:
+        for a, b in element.bonds:
+            neighbours.setdefault(a, []).append(b)
+            neighbours.setdefault(b, []).append(a)
+    grounded, front = {GROUND}, [GROUND]
+    while front:
+        reached = [node for node in neighbours.get(front.pop(), ()) if node not in grounded]
+        grounded.update(reached)
+        front += reached
     for element in elements:
         for node in element.nodes:
             if node not in grounded:

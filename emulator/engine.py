@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import math
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -65,8 +66,12 @@ class Engine:
         self._outputs = tuple(outputs)
         self._names = (system.states, system.inputs)
         self._library = library.load()
-        if not sample_rate_hz > 0:
-            raise EngineError(f"sample_rate_hz must be positive, got {sample_rate_hz!r}")
+        if not 0 < sample_rate_hz < math.inf:
+            raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
+        if len(self._outputs) > library.MAX_OUTPUTS:
+            raise EngineError(
+                f"{len(self._outputs)} nodes are to be recorded; the engine takes at most {library.MAX_OUTPUTS}"
+            )
         sizes = (len(system.states), len(system.inputs), len(system.kinks), len(self._outputs))
         self._handle = self._library.engine_new(*sizes, 1.0 / sample_rate_hz, events_per_sample)
         if not self._handle:
@@ -128,11 +133,16 @@ class Engine:
         ticks). Cutting a run into several calls gives the same bits. Raises EngineError; the engine is then of no
         further use.
         """
-        volts = np.empty((samples, len(self._outputs)))
+        volts = self._room(samples)
         trains = self._merge(edges or {})
         self._run_until((self._recorded + samples - 1) * TICKS_PER_SAMPLE, trains, volts)
         self._note(samples)
         return volts
+
+    def _room(self, samples: int) -> NDArray[np.float64]:
+        if samples < 0:
+            raise EngineError(f"cannot record {samples} samples")
+        return np.empty((samples, len(self._outputs)))
 
     def _note(self, samples: int) -> None:
         self._recorded += samples
@@ -162,7 +172,7 @@ class Engine:
         """
         if pieces_per_sample < 1:
             raise EngineError(f"pieces_per_sample must be at least 1, got {pieces_per_sample}")
-        volts = np.empty((samples, len(self._outputs)))
+        volts = self._room(samples)
         ticks, inputs, levels_v = self._merge(edges or {})
         last, first_edge = self._recorded + samples - 1, 0
         for piece in range(max(self._recorded - 1, 0) * pieces_per_sample, last * pieces_per_sample + 1):

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
 from .components import NOMINAL, Components, contact_of
 from .engine import Engine
-from .errors import CircuitError, ModeError, PotError
+from .errors import CircuitError, EngineError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .nodal import Nodal, PiecewiseLinear
 from .patching import Patch, is_part_of, patches
@@ -90,7 +90,8 @@ class AnalogComputer:
 
     components: with which the circuit was fitted; they say where wipers come to rest, and how they sound on the way.
 
-    Raises CircuitError for errors of patching and for an integrator that is none.
+    Raises CircuitError for errors of patching and for an integrator that is none, EngineError for a rate or a delay
+    that cannot be.
     """
 
     def __init__(
@@ -106,6 +107,12 @@ class AnalogComputer:
     ) -> None:
         if ic_ohm is not None and not (math.isfinite(ic_ohm) and ic_ohm > 0):
             raise CircuitError(f"ic_ohm must be positive and finite, got {ic_ohm!r}")
+        if not 0 < sample_rate_hz < math.inf:
+            raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
+        if not 0 <= lamp_delay_s < math.inf:
+            raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
+        # First, for it refuses a circuit that is too large at once.
+        self._nodals = {Mode.OPERATE: Nodal(circuit)}
         self._patched = circuit
         self._readings = tuple(readings)
         self._patches = patches(circuit)
@@ -117,7 +124,6 @@ class AnalogComputer:
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
         self._turns: dict[str, _Turn] = {}
         self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
-        self._nodals: dict[Mode, Nodal] = {}
         self._check_integrators(self._initial_v)
         self.restart()
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
+from types import FrameType
+from typing import Any
 
 import pytest
 
@@ -20,6 +23,8 @@ SOURCE = VoltageSource("V1", "in")
         ([SOURCE, Resistor("R1", "in", "0", -1.0)], r"Resistor R1 \(in 0\): ohm must be positive and finite, got -1.0"),
         ([SOURCE, Resistor("R1", "in", "0", math.nan)], "Resistor R1 .* got nan"),
         ([SOURCE, Capacitor("C1", "in", "0", 0.0)], r"Capacitor C1 \(in 0\): farad must be positive"),
+        ([SOURCE, Resistor("R1", "in", "0", 1e-309)], r"Resistor R1 \(in 0\): ohm must be at least 1e-100"),
+        ([SOURCE, Pot("P1", "in", "w", "0", 5e-324, 0.5)], r"Pot P1 \(in w 0\): track_ohm must be at least 1e-100"),
         ([SOURCE, Resistor("R1", "in", "in", 1e3)], r"Resistor R1 \(in in\): both ends are on node in"),
         ([SOURCE, Resistor("R1", "a", "b", 1e3)], r"Resistor R1 \(a b\): node a floats"),
         ([SOURCE, OpAmp("U1", "in", "x", "out", IDEAL)], r"OpAmp U1 \(in x out\): node x floats"),
@@ -32,6 +37,30 @@ SOURCE = VoltageSource("V1", "in")
 def test_a_wrong_netlist_is_refused_naming_element_and_node(elements: list[Element], message: str) -> None:
     with pytest.raises(CircuitError, match=message):
         Circuit(elements)
+
+
+def test_the_cost_of_checking_a_ladder_grows_linearly_with_its_length() -> None:
+    """Counted in lines of Python: no step of the check may look at every element again."""
+
+    def lines(length: int) -> int:
+        ladder = [Resistor(f"R{i}", f"n{i}", f"n{i + 1}", 1.0) for i in range(length)]
+        elements: list[Element] = [VoltageSource("V1", "n0"), *ladder, Resistor("Rend", f"n{length}", "0", 1.0)]
+        count = 0
+
+        def trace(_frame: FrameType, _event: str, _arg: object) -> Any:
+            nonlocal count
+            count += 1
+            return trace
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            Circuit(elements)
+        finally:
+            sys.settrace(before)
+        return count
+
+    assert lines(800) < 9 * lines(100)
 
 
 @pytest.mark.parametrize("dial", [-0.001, 1.001, math.nan])

@@ -317,3 +317,12 @@ def test_two_inputs_may_change_at_the_same_instant() -> None:
     one = Edges(np.array([0, TICKS_PER_SAMPLE]), np.array([2.0, 4.0]))
     other = Edges(np.array([TICKS_PER_SAMPLE, 2 * TICKS_PER_SAMPLE]), np.array([6.0, 0.0]))
     assert Engine(piecewise_linear(circuit), ["o"]).run(3, {"B": other, "A": one})[:, 0].tolist() == [1.0, 5.0, 2.0]
+
+
+def test_what_cannot_be_recorded_is_refused_with_the_number() -> None:
+    with pytest.raises(EngineError, match="200 nodes are to be recorded; the engine takes at most 128"):
+        Engine(follower(), ["out"] * 200)
+    with pytest.raises(EngineError, match="sample_rate_hz must be positive and finite, got inf"):
+        Engine(follower(), ["out"], sample_rate_hz=float("inf"))
+    with pytest.raises(EngineError, match="cannot record -3 samples"):
+        Engine(follower(), ["out"]).run(-3)

@@ -446,6 +446,26 @@ def test_initial_voltages_that_cannot_be_are_refused(initial_v: Mapping[str, flo
         machine(ic_ohm=-1.0)
 
 
+@pytest.mark.parametrize("rate_hz", [math.nan, math.inf, 0.0])
+def test_a_sample_rate_that_cannot_be_is_refused(rate_hz: float) -> None:
+    with pytest.raises(EngineError, match="sample_rate_hz must be positive and finite"):
+        AnalogComputer(SuspensionComputer().circuit, ["u1"], sample_rate_hz=rate_hz)
+
+
+def test_a_circuit_too_large_is_refused_before_its_patching_is_looked_at() -> None:
+    """Which for 4000 nodes in a row takes more than 90 s."""
+    ladder = [Resistor(f"R{i}", f"n{i}", f"n{i + 1}", 1.0) for i in range(4000)]
+    circuit = Circuit([VoltageSource("V1", "n0"), *ladder, Resistor("Rend", "n4000", "0", 1.0)])
+    with pytest.raises(CircuitError, match="4002 nodes and branches; the engine takes at most 256"):
+        AnalogComputer(circuit, ["n1"])
+
+
+@pytest.mark.parametrize("delay_s", [math.nan, math.inf, -1.0])
+def test_a_lamp_delay_that_cannot_be_is_refused(delay_s: float) -> None:
+    with pytest.raises(EngineError, match="lamp_delay_s must be finite and not negative"):
+        AnalogComputer(SuspensionComputer().circuit, ["u1"], lamp_delay_s=delay_s)
+
+
 # ---- overload
 
 
