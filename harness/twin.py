@@ -19,7 +19,7 @@ SLIP_DOUBT = 1000.0
 """How much less certain a slip leaves every parameter."""
 
 CONTRACTION = 0.99
-REFRESH_STEP = 0.02
+REFRESH_STEP = 0.002
 
 NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
 

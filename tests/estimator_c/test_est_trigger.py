@@ -32,7 +32,6 @@ PLAIN: dict[str, float | tuple[float, float]] = {
     "forgetting": 1.0,
     "edge_instants": LOCKED,
     "refresh_n": 0,
-    "warm_up_n": 0,
 }
 
 

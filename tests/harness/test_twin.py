@@ -16,7 +16,8 @@ from harness.twin import Twin
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900
-LOCKED: dict[str, Any] = {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
+FIXED: dict[str, Any] = {"refresh_n": 0, "warm_up_n": 0}
+LOCKED: dict[str, Any] = FIXED | {"nb": 2, "nk": 1, "offset": False, "edge_instants": "locked", "forgetting": 1.0}
 
 
 def record(drift: float = 0.0, seed: int = 4) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -28,18 +29,20 @@ def record(drift: float = 0.0, seed: int = 4) -> tuple[NDArray[np.float64], NDAr
 
 
 CASES: dict[str, EstimatorConfig] = {
-    "default": EstimatorConfig(),
+    "default": EstimatorConfig(**FIXED),
     "locked": EstimatorConfig(**LOCKED),
-    "anywhere": EstimatorConfig(edge_instants="anywhere"),
-    "none": EstimatorConfig(trigger="none", c=()),
+    "anywhere": EstimatorConfig(**FIXED, edge_instants="anywhere"),
+    "none": EstimatorConfig(**FIXED, trigger="none", c=()),
     "walk": EstimatorConfig(**LOCKED, random_walk=1e-6),
-    "noise": EstimatorConfig(noise_estimated=True, noise_variance=3.0),
-    "refresh": EstimatorConfig(refresh_n=60, c=(-0.9, 0.2)),
-    "armax": EstimatorConfig(**(LOCKED | {"nc": 2, "c": (), "offset": False}), trigger="none"),
+    "noise": EstimatorConfig(**FIXED, noise_estimated=True, noise_variance=3.0),
+    "refresh": EstimatorConfig(refresh_n=200, c=(-0.9, 0.2)),
+    "armax": EstimatorConfig(**(LOCKED | {"nc": 2, "c": ()}), trigger="none"),
     "prediction error": EstimatorConfig(
-        **LOCKED, c=(), trigger="prediction-error", ceiling=200.0, warm_up_n=30, hold_off_n=20, reset="all"
+        **(LOCKED | {"warm_up_n": 30}), c=(), trigger="prediction-error", ceiling=200.0, hold_off_n=20, reset="all"
     ),
-    "mean": EstimatorConfig(trigger="mean-between-faults", ceiling=30.0, warm_up_n=30, hold_off_n=4, absolute=True),
+    "mean": EstimatorConfig(
+        **(FIXED | {"warm_up_n": 30}), trigger="mean-between-faults", ceiling=30.0, hold_off_n=4, absolute=True
+    ),
 }
 
 
