@@ -316,3 +316,9 @@ def test_two_inputs_may_change_at_the_same_instant() -> None:
     one = Edges(np.array([0, TICKS_PER_SAMPLE]), np.array([2.0, 4.0]))
     other = Edges(np.array([TICKS_PER_SAMPLE, 2 * TICKS_PER_SAMPLE]), np.array([6.0, 0.0]))
     assert Engine(piecewise_linear(circuit), ["o"]).run(3, {"B": other, "A": one})[:, 0].tolist() == [1.0, 5.0, 2.0]
+
+
+def test_more_recorded_nodes_than_the_engine_takes_are_refused_with_the_number() -> None:
+    nodes = ["in"] * 129
+    with pytest.raises(EngineError, match="129 recorded nodes; the engine takes at most 128"):
+        Engine(piecewise_linear(Circuit([SOURCE, Resistor("R1", "in", "0", 1e3)])), nodes)
