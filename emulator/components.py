@@ -15,6 +15,7 @@ adding an element, or a non-ideality, changes no other draw. What is left at its
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -39,6 +40,7 @@ __all__ = [
     "OpAmpGrade",
     "PotGrade",
     "contact_of",
+    "is_part_of",
 ]
 
 REFERENCE_C = 25.0
@@ -368,6 +370,15 @@ def _mounted(pot: Pot, grade: PotGrade) -> Iterator[Element]:
         yield Pot(contact, wiper, rest, f"{contact}_end", grade.wiper_noise_ohm, 1.0)
         yield Resistor(f"{contact}_ohm", f"{contact}_end", GROUND, _NOWHERE_OHM)
     yield replace(pot, top=top, wiper=wiper, bottom=bottom)
+
+
+_ADDED = re.compile(r"leak|soak\d+(_ohm)?|(plus|minus)_(bias|ohm|farad)|(wiper|top|bottom)_ohm|contact(_ohm)?")
+"""What fitted() adds to the name of an element for those that make it real."""
+
+
+def is_part_of(element: Element, owner: str) -> bool:
+    """Whether an element is one of those that fitted() adds to make another real: by its name, C1_leak for C1."""
+    return element.name.startswith(f"{owner}_") and _ADDED.fullmatch(element.name, len(owner) + 1) is not None
 
 
 NOMINAL = Components()

@@ -80,7 +80,8 @@ def _without_load(
     machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
 ) -> dict[str, float]:
     """Turns the dial to the coefficient that the pot should give under load."""
-    return {f"{key[0]}_dial": machine.program.coefficient(key, value) for key, value in wanted.items()}
+    program = machine.program
+    return {f"{program.parameters[key].pot}_dial": program.coefficient(key, value) for key, value in wanted.items()}
 
 
 def _to_a_thousandth(

@@ -11,8 +11,7 @@
 #define NEVER INT64_C(-1)
 #define MAX_COLUMNS (ENGINE_MAX_STATES + ENGINE_MAX_INPUTS + 1)
 
-/* Matrices that are multiplied in the inner loop are cut into panels of four rows; a panel is stored column by column.
- * */
+/* Matrices that are multiplied in the inner loop are cut into panels of four rows; a panel is stored column by column. */
 #define PANEL 4
 #define PANELS(rows) (((rows) + PANEL - 1) / PANEL)
 #define PANEL_ELEMENTS(rows, columns) (PANELS(rows) * PANEL * (columns))
@@ -124,8 +123,7 @@ struct engine {
 /* How a step ended with respect to the bounds of the present mode. */
 enum judgement { CLEAR, NEAR, CROSSED };
 
-/* ---- matrices
- * ---------------------------------------------------------------------------------------------------------------- */
+/* ---- matrices ---- */
 
 static void to_panels(int rows, int columns, int stride, const double *matrix, double *panels)
 {
@@ -224,8 +222,7 @@ static double norm(int n, int stride, const double *a)
     return largest;
 }
 
-/* ---- linear equations
- * ---------------------------------------------------------------------------------------------------------- */
+/* ---- linear equations ---- */
 
 /* A pivot smaller than this part of the largest element its column began with counts as none: it is what rounding
  * leaves of a zero. */
@@ -303,9 +300,7 @@ int engine_solve(int n, int columns, double *a, double *b)
     return -1;
 }
 
-/* ---- modes
- * -------------------------------------------------------------------------------------------------------------------
- * */
+/* ---- modes ---- */
 
 /* I - [w_phi] diag(slopes) of the given pieces, restricted to the kinks listed. */
 static void feedback(const engine *self, const unsigned char *piece, int count, const int *listed, double *a)
@@ -610,9 +605,7 @@ static enum engine_status enter_mode(engine *self)
     return status;
 }
 
-/* ---- steps
- * -------------------------------------------------------------------------------------------------------------------
- * */
+/* ---- steps ---- */
 
 static void step(engine *self, int level, struct point *to)
 {
@@ -728,8 +721,7 @@ static enum engine_status stride(engine *self, int64_t ticks)
     return ENGINE_OK;
 }
 
-/* ---- quiet stretches
- * ------------------------------------------------------------------------------------------------------------ */
+/* ---- quiet stretches ---- */
 
 /* The rows of exp(A h) that all others depend on, found by elimination: slow ones first, so that nothing cancels in
  * their changes. e = exp(A h), f = e - I. Returns how many; column[i] is where row[i] has its pivot. */
@@ -1173,8 +1165,7 @@ static void leave_quiet(engine *self)
     }
 }
 
-/* ---- a run
- * --------------------------------------------------------------------------------------------------------------------- */
+/* ---- a run ---- */
 
 static enum engine_status advance(engine *self, int64_t tick)
 {
@@ -1190,8 +1181,7 @@ static enum engine_status advance(engine *self, int64_t tick)
     return status;
 }
 
-/* ---- the public functions
- * ------------------------------------------------------------------------------------------------------ */
+/* ---- the public functions ---- */
 
 static bool within(int value, int low, int high)
 {
@@ -1362,18 +1352,20 @@ enum engine_status engine_set_system(engine *self, const struct engine_system *s
     if (self->has_system) {
         leave_quiet(self);
     }
-    self->has_system = true;
     self->stored = 0;
     self->oldest = 0;
     list_feeding(self);
-    if (!has_one_sign(self)) {
+    self->has_system = has_one_sign(self);
+    if (!self->has_system) {
         return ENGINE_NOT_UNIQUE;
     }
     to_panels(self->kinks, self->columns, self->columns, self->cde, self->cde_panels);
     to_panels(self->outputs, self->columns, self->columns, self->lmn, self->lmn_panels);
     self->w_panels = self->cde_panels;
     self->y_panels = self->lmn_panels;
-    return enter_mode(self);
+    const enum engine_status status = enter_mode(self);
+    self->has_system = status == ENGINE_OK;
+    return status;
 }
 
 void engine_get_state(const engine *self, double *x)
@@ -1526,9 +1518,7 @@ void engine_get_counts(const engine *self, struct engine_counts *counts)
     *counts = self->counts;
 }
 
-/* ---- noise
- * ------------------------------------------------------------------------------------------------------------------
- * */
+/* ---- noise ---- */
 
 /* The short step h of engine_noise_gather: |a h| up to this, and so many terms end the series within 1e-19 of its sum. */
 #define NOISE_NORM 1e-2

@@ -37,7 +37,7 @@ enum engine_status {
     ENGINE_EVENTS,     /* more events within one sample period than allowed */
     ENGINE_NOT_FINITE, /* the state has left the numbers */
     ENGINE_EDGE,       /* edges out of order, in the past, beyond the run, or of an input that is not there */
-    ENGINE_NO_SYSTEM,  /* engine_set_system has not been called */
+    ENGINE_NO_SYSTEM,  /* engine_set_system has not been called, or its last circuit was refused */
     ENGINE_NOT_UNIQUE  /* w = r + P phi(w) has no solution, or more than one, for some r */
 };
 
@@ -78,7 +78,7 @@ void engine_free(engine *self);
 /* Sets or replaces the circuit. x and u stay as they are; a circuit equal to the one before, bit for bit, changes
  * nothing at all. Cost: a copy, then a ladder for each mode that occurs (about 30 n^2 (n + m + 1) multiplications), and,
  * for each combination of pieces of the kinks that feed a w, a determinant; of more than 4096 combinations only those
- * that occur are checked. Call it before engine_run. */
+ * that occur are checked. Call it before engine_run. On failure the engine has no circuit until one is accepted. */
 enum engine_status engine_set_system(engine *self, const struct engine_system *system);
 
 /* Copies the state x out and in. Setting it looks for events anew. */

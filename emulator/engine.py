@@ -25,11 +25,11 @@ _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
 
 _REASONS = {
     1: "out of memory",
-    2: "the circuit is too stiff: it has a time constant below a femtosecond",
+    2: "the circuit is too stiff: it has a time constant 10^17 times shorter than a sample period",
     3: "more events within one sample than events_per_sample allows: does an amplifier oscillate?",
     4: "the state is no longer finite: the circuit is unstable",
     5: "the edges are out of order, not after the last sample recorded, or beyond the last sample of the run",
-    6: "no circuit was set",
+    6: "no circuit was set, or the last one was refused",
     7: "limiters and amplifiers feed one another so that there is no unique solution: is there positive feedback?",
 }
 
@@ -112,7 +112,8 @@ class Engine:
         """Replaces the circuit by another of the same states, inputs and kinks, at the last instant recorded.
 
         That sample is still the old circuit's, the next is the first of the new. Voltages of capacitors and op-amps
-        carry over. An equal circuit changes nothing, to the bit. Raises EngineError.
+        carry over. An equal circuit changes nothing, to the bit. Raises EngineError; the engine then plays nothing
+        until it is given a circuit that it accepts.
         """
         if (system.states, system.inputs) != self._names:
             raise EngineError(

@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
-from .components import NOMINAL, Components, contact_of
+from .components import NOMINAL, Components, contact_of, is_part_of
 from .engine import Engine
 from .errors import CircuitError, EngineError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .nodal import Nodal, PiecewiseLinear
-from .patching import Patch, is_part_of, patches
+from .patching import Patch, patches
 from .pot import END_FRACTION, checked_dial
 
 __all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch"]
@@ -479,12 +479,18 @@ class AnalogComputer:
         return Nodal(Circuit([*elements, VoltageSource("reference", "reference", dc_v=REFERENCE_V)]))
 
     def _terminal(self, pot: str, end: str) -> str:
-        """The node at which that end of a pot is patched: beyond what resistance of its own it has there."""
-        inner: str = next(getattr(element, end) for element in self._patched.of(Pot) if element.name == pot)
-        for resistor in self._patched.of(Resistor):
-            if is_part_of(resistor, pot) and inner in resistor.nodes:
-                return resistor.b if resistor.a == inner else resistor.a
-        return inner
+        """The node at which that end of a pot is patched: where what fitted() put there meets anything else."""
+        own = [element for element in self._patched.elements if element.name == pot or is_part_of(element, pot)]
+        parts = [bond for element in own if element.name != pot for bond in element.bonds]
+        patched = {
+            GROUND,
+            *(node for element in self._patched.elements if element not in own for node in element.nodes),
+        }
+        reached: list[str] = [next(getattr(element, end) for element in own if element.name == pot)]
+        for node in reached:
+            fresh = {other for bond in parts if node in bond for other in bond}
+            reached += sorted(fresh.difference(reached, {GROUND}))
+        return next(node for node in reached if node in patched)
 
     def _reading(self, nodal: Nodal, pot: str, dial: float) -> float:
         system = nodal.at(self._dials | {pot: dial}, self._closed)

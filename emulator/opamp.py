@@ -2,8 +2,8 @@
 
 The law of every op-amp here, with v the voltage behind the output resistance (SI units throughout):
 
-    dv/dt = clip(2 pi GBW (v+ - v- + Vos) - v / tau, -SR, +SR) - CLAMP_RATE deadzone(v; swing),   tau = Avol / (2 pi
-    GBW)
+    dv/dt = clip(2 pi GBW (v+ - v- + Vos) - v / tau, -SR, +SR) - CLAMP_RATE deadzone(v; swing)
+    tau = Avol / (2 pi GBW)
 
 The clamp is a spring and not a wall: overdriven at full slew rate, v settles SR / CLAMP_RATE beyond the swing (13 mV
 for a TL07x). That keeps the field continuous, so the mode of an amplifier follows from the state alone and there is
@@ -30,8 +30,7 @@ class OpAmpModel:
     """One type of op-amp. The defaults are the ideal one (v+ = v-, no state); every non-ideality is off on its own.
 
     avol: open-loop gain at DC (V/V); gbw_hz: gain-bandwidth product; slew_v_per_s: slew rate; swing_v: (lowest,
-    highest) output in V;
-    rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-.
+    highest) output in V; rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-.
 
     Raises CircuitError naming the field. Slew and swing need a finite gbw_hz, for they act on the state that it brings.
     """

@@ -12,9 +12,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from .circuit import GROUND, Capacitor, Circuit, CurrentSource, Element, OpAmp, Pot, VoltageSource, label
+from .components import is_part_of
 from .errors import CircuitError
 
-__all__ = ["Patch", "is_part_of", "patches"]
+__all__ = ["Patch", "patches"]
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,6 @@ class Patch:
     out: str
     inputs: tuple[str, ...]
     capacitors: tuple[str, ...]
-
-
-def is_part_of(element: Element, owner: str) -> bool:
-    """Whether an element is one of those that make another real, whose names follow its own: E_... is part of E."""
-    return element.name.startswith(f"{owner}_")
 
 
 def patches(circuit: Circuit) -> dict[str, Patch]:

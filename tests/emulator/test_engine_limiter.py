@@ -211,3 +211,37 @@ def current(element: Resistor | DiodeLimiter, v: float) -> float:
 def test_an_unknown_switch_is_refused() -> None:
     with pytest.raises(CircuitError, match="no switch is called 'S2'; there are none"):
         Circuit([SOURCE, Resistor("R1", "in", "0", 1.0)]).with_switches({"S2": True})
+
+
+@pytest.mark.parametrize(
+    ("refused", "why"),
+    [
+        (lambda: latching(closed=True), "no unique solution"),
+        (lambda: latching(closed=False, farad=1e-40), "too stiff"),
+    ],
+)
+def test_a_refused_circuit_is_refused_again_and_not_played(refused: Callable[[], Circuit], why: str) -> None:
+    engine = Engine(piecewise_linear(latching(closed=False)), ["o"])
+    engine.run(3, steps((0.0, 1.0)))
+    for _ in range(2):
+        with pytest.raises(EngineError, match=why):
+            engine.set_system(piecewise_linear(refused()))
+    with pytest.raises(EngineError, match="the last one was refused"):
+        engine.run(1)
+    engine.set_system(piecewise_linear(latching(closed=False)))
+    assert engine.run(3).shape == (3, 1)
+
+
+def latching(*, closed: bool, farad: float = 1e-9) -> Circuit:
+    """A follower with a limiter from output to input, which a switch puts in: beyond its threshold it latches."""
+    return Circuit(
+        [
+            *(SOURCE, Resistor("R1", "in", "p", 1e4), Resistor("R2", "o", "n", 1e4), Resistor("R3", "n", "0", 1e4)),
+            *(OpAmp("U1", "p", "n", "o", OpAmpModel()), Switch("S1", "o", "x", 1.0, 1e12, closed)),
+            *(
+                DiodeLimiter("D1", "x", "p", 0.5, 100.0, 1e9),
+                Resistor("R4", "in", "c", 1e3),
+                Capacitor("C1", "c", "0", farad),
+            ),
+        ]
+    )

@@ -22,6 +22,7 @@ from emulator import (
     Capacitor,
     Circuit,
     CircuitError,
+    Components,
     DiodeLimiter,
     Edges,
     EngineError,
@@ -32,6 +33,7 @@ from emulator import (
     OpAmpModel,
     Pot,
     PotError,
+    PotGrade,
     Resistor,
     SuspensionComputer,
     Switch,
@@ -388,7 +390,7 @@ def test_a_pot_with_resistance_at_its_ends_is_read_at_its_terminals() -> None:
 
 def test_hold_droops_by_the_bias_current_of_the_amplifier() -> None:
     """80 nA into 10 nF are 8 V/s; -16 V behind 200 M is how such a current is wired."""
-    bias: list[Element] = [VoltageSource("U1_bias", "U1_bias", dc_v=-16.0), Resistor("U1_ohm", "s", "U1_bias", 2e8)]
+    bias: list[Element] = [VoltageSource("U1_minus_bias", "u1b", dc_v=-16.0), Resistor("U1_minus_ohm", "s", "u1b", 2e8)]
     computer = machine(integrator(bias), ic_ohm=None)
     computer.switch(HOLD)
     volts = computer.run(1000, level(10.0))[:, 0]
@@ -567,3 +569,20 @@ def test_a_machine_of_real_components_is_set_charged_and_held(stock: str) -> Non
     by_hand.switch(HOLD)
     held = by_hand.run(101)[:, 1]
     assert 1e-6 < abs(held[-1] - held[0]) < LSB_V
+
+
+@pytest.mark.parametrize("load", ["R1", "M_load"])
+@pytest.mark.parametrize("noise_ohm", [0.0, 100.0])
+def test_a_coefficient_is_read_beyond_the_wiper_whatever_its_load_is_called(load: str, noise_ohm: float) -> None:
+    """10k at half its track into a wiper of 5k and a load of 95k: 1/2 / (1 + 1/4 10k / 100k) of which 95 %."""
+    parts = Components(pots=PotGrade(wiper_ohm=5e3, wiper_noise_ohm=noise_ohm))
+    elements: list[Element] = [
+        VoltageSource("V1", "in"),
+        Pot("M", "in", "M_w", "0", 10e3, 0.5),
+        Resistor(load, "M_w", "s", 95e3),
+        Resistor("R2", "s", "out", 1e5),
+        OpAmp("U1", "0", "s", "out", IDEAL),
+    ]
+    machine = AnalogComputer(Circuit(parts.fitted(elements)), ["out"], components=parts)
+    machine.switch(Mode.POT_SET)
+    assert machine.coefficient("M") == pytest.approx(0.5 / 1.025 * 0.95, rel=1e-5)

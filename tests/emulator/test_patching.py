@@ -120,3 +120,16 @@ def test_a_follower_and_an_amplifier_with_gain_need_no_junction() -> None:
         "U1": Patch("U1", "a", "a", (), ()),
         "U2": Patch("U2", "n", "b", (), ()),
     }
+
+
+def test_an_input_named_after_its_amplifier_is_an_input_like_any_other() -> None:
+    circuit = Circuit(
+        [
+            VoltageSource("V1", "in"),
+            Resistor("R1", "in", "s", 1e5),
+            Resistor("U1_in", "in", "s", 1e5),
+            Capacitor("C1", "s", "out", 1e-8),
+            OpAmp("U1", "0", "s", "out", IDEAL),
+        ]
+    )
+    assert patches(circuit) == {"U1": Patch("U1", "s", "out", ("R1", "U1_in"), ("C1",))}
