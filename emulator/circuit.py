@@ -220,6 +220,13 @@ _POSITIVE: Mapping[type, tuple[str, ...]] = {
 }
 
 
+_FINITE: Mapping[type, tuple[str, ...]] = {
+    VoltageSource: ("dc_v",),
+    CurrentSource: ("dc_a",),
+    DiodeLimiter: ("threshold_v",),
+}
+
+
 @dataclass(frozen=True)
 class Circuit:
     """A checked netlist.
@@ -306,22 +313,24 @@ def _check_element(element: Element) -> None:
     for a, b in (element.nodes,) if isinstance(element, CurrentSource) else element.bonds:
         if a == b:
             raise CircuitError(f"{label(element)}: both ends are on node {a}")
+    _check_values(element)
+    if isinstance(element, Pot):
+        checked_dial(element.dial, element.name)
+    if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
+        raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+
+
+def _check_values(element: Element) -> None:
     for field in _POSITIVE.get(type(element), ()):
         value = getattr(element, field)
         if not (math.isfinite(value) and value > 0):
             raise CircuitError(f"{label(element)}: {field} must be positive and finite, got {value!r}")
         if value < _LEAST:
             raise CircuitError(f"{label(element)}: {field} must be at least {_LEAST:g}, got {value!r}")
-    if isinstance(element, Pot):
-        checked_dial(element.dial, element.name)
-    if isinstance(element, DiodeLimiter) and not math.isfinite(element.threshold_v):
-        raise CircuitError(f"{label(element)}: threshold_v must be finite, got {element.threshold_v!r}")
-    if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
-        raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
-    if isinstance(element, VoltageSource | CurrentSource):
-        level, unit = constant_of(element), "v" if isinstance(element, VoltageSource) else "a"
-        if level is not None and not math.isfinite(level):
-            raise CircuitError(f"{label(element)}: dc_{unit} must be finite, got {level!r}")
+    for field in _FINITE.get(type(element), ()):
+        value = getattr(element, field)
+        if value is not None and not math.isfinite(value):
+            raise CircuitError(f"{label(element)}: {field} must be finite, got {value!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:

@@ -58,7 +58,7 @@ class EstimatorConfig:
     """The displacement is stuck once it was the same for so many samples after an edge of the force; 0: never."""
     idle_n: int = 1000
     """Excitation is lost once the force had no edge for so many samples; 0: never."""
-    forgetting: float = 0.9925
+    forgetting: float = 0.99
     random_walk: float = 0.0
     """Variance by which each parameter walks per sample, in noise variances."""
     p0: float = 10.0

@@ -429,7 +429,7 @@ est_config_t est_config_default(void) {
         .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
         .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
         .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,
-        .forgetting     = 0.9925F,
+        .forgetting     = 0.99F,
         .random_walk    = 0.0F,
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,

@@ -259,7 +259,7 @@ typedef struct {
 } est_t;
 
 /// The configuration for a rig whose generator has a clock of its own: ARX(2, 3) with delay 0 and offset, C at first
-/// (1 - 0.8 z^-1)^2 and then from A, forgetting 0.9925, the cumulative sum with ARL0 = 1e5 after 150 samples. Constant time. Cannot fail.
+/// (1 - 0.8 z^-1)^2 and then from A, forgetting 0.99, the cumulative sum with ARL0 = 1e5 after 150 samples. Constant time. Cannot fail.
 est_config_t est_config_default(void);
 
 /// True iff every value of the configuration is in the range stated at its field. Cost: constant. Cannot fail.

@@ -185,7 +185,7 @@ def test_unknown_estimator_setting_is_named(tmp_path: Path) -> None:
 
 
 def test_setting_that_the_device_refuses_is_named(tmp_path: Path) -> None:
-    text = locate("devices", "host").read_text().replace("forgetting = 0.9925\n", "forgetting = 0.2\n")
+    text = locate("devices", "host").read_text().replace("forgetting = 0.99\n", "forgetting = 0.2\n")
     (tmp_path / "dut.toml").write_text(text)
     line = refusal("run", "--dut", "dut.toml", cwd=tmp_path)
     assert "forgetting" in line
