@@ -7,11 +7,20 @@
 typedef struct {
     double na, nb, nk, nc, offset, noise_estimated, refresh_n, stuck_n, idle_n, edge_instants;
     double forgetting, random_walk, p0, p0_offset, noise_variance, c[2], edge_codes, code_low, code_high;
-    double kind, ceiling, hold_off_n, warm_up_n, absolute, reset;
+    double kind, ceiling, hold_off_n, warm_up_n, absolute, reset, custom;
 } driver_config_t;
 
 static est_t        self;
 static est_config_t config;
+
+/* A trigger of the caller's own: counts the innovations since it began anew, in its context. */
+static float counted;
+
+static float count_innovations(void* context, float innovation, float variance, bool anew) {
+    float* const counter = context;
+    *counter = (anew ? 0.0F : *counter) + (((innovation * innovation) >= 0.0F) && (variance > 0.0F) ? 1.0F : 0.0F);
+    return *counter;
+}
 
 int driver_init(const driver_config_t* in) {
     config = (est_config_t){
@@ -24,7 +33,8 @@ int driver_init(const driver_config_t* in) {
         .edge_codes = (float)in->edge_codes, .code_low = (float)in->code_low, .code_high = (float)in->code_high,
         .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
                      .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,
-                     .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset },
+                     .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset,
+                     .custom = (in->custom != 0) ? count_innovations : 0, .context = &counted },
     };
     return est_init(&self, &config) ? 1 : 0;
 }
@@ -35,7 +45,7 @@ void driver_default(driver_config_t* out) {
                               c.edge_instants, c.forgetting, c.random_walk, c.p0, c.p0_offset, c.noise_variance,
                               { c.c[0], c.c[1] }, c.edge_codes, c.code_low, c.code_high, c.trigger.kind,
                               c.trigger.ceiling, c.trigger.hold_off_n, c.trigger.warm_up_n, c.trigger.absolute,
-                              c.trigger.reset };
+                              c.trigger.reset, 0 };
 }
 
 /* theta: (n, est_theta_count()); returns whether the invariants held after every sample. */

@@ -26,7 +26,7 @@ STRICT = [
 ]
 COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes")
 
-NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM = range(4)
+NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
 UPDATED, MISSING, REFUSED, GATHERING = range(4)
 LOCKED, MAY_SLIP, ANYWHERE = range(3)
 
@@ -42,7 +42,7 @@ class Config(ctypes.Structure):
         *((name, ctypes.c_double) for name in "forgetting random_walk p0 p0_offset noise_variance".split()),
         ("c", ctypes.c_double * 2),
         *((name, ctypes.c_double) for name in "edge_codes code_low code_high".split()),
-        *((name, ctypes.c_double) for name in "kind ceiling hold_off_n warm_up_n absolute reset".split()),
+        *((name, ctypes.c_double) for name in "kind ceiling hold_off_n warm_up_n absolute reset custom".split()),
     ]
 
 
@@ -111,10 +111,10 @@ class Estimator:
         return alarm, theta
 
 
-def compile_driver(folder: Path) -> Path:
-    """The driver as a shared library, with the strict warnings of the project."""
-    library = folder / "est_driver.so"
+def compile_driver(folder: Path, *options: str) -> Path:
+    """The driver as a shared library, with the strict warnings of the project; options come last."""
+    library = folder / f"est_driver_{len(list(folder.iterdir()))}.so"
     sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c"))]
-    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, "-shared", "-fPIC", f"-I{CORE}"]
+    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", f"-I{CORE}"]
     subprocess.run([*command, "-o", str(library), *map(str, sources)], check=True)
     return library

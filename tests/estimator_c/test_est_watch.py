@@ -1,0 +1,107 @@
+"""What the estimator makes of readings that come from no plant, and of a force that does not move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.estimator_c.est_driver import CUSTOM, GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.test_est_trigger import FRONT, suspension
+
+N = 800
+
+
+def front(seed: int = 3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return suspension([(0, FRONT)], np.arange(10.0, N, 50.0), N, 1.0, seed)
+
+
+def test_stuck_displacement_is_refused_from_the_stated_sample_on_until_it_moves(estimator: Estimator) -> None:
+    u, y = front()
+    y[400:600] = y[399]
+    assert estimator.init(stuck_n=16, kind=NONE)
+    result = estimator.run(u, y)
+    # The first edge of the stuck stretch comes at 410: that sample is the first of the sixteen.
+    assert (result.status[410:425] == UPDATED).all()
+    assert (result.status[425:600] == REFUSED).all()
+    assert (result.status[602:] == UPDATED).all()
+    assert result.theta[599].tobytes() == result.theta[424].tobytes()
+    assert (result.counters["stuck"], result.counters["refused"]) == (175, 175)
+
+
+def test_displacement_may_rest_while_the_force_does(estimator: Estimator) -> None:
+    u, y = np.zeros(300), np.full(300, 410.0)
+    assert estimator.init()
+    assert (estimator.run(u, y).status[2:] == UPDATED).all()
+
+
+def test_a_gap_does_not_make_a_stuck_displacement_good(estimator: Estimator) -> None:
+    u, y = front()
+    y[400:600] = y[399]
+    valid = np.ones(N)
+    valid[[450, 500, 501]] = 0
+    assert estimator.init(kind=NONE)
+    status = estimator.run(u, y, valid).status
+    assert (status[[450, 500, 501]] == MISSING).all()
+    assert (np.delete(status[425:600], [25, 75, 76]) == REFUSED).all()
+
+
+@pytest.mark.parametrize("channel", ["u", "y"])
+@pytest.mark.parametrize("code", [0.0, 4095.0])
+def test_reading_at_the_end_of_the_converter_is_saturated(estimator: Estimator, channel: str, code: float) -> None:
+    u, y = front()
+    u, y = u * 0.8 + 300.0, y * 0.8 + 300.0
+    (u if channel == "u" else y)[300] = code
+    assert estimator.init(code_low=0.0, code_high=4095.0, kind=NONE)
+    result = estimator.run(u, y)
+    assert result.status[299:304].tolist() == [UPDATED, REFUSED, GATHERING, GATHERING, UPDATED]
+    assert result.theta[300].tobytes() == result.theta[299].tobytes()
+    assert (result.counters["saturated"], result.counters["refused"]) == (1, 1)
+
+
+def test_absurd_reading_does_not_count_as_saturated(estimator: Estimator) -> None:
+    u, y = front()
+    u[300], y[350] = np.nan, 2e6
+    assert estimator.init(code_low=-10.0, code_high=4e3 + 100.0, kind=NONE)
+    counters = estimator.run(u, y).counters
+    assert (counters["saturated"], counters["refused"]) == (0, 2)
+
+
+def test_lost_excitation_is_reported_and_its_return(estimator: Estimator) -> None:
+    u, y = front()
+    u[361:700] = u[360]
+    assert estimator.init(idle_n=100, kind=NONE, stuck_n=0)
+    idle = estimator.run(u, y).idle
+    last, back = 360, 710  # the edges before and after
+    assert not idle[:last].any()
+    assert np.flatnonzero(idle).tolist() == list(range(last + 100, back))
+
+
+def test_own_trigger_is_asked_at_every_innovation_and_told_when_it_begins_anew(estimator: Estimator) -> None:
+    u, y = front()
+    assert not estimator.init(kind=CUSTOM)
+    assert estimator.init(kind=CUSTOM, custom=1, ceiling=100.0, warm_up_n=50, hold_off_n=10)
+    alarms = estimator.run(u, y).alarms
+    # Two samples gathered, 50 of warm-up; after an alarm two gathered and ten held.
+    assert alarms.tolist() == [151, 263, 375, 487, 599, 711]
+
+
+def test_variance_of_the_noise_is_followed(estimator: Estimator) -> None:
+    """1 LSB of Gaussian noise and rounding: 1 + 1/12; what clipping at three sigma costs is made up for."""
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 20_000.0, 50.0), 20_000, 1.0, 5)
+    assert estimator.init(noise_estimated=1, noise_variance=4.0)
+    assert estimator.run(u, y).noise_variance == pytest.approx(1.0 + 1.0 / 12.0, rel=0.15)
+
+
+def test_walking_parameters_are_followed_where_forgetting_nothing_is_stuck(estimator: Estimator) -> None:
+    """The spring softens by a quarter; with a random walk theta comes to it, without (and without trigger) not."""
+    changes = [(0, FRONT), (400, (115.0, 3021.0, 18000.0))]
+    u, y = suspension(changes, np.arange(10.0, 1600.0, 50.0), 1600, 0.5, 1)
+    gains = {}
+    for walk in (0.0, 1e-7):
+        assert estimator.init(kind=NONE, forgetting=1.0, random_walk=walk, refresh_n=0)
+        theta = estimator.run(u, y).theta[-1].astype(float)
+        gains[walk] = theta[2:5].sum() / (1.0 + theta[0] + theta[1])
+    true = (1.0 / 18000.0) * (2940.0 / 4096) / (0.1996 / 4096)
+    assert gains[1e-7] == pytest.approx(true, rel=0.04)
+    assert gains[0.0] < true * 0.93
