@@ -69,12 +69,12 @@ static bool codes_valid(const est_config_t* const config) {
 }
 
 static bool adaptive(const est_config_t* const config) {
-    return (config->nc > 0U) || config->noise_estimated || (config->refresh_n > 0U) || (config->random_walk > 0.0F);
+    return (config->nc > 0U) || config->noise_estimated || (config->random_walk > 0.0F);
 }
 
 static bool in_this_build(const est_config_t* const config) {
     return (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
-           (EST_WITH_ADAPTATION || !adaptive(config)) &&
+           (EST_WITH_ADAPTATION || (!adaptive(config) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
 
@@ -120,9 +120,14 @@ static void restart(est_t* const self, const uint8_t pending_n) {
     self->pending_n = larger(self->pending_n, pending_n);
 }
 
-/// One sample less to come before the next equation is complete.
+/// One sample less to come before the next equation is complete. What an alarm leaves to do is done here, where there is time:
+/// the step that raises it is long enough.
 static void gather(est_t* const self) {
     self->pending_n--;
+    if (self->afresh) {
+        self->afresh = false;
+        est_factors_reset(&self->factors, self->config);
+    }
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
         count(&self->counters.restarts);
@@ -201,7 +206,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
         count(&self->counters.stuck);
         return EST_REFUSED;
     }
-    if (EST_WITH_WATCH) {
+    if (EST_WITH_WATCH || EST_WITH_EDGES) {
         count(&self->idle_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
@@ -234,21 +239,24 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-static float predicted(const est_t* const self, const float* const phi, const float* const theta) {
-    float out = 0.0F;
-    for (uint8_t i = 0U; i < self->count; i++) {
-        out += phi[i] * theta[i];
+/// The residual of an equation.
+EST_INLINE float residual(const float* const phi, const float* const theta, const uint8_t n) {
+    float out = phi[n];
+    EST_UNROLL
+    for (uint8_t i = 0U; i < n; i++) {
+        out -= phi[i] * theta[i];
     }
     return out;
 }
 
 /// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
 /// they are taken against what was believed before the doubt.
-static void read_otherwise(est_t* const self, const float* const phi, float* const readings) {
-    const float e = phi[self->count] - predicted(self, phi, self->edges.theta);
+EST_INLINE void
+read_otherwise(est_t* const self, const est_shape_t shape, const float* const phi, float* const readings) {
+    const float e = residual(phi, self->edges.theta, est_shape_count(shape));
     float       early;
     float       late;
-    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
+    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, self->idle_n, &early, &late);
     readings[1] = e - early;
     readings[2] = e - late;
 }
@@ -257,7 +265,7 @@ static void read_otherwise(est_t* const self, const float* const phi, float* con
 static void keep_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
-        shift(self->residual, self->config->nc, phi[self->count] - predicted(self, phi, self->theta));
+        shift(self->residual, self->config->nc, residual(phi, self->theta, self->count));
     }
 #else
     (void)self;
@@ -285,10 +293,23 @@ static void refresh_prefilter(est_t* const self) {
         c[i]  = self->theta[i] * factor;
         moved = moved || !within(c[i] - self->whitener.c[i], -REFRESH_STEP, REFRESH_STEP);
     }
-    self->equations_n = 0U;
     if (moved && est_whitener_accepts(c, na)) {
         est_whitener_set(&self->whitener, c, na);
         count(&self->counters.refreshes);
+    }
+}
+
+/// Not while edges are in doubt: theta may have followed what did not happen.
+EST_INLINE void approach_refresh(est_t* const self) {
+    self->refresh_in--;
+    if (self->refresh_in > 0U) {
+        return;
+    }
+    if (self->edges.age_n > 0U) {
+        self->refresh_in = 1U;
+    } else {
+        self->refresh_in = self->config->refresh_n;
+        refresh_prefilter(self);
     }
 }
 
@@ -322,8 +343,8 @@ static void estimate_afresh(est_t* const self) {
     if (self->config->trigger.reset == EST_RESET_ALL) {
         zero(self->theta, self->count);
     }
-    self->equations_n = 0U;
-    est_factors_reset(&self->factors, self->config);
+    self->refresh_in = self->config->refresh_n;
+    self->afresh      = true;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
 }
 
@@ -363,10 +384,6 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     if (config->noise_estimated) {
         follow_noise(self, innovation, precision);
     }
-    count(&self->equations_n);
-    if ((config->refresh_n > 0U) && (self->equations_n >= config->refresh_n) && (self->edges.age_n == 0U)) {
-        refresh_prefilter(self);
-    }
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
@@ -378,10 +395,13 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     float readings[EST_READINGS];
     readings[0] = equation.innovation;
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        read_otherwise(self, equation.phi, readings);
+        read_otherwise(self, shape, equation.phi, readings);
     }
     const float precision =
         config->forgetting * est_equation_measure(&self->factors, config, shape, &equation, self->theta);
+    if (EST_WITH_ADAPTATION && (self->refresh_in > 0U)) {
+        approach_refresh(self);
+    }
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
     }
@@ -460,6 +480,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     *self                = (est_t){ .config = config };
     self->count          = est_shape_count(est_shape_of(config));
     self->adaptive       = adaptive(config);
+    self->refresh_in     = config->refresh_n;
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
     restart(self, past_n(config));

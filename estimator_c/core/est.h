@@ -239,9 +239,10 @@ typedef struct {
     const est_config_t* config;
     uint8_t             count;      ///< of parameters
     uint8_t             pending_n;  ///< samples to come before the next equation is complete
-    bool                adaptive;   ///< there is more to adapt than theta
+    bool                adaptive;   ///< there is more to adapt than theta and C
+    bool                afresh;     ///< P is to be reset before the next equation
     bool                known;      ///< the sample before this one is known
-    uint16_t            equations_n;     ///< since the last reset of the covariance or refresh of C
+    uint16_t            refresh_in;  ///< equations to come before C is taken from A; 0: never
     uint16_t            same_n;          ///< samples since an edge of u for which y has been the same
     uint16_t            idle_n;          ///< samples since the last edge of u
     float               noise_variance;  ///< [codes^2]
