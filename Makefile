@@ -7,6 +7,7 @@ BUILD ?= build
 JOBS ?= 2
 ARGS ?=
 PYTEST_ARGS ?=
+FUZZ_S ?= 60
 STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
@@ -24,7 +25,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench fuzz wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -53,6 +54,13 @@ format: $(PRODUCTS) ## lay out the Python sources
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
+	@mkdir -p $(BUILD)/fuzz/corpus
+	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
+	    -DEST_NC_MAX=2U -Iestimator_c/core estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c -o $(BUILD)/fuzz/fuzz_est
+	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
+	    then grep "^stat::" log; else tail -60 log; exit 1; fi
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

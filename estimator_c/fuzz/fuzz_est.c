@@ -1,0 +1,119 @@
+/// libFuzzer target over the public API of the core: any configuration, any samples; the invariants must hold after every
+/// step, and nothing may be read or written that is not there. `make fuzz` builds and runs it.
+
+#include "est.h"
+
+#include <stddef.h>
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct {
+    const uint8_t* bytes;
+    size_t         n;
+} input_t;
+
+static uint32_t word(input_t* const input) {
+    uint32_t value = 0U;
+    for (size_t i = 0U; i < sizeof(value); i++) {
+        value <<= 8U;
+        if (input->n > 0U) {
+            value |= *input->bytes++;
+            input->n--;
+        }
+    }
+    return value;
+}
+
+static uint8_t byte(input_t* const input) {
+    if (input->n == 0U) {
+        return 0U;
+    }
+    input->n--;
+    return *input->bytes++;
+}
+
+/// Half of them any bit pattern, half of them a code.
+static float number(input_t* const input) {
+    const uint8_t kind = byte(input);
+    if ((kind & 1U) != 0U) {
+        const uint32_t bits = word(input);
+        float          value;
+        memcpy(&value, &bits, sizeof(value));
+        return value;
+    }
+    return (float)((int32_t)(word(input) >> 20U) - ((kind & 2U) != 0U ? 2048 : 0)) / ((kind & 4U) != 0U ? 1024.0F : 1.0F);
+}
+
+static float trigger(void* const context, const float innovation, const float variance, const bool anew) {
+    (void)context;
+    return (anew || !(variance > 0.0F)) ? 0.0F : ((innovation * innovation) / variance);
+}
+
+/// Most values come from the defaults, or almost no configuration would be valid.
+static est_config_t configuration(input_t* const input) {
+    est_config_t config = est_config_default();
+    config.na           = (uint8_t)(byte(input) % (EST_NA_MAX + 2U));
+    config.nb           = (uint8_t)(byte(input) % (EST_NB_MAX + 2U));
+    config.nk           = (uint8_t)(byte(input) % (EST_NK_MAX + 2U));
+    config.nc           = (uint8_t)(byte(input) % (EST_NC_MAX + 2U));
+    const uint8_t flags      = byte(input);
+    config.offset            = (flags & 1U) != 0U;
+    config.noise_estimated   = (flags & 2U) != 0U;
+    config.trigger.absolute  = (flags & 4U) != 0U;
+    config.trigger.reset     = ((flags & 8U) != 0U) ? EST_RESET_ALL : EST_RESET_COVARIANCE;
+    config.trigger.custom    = ((flags & 16U) != 0U) ? trigger : 0;
+    config.refresh_n         = byte(input);
+    config.stuck_n           = byte(input);
+    config.idle_n            = byte(input);
+    config.trigger.hold_off_n = byte(input);
+    config.trigger.warm_up_n = byte(input);
+    config.trigger.kind      = (est_trigger_kind_t)(byte(input) % 6U);
+    config.edge_instants     = (est_edge_instants_t)(byte(input) % 4U);
+    float* const values[] = { &config.forgetting, &config.random_walk,  &config.p0,         &config.p0_offset,
+                              &config.c[0],       &config.noise_variance, &config.edge_codes, &config.code_low,
+                              &config.code_high,  &config.trigger.ceiling, &config.c[EST_NA_MAX - 1U] };
+    const uint32_t changed = word(input);
+    for (size_t i = 0U; i < (sizeof(values) / sizeof(values[0])); i++) {
+        if (((changed >> i) & 1U) != 0U) {
+            *values[i] = number(input);
+        }
+    }
+    return config;
+}
+
+static void expect(const bool holds) {
+    if (!holds) {
+        abort();
+    }
+}
+
+static bool number_is_finite(const float x) { return (x - x) == 0.0F; }
+
+int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
+    input_t            input  = { .bytes = data, .n = size };
+    const est_config_t config = configuration(&input);
+    est_t              estimator;
+    if (!est_init(&estimator, &config)) {
+        return 0;
+    }
+    expect(est_config_valid(&config) && est_invariants_hold(&estimator));
+    while (input.n > 0U) {
+        const uint8_t repeats = (uint8_t)(1U + (byte(&input) % 32U));
+        const bool    valid   = (byte(&input) % 16U) != 0U;
+        const float   u       = number(&input);
+        const float   y       = number(&input);
+        const float   drift   = number(&input);
+        for (uint8_t i = 0U; i < repeats; i++) {
+            const est_sample_t sample = { .u = u, .y = y + (drift * (float)i), .valid = valid };
+            const est_step_t   step   = est_step(&estimator, sample);
+            expect(est_invariants_hold(&estimator));
+            expect(number_is_finite(step.innovation) && number_is_finite(step.statistic));
+        }
+    }
+    for (uint8_t i = 0U; i < est_theta_count(&estimator); i++) {
+        expect(number_is_finite(est_theta(&estimator, i)) && (est_variance(&estimator, i) >= 0.0F));
+    }
+    expect(est_noise_variance(&estimator) > 0.0F);
+    (void)est_counters(&estimator);
+    return 0;
+}
