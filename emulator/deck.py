@@ -499,15 +499,9 @@ class _Reading:
             circuit = Circuit(elements)
             Nodal(circuit).at({})
         except EmulatorError as error:
-            raise type(error)(f"{self._where(str(error), elements, cards)}: {error}") from error
+            line = f":{cards[error.element].line}" if error.element in cards else ""
+            raise type(error)(f"{self._name}{line}: {error}") from error
         return circuit
-
-    def _where(self, message: str, elements: Sequence[Element], cards: Mapping[str, Card]) -> str:
-        """The file, and the line of the element (or of the first one at the node) that a message names."""
-        names = re.match(r"(?:pot|[A-Z]\w*) (\w+)", message) or re.search(r"the current of (\w+)", message)
-        node = re.search(r"the node (\w+)", message)
-        name = names[1] if names else next((e.name for e in elements if node and node[1] in e.nodes), "")
-        return f"{self._name}:{cards[name].line}" if name in cards else self._name
 
 
 def _library() -> dict[str, Definition]:

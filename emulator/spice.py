@@ -29,7 +29,6 @@ from .circuit import (
     Resistor,
     Switch,
     VoltageSource,
-    constant_of,
 )
 from .errors import CircuitError
 from .excitation import TICKS_PER_SAMPLE, Edges
@@ -198,7 +197,7 @@ class _Writer:
                 yield self._instance("switch", card, element.nodes, on=on, off=off, closed=closed)
 
     def _source(self, card: str, source: VoltageSource | CurrentSource) -> Iterator[str]:
-        head, level = f"{card} {source.plus} {source.minus}", constant_of(source)
+        head, level = f"{card} {source.plus} {source.minus}", source.constant
         if level is None:
             yield from _stepped(head, *_levels(self._edges.get(source.name, Edges.none()), self._period_s))
         else:
