@@ -337,9 +337,9 @@ def _check_names(elements: tuple[Element, ...]) -> None:
     nodes: dict[str, str] = {}
     for element in elements:
         if not _NAME.fullmatch(element.name):
-            raise CircuitError(f"element name {element.name!r}: only letters, digits and _ are allowed")
+            raise refused(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
         if element.name.lower() in names:
-            raise CircuitError(f"two elements are called {element.name!r}")
+            raise refused(element, f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
             if nodes.get(node.lower()) == node:
