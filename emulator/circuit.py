@@ -10,7 +10,9 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias, TypeVar
+from itertools import pairwise
+from numbers import Real
+from typing import ClassVar, TypeAlias, TypeVar
 
 from .errors import CircuitError
 from .opamp import OpAmpModel
@@ -29,6 +31,7 @@ __all__ = [
     "Switch",
     "VoltageSource",
     "label",
+    "refused",
 ]
 
 GROUND = "0"
@@ -37,13 +40,39 @@ _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
 @dataclass(frozen=True)
-class Resistor:
-    """ohm between nodes a and b."""
+class _Part:
+    """What every element has: a name, and which of its fields must be what for it to be possible."""
+
+    positive: ClassVar[tuple[str, ...]] = ()
+    finite: ClassVar[tuple[str, ...]] = ()
+    """Fields that must be numbers, where they are given at all."""
 
     name: str
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        raise NotImplementedError
+
+    @property
+    def bonds(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of nodes of which it holds either at a voltage once the other is held."""
+        raise NotImplementedError
+
+    @property
+    def spans(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of nodes that must not be the same."""
+        return self.bonds
+
+    @property
+    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
+        """The bonds between which it lets whatever current flow without the voltage giving way."""
+        return ()
+
+
+@dataclass(frozen=True)
+class _TwoEnded(_Part):
     a: str
     b: str
-    ohm: float
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -55,28 +84,33 @@ class Resistor:
 
 
 @dataclass(frozen=True)
-class Capacitor:
+class Resistor(_TwoEnded):
+    """ohm between nodes a and b."""
+
+    positive = ("ohm",)
+
+    ohm: float
+
+
+@dataclass(frozen=True)
+class Capacitor(_TwoEnded):
     """farad between nodes a and b; its state is v(a) - v(b)."""
 
-    name: str
-    a: str
-    b: str
+    positive = ("farad",)
+
     farad: float
 
     @property
-    def nodes(self) -> tuple[str, ...]:
-        return self.a, self.b
-
-    @property
-    def bonds(self) -> tuple[tuple[str, str], ...]:
-        return ((self.a, self.b),)
+    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
+        return self.bonds
 
 
 @dataclass(frozen=True)
-class Pot:
+class Pot(_Part):
     """A track of track_ohm from top to bottom; dial 0 puts the wiper at the bottom, 1 at the top."""
 
-    name: str
+    positive = ("track_ohm",)
+
     top: str
     wiper: str
     bottom: str
@@ -93,10 +127,9 @@ class Pot:
 
 
 @dataclass(frozen=True)
-class OpAmp:
+class OpAmp(_Part):
     """An op-amp; its state, if the model has one, is the voltage behind the output resistance."""
 
-    name: str
     plus: str
     minus: str
     out: str
@@ -111,46 +144,73 @@ class OpAmp:
         # The inputs draw no current, so they hold no node at a voltage.
         return ((self.out, GROUND),)
 
+    @property
+    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
+        # Without a pole the loop gain divides the output resistance.
+        ohm = self.model.rout_ohm if self.model.has_state else self.model.rout_ohm / self.model.avol
+        return () if ohm > 0 else self.bonds
+
 
 @dataclass(frozen=True)
-class VoltageSource:
-    """v(plus) - v(minus): an input of the circuit, or, when dc_v is given, a constant."""
-
-    name: str
+class _Source(_Part):
     plus: str
     minus: str = GROUND
-    dc_v: float | None = None
 
     @property
     def nodes(self) -> tuple[str, ...]:
         return self.plus, self.minus
+
+    @property
+    def constant(self) -> float | None:
+        """Its level when that is a constant [V or A]; None for an input of the circuit."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class VoltageSource(_Source):
+    """v(plus) - v(minus): an input of the circuit, or, when dc_v is given, a constant."""
+
+    finite = ("dc_v",)
+
+    dc_v: float | None = None
 
     @property
     def bonds(self) -> tuple[tuple[str, str], ...]:
         return ((self.plus, self.minus),)
 
+    @property
+    def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
+        return self.bonds
+
+    @property
+    def constant(self) -> float | None:
+        return self.dc_v
+
 
 @dataclass(frozen=True)
-class CurrentSource:
+class CurrentSource(_Source):
     """A current from node plus through the source to node minus: an input of the circuit [A], or, when dc_a is given, a
     constant. It holds no node at a voltage."""
 
-    name: str
-    plus: str
-    minus: str = GROUND
-    dc_a: float | None = None
+    finite = ("dc_a",)
 
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        return self.plus, self.minus
+    dc_a: float | None = None
 
     @property
     def bonds(self) -> tuple[tuple[str, str], ...]:
         return ()
 
+    @property
+    def spans(self) -> tuple[tuple[str, str], ...]:
+        return ((self.plus, self.minus),)
+
+    @property
+    def constant(self) -> float | None:
+        return self.dc_a
+
 
 @dataclass(frozen=True)
-class DiodeLimiter:
+class DiodeLimiter(_TwoEnded):
     """A diode of straight pieces from a to b.
 
     With v = v(a) - v(b) it passes, in A,
@@ -160,20 +220,12 @@ class DiodeLimiter:
     Two of them back to back, from a to b and from b to a, limit both ways.
     """
 
-    name: str
-    a: str
-    b: str
+    positive = ("on_ohm", "off_ohm")
+    finite = ("threshold_v",)
+
     threshold_v: float
     on_ohm: float
     off_ohm: float
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        return self.a, self.b
-
-    @property
-    def bonds(self) -> tuple[tuple[str, str], ...]:
-        return ((self.a, self.b),)
 
     @property
     def excess_siemens(self) -> float:
@@ -182,23 +234,14 @@ class DiodeLimiter:
 
 
 @dataclass(frozen=True)
-class Switch:
+class Switch(_TwoEnded):
     """on_ohm between nodes a and b when closed, off_ohm when open."""
 
-    name: str
-    a: str
-    b: str
+    positive = ("on_ohm", "off_ohm")
+
     on_ohm: float
     off_ohm: float
     closed: bool
-
-    @property
-    def nodes(self) -> tuple[str, ...]:
-        return self.a, self.b
-
-    @property
-    def bonds(self) -> tuple[tuple[str, str], ...]:
-        return ((self.a, self.b),)
 
     def ohm(self, *, closed: bool) -> float:
         """Its resistance in that position."""
@@ -211,28 +254,14 @@ _E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource
 _LEAST = 1e-100
 """Of ohms and farads, so that no reciprocal of theirs, nor of an end stop's part of a track, overflows."""
 
-_POSITIVE: Mapping[type, tuple[str, ...]] = {
-    Resistor: ("ohm",),
-    Capacitor: ("farad",),
-    Pot: ("track_ohm",),
-    DiodeLimiter: ("on_ohm", "off_ohm"),
-    Switch: ("on_ohm", "off_ohm"),
-}
-
-
-_FINITE: Mapping[type, tuple[str, ...]] = {
-    VoltageSource: ("dc_v",),
-    CurrentSource: ("dc_a",),
-    DiodeLimiter: ("threshold_v",),
-}
-
 
 @dataclass(frozen=True)
 class Circuit:
     """A checked netlist.
 
-    Raises CircuitError for duplicate or malformed names, values that are not positive, an element across a single node,
-    nodes that nothing holds at a voltage, and op-amps without feedback; PotError for a dial off its track.
+    Raises CircuitError for duplicate or malformed names, values that are not positive or no numbers, an element across
+    a single node, nodes that nothing holds at a voltage, loops without resistance, and op-amps without feedback;
+    PotError for a dial off its track. The message begins with the element and its nodes.
     """
 
     elements: tuple[Element, ...]
@@ -243,6 +272,7 @@ class Circuit:
         for element in self.elements:
             _check_element(element)
         _check_nodes(self.elements)
+        _check_loops(self.elements)
         _check_feedback(self.elements)
 
     @property
@@ -255,7 +285,7 @@ class Circuit:
     def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
         """The sources that are no constants: volts or amperes from outside, in netlist order."""
         sources = (element for element in self.elements if isinstance(element, VoltageSource | CurrentSource))
-        return tuple(source for source in sources if constant_of(source) is None)
+        return tuple(source for source in sources if source.constant is None)
 
     def of(self, kind: type[_E]) -> tuple[_E, ...]:
         """The elements of one kind, in netlist order."""
@@ -266,10 +296,7 @@ class Circuit:
 
         Raises CircuitError for a switch that is not there.
         """
-        known = {switch.name for switch in self.of(Switch)}
-        for name in closed:
-            if name not in known:
-                raise CircuitError(f"no switch is called {name!r}; there are {', '.join(sorted(known)) or 'none'}")
+        _check_known("switch", closed, self.of(Switch))
         return Circuit(
             replace(element, closed=closed[element.name])
             if isinstance(element, Switch) and element.name in closed
@@ -279,10 +306,7 @@ class Circuit:
 
     def with_dials(self, dials: Mapping[str, float]) -> Circuit:
         """The same circuit with the pots named in dials set anew. Raises CircuitError for a pot that is not there."""
-        known = {pot.name for pot in self.of(Pot)}
-        for name in dials:
-            if name not in known:
-                raise CircuitError(f"no pot is called {name!r}; there are {', '.join(sorted(known)) or 'none'}")
+        _check_known("pot", dials, self.of(Pot))
         return Circuit(
             replace(element, dial=dials[element.name])
             if isinstance(element, Pot) and element.name in dials
@@ -291,100 +315,145 @@ class Circuit:
         )
 
 
+def label(element: Element) -> str:
+    """How errors name an element: kind, name and nodes."""
+    return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"
+
+
+def refused(element: Element, why: str) -> CircuitError:
+    """The error that an element cannot be, or cannot be there."""
+    return CircuitError(f"{label(element)}: {why}", element=element.name)
+
+
+def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -> None:
+    known = sorted(element.name for element in elements)
+    for name in names:
+        if name not in known:
+            raise CircuitError(f"no {kind} is called {name!r}; there are {', '.join(known) or 'none'}")
+
+
 def _check_names(elements: tuple[Element, ...]) -> None:
     names: set[str] = set()
     nodes: dict[str, str] = {}
     for element in elements:
         if not _NAME.fullmatch(element.name):
-            raise CircuitError(f"element name {element.name!r}: only letters, digits and _ are allowed")
+            raise refused(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
         if element.name.lower() in names:
-            raise CircuitError(f"two elements are called {element.name!r}")
+            raise refused(element, f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
             if nodes.get(node.lower()) == node:
                 continue
             if not _NAME.fullmatch(node):
-                raise CircuitError(f"{label(element)}: node name {node!r}: only letters, digits and _ are allowed")
+                raise refused(element, f"node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
-                raise CircuitError(f"{label(element)}: nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+                raise refused(element, f"nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
 
 
 def _check_element(element: Element) -> None:
-    for a, b in (element.nodes,) if isinstance(element, CurrentSource) else element.bonds:
+    for a, b in element.spans:
         if a == b:
-            raise CircuitError(f"{label(element)}: both ends are on node {a}")
-    _check_values(element)
+            raise refused(element, f"both ends are on node {a}")
+    for field in (*element.positive, *element.finite):
+        _check_value(element, field)
     if isinstance(element, Pot):
         checked_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
-        raise CircuitError(f"{label(element)}: on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+        raise refused(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
 
 
-def _check_values(element: Element) -> None:
-    for field in _POSITIVE.get(type(element), ()):
-        value = getattr(element, field)
-        if not (math.isfinite(value) and value > 0):
-            raise CircuitError(f"{label(element)}: {field} must be positive and finite, got {value!r}")
-        if value < _LEAST:
-            raise CircuitError(f"{label(element)}: {field} must be at least {_LEAST:g}, got {value!r}")
-    for field in _FINITE.get(type(element), ()):
-        value = getattr(element, field)
-        if value is not None and not math.isfinite(value):
-            raise CircuitError(f"{label(element)}: {field} must be finite, got {value!r}")
+def _check_value(element: Element, field: str) -> None:
+    value = getattr(element, field)
+    if value is None and field in element.finite:
+        return
+    number = isinstance(value, Real) and math.isfinite(value)
+    if field in element.finite and not number:
+        raise refused(element, f"{field} must be finite, got {value!r}")
+    if field in element.positive and not (number and value > 0):
+        raise refused(element, f"{field} must be positive and finite, got {value!r}")
+    if field in element.positive and value < _LEAST:
+        raise refused(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
-    """Every node must have a path to ground that can hold its voltage (found by growing the set of grounded nodes)."""
-    neighbours: dict[str, list[str]] = {}
-    for element in elements:
-        for a, b in element.bonds:
-            neighbours.setdefault(a, []).append(b)
-            neighbours.setdefault(b, []).append(a)
-    grounded, front = {GROUND}, [GROUND]
-    while front:
-        reached = [node for node in neighbours.get(front.pop(), ()) if node not in grounded]
-        grounded.update(reached)
-        front += reached
+    """Every node must have a path to ground that can hold its voltage."""
+    grounded = _reached(GROUND, _ways(bond for element in elements for bond in element.bonds))
     for element in elements:
         for node in element.nodes:
             if node not in grounded:
-                raise CircuitError(f"{label(element)}: node {node} floats: no path to ground holds its voltage")
+                raise refused(element, f"node {node} floats: no path to ground holds its voltage")
+
+
+def _check_loops(elements: tuple[Element, ...]) -> None:
+    """Sources, capacitors and op-amps that hold their voltages whatever the current must not form a loop.
+
+    Nothing would determine the current around it. (Nodes are merged as such elements join them: Kruskal's forest.)
+    """
+    joined: dict[str, str] = {}
+    for count, element in enumerate(elements):
+        for a, b in element.rigid_bonds:
+            one, other = _root(a, joined), _root(b, joined)
+            if one == other:
+                others = ", ".join(_names_between(a, b, elements[:count]))
+                raise refused(element, f"closes a loop without resistance from node {a} to node {b} with {others}")
+            joined[one] = other
+
+
+def _root(node: str, joined: dict[str, str]) -> str:
+    while node in joined:
+        joined[node] = joined.get(joined[node], joined[node])  # halves the way for the next search
+        node = joined[node]
+    return node
+
+
+def _names_between(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
+    """The rigid elements by which node a is joined to node b, in order; there is one such way at most."""
+    rigid = [(element.name, bond) for element in elements for bond in element.rigid_bonds]
+    ways = _ways(bond for _, bond in rigid)
+    names = {frozenset(bond): name for name, bond in rigid}
+    before, front = {a: a}, [a]
+    while b not in before:
+        node = front.pop()
+        fresh = [near for near in ways[node] if near not in before]
+        before |= dict.fromkeys(fresh, node)
+        front += fresh
+    path = [b]
+    while path[-1] != a:
+        path.append(before[path[-1]])
+    return [names[frozenset(pair)] for pair in pairwise(reversed(path))]
 
 
 def _check_feedback(elements: tuple[Element, ...]) -> None:
     """Every op-amp's output must act on one of its own inputs, through whatever elements."""
-    acts: dict[str, list[str]] = {}
-    for element in elements:
-        if isinstance(element, OpAmp):
-            pairs = [(element.plus, element.out), (element.minus, element.out)]
-        else:
-            pairs = [pair for a, b in element.bonds for pair in ((a, b), (b, a))]
-        for cause, effect in pairs:
-            if GROUND not in {cause, effect}:
-                acts.setdefault(cause, []).append(effect)
+    acts = _ways(
+        bond for element in elements if not isinstance(element, OpAmp) for bond in element.bonds if GROUND not in bond
+    )
+    for amp in elements:
+        if isinstance(amp, OpAmp):
+            for node in {amp.plus, amp.minus} - {GROUND}:
+                acts.setdefault(node, []).append(amp.out)
     for amp in elements:
         if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reached(amp.out, acts):
-            raise CircuitError(
-                f"{label(amp)}: no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
-                f" {amp.plus} and {amp.minus}"
+            raise refused(
+                amp,
+                f"no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
+                f" {amp.plus} and {amp.minus}",
             )
 
 
-def _reached(start: str, acts: Mapping[str, Sequence[str]]) -> set[str]:
+def _ways(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """The neighbours of each node."""
+    ways: dict[str, list[str]] = {}
+    for a, b in bonds:
+        ways.setdefault(a, []).append(b)
+        ways.setdefault(b, []).append(a)
+    return ways
+
+
+def _reached(start: str, ways: Mapping[str, Sequence[str]]) -> set[str]:
     reached, front = {start}, [start]
     while front:
-        for effect in acts.get(front.pop(), ()):
-            if effect not in reached:
-                reached.add(effect)
-                front.append(effect)
+        fresh = [node for node in ways.get(front.pop(), ()) if node not in reached]
+        reached.update(fresh)
+        front += fresh
     return reached
-
-
-def constant_of(source: VoltageSource | CurrentSource) -> float | None:
-    """The level of a source that is a constant [V or A]; None for an input."""
-    return source.dc_v if isinstance(source, VoltageSource) else source.dc_a
-
-
-def label(element: Element) -> str:
-    """How errors name an element: kind, name and nodes."""
-    return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"

@@ -15,7 +15,11 @@ __all__ = ["CircuitError", "EmulatorError", "EngineError", "ExcitationError", "M
 
 
 class EmulatorError(Exception):
-    """Base of everything that the emulator raises on purpose."""
+    """Base of everything that the emulator raises on purpose; element: the name of the one at fault, if any."""
+
+    def __init__(self, message: str = "", *, element: str = "") -> None:
+        super().__init__(message)
+        self.element = element
 
 
 class CircuitError(EmulatorError):

@@ -36,7 +36,7 @@ from .circuit import (
     Resistor,
     Switch,
     VoltageSource,
-    constant_of,
+    refused,
 )
 from .errors import CircuitError
 from .opamp import CLAMP_RATE
@@ -148,6 +148,7 @@ class Nodal:
     """
 
     def __init__(self, circuit: Circuit) -> None:
+        self._elements = circuit.elements
         self._pots = circuit.of(Pot)
         self._switches = circuit.of(Switch)
         self._limiters = circuit.of(DiodeLimiter)
@@ -160,7 +161,7 @@ class Nodal:
         branches += [amp.name for amp in circuit.of(OpAmp) if not (amp.model.has_state and amp.model.rout_ohm > 0)]
 
         self._nodes = circuit.nodes
-        self._unknowns = [f"node {node}" for node in self._nodes] + [f"current of {name}" for name in branches]
+        self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
         # Ground has the last row and column, which are left out of the solution.
         self._row = {node: i for i, node in enumerate(self._nodes)} | {GROUND: len(self._unknowns)}
         self._branch = {name: len(self._nodes) + i for i, name in enumerate(branches)}
@@ -259,7 +260,7 @@ class Nodal:
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
         """The column of what drives a source, and by how much: the constant's, or that of an input."""
-        level = constant_of(source)
+        level = source.constant
         if level is None:
             return len(self._state) + self._inputs.index(source), 1.0
         return self._columns - 1, level
@@ -325,8 +326,14 @@ class Nodal:
         solution[:size] = right[:size]
         failed = library.load().engine_solve(size, right.shape[1], matrix.ctypes.data, solution.ctypes.data)
         if failed >= 0:
-            raise CircuitError(f"the circuit is singular: nothing determines the {self._unknowns[failed]}")
+            raise self._singular(failed)
         return solution
+
+    def _singular(self, unknown: int) -> CircuitError:
+        """The error for what nothing determines: a node, named with the first element at it, or a current."""
+        what, name = self._unknowns[unknown]
+        element = next(part for part in self._elements if name in (part.nodes if what == "node" else (part.name,)))
+        return refused(element, f"the circuit is singular: nothing determines the {what} {name}")
 
     def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         """[A B c], G, [C D e] and P."""

@@ -30,7 +30,7 @@ END_FRACTION = 1e-6
 def checked_dial(dial: float, name: str = "pot") -> float:
     """The dial itself when it is within 0..1, else PotError."""
     if not 0.0 <= dial <= 1.0:
-        raise PotError(f"pot {name}: dial {dial!r} is beyond the track (0 to 1)")
+        raise PotError(f"pot {name}: dial {dial!r} is beyond the track (0 to 1)", element=name)
     return dial
 
 

@@ -9,7 +9,21 @@ from typing import Any
 
 import pytest
 
-from emulator import IDEAL, Capacitor, Circuit, CircuitError, OpAmp, OpAmpModel, Pot, PotError, Resistor, VoltageSource
+from emulator import (
+    IDEAL,
+    Capacitor,
+    Circuit,
+    CircuitError,
+    CurrentSource,
+    DiodeLimiter,
+    OpAmp,
+    OpAmpModel,
+    Pot,
+    PotError,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
 from emulator.circuit import Element
 from emulator.opamp import preset
 
@@ -32,6 +46,15 @@ SOURCE = VoltageSource("V1", "in")
         ([SOURCE, Resistor("R 1", "in", "0", 1e3)], "element name 'R 1'"),
         ([SOURCE, Resistor("R1", "in", "a;b", 1e3)], "node name 'a;b'"),
         ([SOURCE, VoltageSource("V2", "a", dc_v=math.inf)], r"VoltageSource V2 \(a 0\): dc_v must be finite"),
+        ([CurrentSource("I1", "0", "0")], r"CurrentSource I1 \(0 0\): both ends are on node 0"),
+        (
+            [SOURCE, CurrentSource("I1", "in", dc_a=math.nan)],
+            r"CurrentSource I1 \(in 0\): dc_a must be finite, got nan",
+        ),
+        ([SOURCE, Resistor("R1", "in", "0", "1k")], r"Resistor R1 \(in 0\): ohm must be positive and finite, got '1k'"),  # type: ignore[arg-type]
+        ([SOURCE, Pot("P1", "in", "w", "0", math.inf, 0.5)], r"Pot P1 \(in w 0\): track_ohm must be positive"),
+        ([SOURCE, DiodeLimiter("D1", "in", "0", math.nan, 1.0, 1e9)], "DiodeLimiter D1 .*threshold_v must be finite"),
+        ([SOURCE, Switch("S1", "in", "0", 10.0, 1.0, closed=True)], "Switch S1 .*on_ohm 10.0 exceeds off_ohm 1.0"),
     ],
 )
 def test_a_wrong_netlist_is_refused_naming_element_and_node(elements: list[Element], message: str) -> None:
@@ -61,6 +84,37 @@ def test_the_cost_of_checking_a_ladder_grows_linearly_with_its_length() -> None:
         return count
 
     assert lines(800) < 9 * lines(100)
+
+
+@pytest.mark.parametrize(
+    ("elements", "message"),
+    [
+        ([SOURCE, VoltageSource("V2", "in", dc_v=1.0)], r"VoltageSource V2 \(in 0\): .* node in to node 0 with V1"),
+        (
+            [SOURCE, VoltageSource("V2", "b", "a"), Capacitor("C1", "in", "a", 1e-9), Capacitor("C2", "0", "b", 1e-9)],
+            r"Capacitor C2 \(0 b\): closes a loop without resistance from node 0 to node b with V1, C1, V2",
+        ),
+        ([Capacitor("C1", "a", "0", 1e-9), Capacitor("C2", "0", "a", 1e-9)], r"Capacitor C2 \(0 a\): .* with C1"),
+        (
+            [SOURCE, OpAmp("U1", "in", "a", "a", IDEAL), OpAmp("U2", "in", "a", "a", OpAmpModel(gbw_hz=1e6))],
+            r"OpAmp U2 \(in a a\): closes a loop without resistance from node a to node 0 with U1",
+        ),
+    ],
+)
+def test_a_loop_without_resistance_is_refused_naming_what_is_in_it(elements: list[Element], message: str) -> None:
+    with pytest.raises(CircuitError, match=message):
+        Circuit(elements)
+
+
+def test_amplifiers_with_output_resistance_may_join_their_outputs() -> None:
+    model = OpAmpModel(avol=1e5, gbw_hz=1e6, rout_ohm=100.0)
+    Circuit([SOURCE, OpAmp("U1", "in", "a", "a", model), OpAmp("U2", "in", "a", "a", model)])
+
+
+def test_an_error_carries_the_name_of_the_element() -> None:
+    with pytest.raises(CircuitError) as caught:
+        Circuit([SOURCE, Resistor("R7", "in", "0", 0.0)])
+    assert caught.value.element == "R7"
 
 
 @pytest.mark.parametrize("dial", [-0.001, 1.001, math.nan])

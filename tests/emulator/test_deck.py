@@ -21,12 +21,14 @@ from emulator import (
     Excitation,
     OpAmp,
     OpAmpModel,
+    Pot,
     PotError,
     Resistor,
     SuspensionComputer,
     VoltageSource,
     read_deck,
 )
+from emulator.circuit import Element
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 
@@ -156,6 +158,17 @@ def test_names_keep_their_prefix_where_they_would_be_the_same_without() -> None:
     assert [element.name for element in deck.circuit.elements] == ["R_1", "C_1", "2"]
 
 
+def test_an_element_may_be_called_as_the_source_of_a_dial_would_be() -> None:
+    elements: list[Element] = [
+        VoltageSource("V1", "in"),
+        Pot("K", "in", "w", "0", 1e4, 0.5),
+        Resistor("dial_K", "w", "0", 1e3),
+    ]
+    deck = Deck(Circuit(elements), samples=9, turns=[(4, {"K": 0.25})])
+    read = read_deck(deck.text())
+    assert (read.circuit, read.turns) == (deck.circuit, deck.turns)
+
+
 def test_a_deck_may_have_its_own_subcircuit_of_a_name_in_the_library() -> None:
     deck = read_deck("t\n.subckt pot a b c\nR1 a b 1k\nR2 b c 1k\n.ends\nX1 in w 0 pot\nV1 in 0 DC 4\n.tran 1m 1m uic")
     assert deck.volts(["w"])[-1, 0] == pytest.approx(2.0)
@@ -178,8 +191,15 @@ HEAD = "t\nV1 in 0 DC 5\n"
         ("Q1 a b c bc547", "deck:3: Q1: transistors are not supported"),
         (".include /etc/passwd", "deck:3: .include: is not supported"),
         (".control\nshell ls\n.endc", "deck:3: .control: is not supported"),
-        ("V2 in 0 DC 4", "deck:3: the circuit is singular: nothing determines the current of V2"),
-        ("C1 in 0 1n", "deck:2: the circuit is singular: nothing determines the current of V1"),
+        (
+            "V2 in 0 DC 4",
+            r"deck:3: VoltageSource V2 \(in 0\): closes a loop without resistance from node in to node 0 with V1",
+        ),
+        ("C1 in 0 1n", r"deck:3: Capacitor C1 \(in 0\): closes a loop without resistance .* with V1"),
+        (
+            "R1 in o 1k\nX1 0 in o opamp_without_pole",
+            r"deck:4: OpAmp X1 \(0 in o\): the circuit is singular: nothing determines the",
+        ),
         ("R1 in 0 -1k", r"deck:3: Resistor R1 \(in 0\): ohm must be positive and finite, got -1000.0"),
         ("R1 in 0 nan", "deck:3: R1: no parameter is called 'nan'"),
         ("R1 in 0 1e999", "deck:3: R1: '1e999' is not a finite number"),
@@ -213,6 +233,10 @@ HEAD = "t\nV1 in 0 DC 5\n"
         ),
         (".ic v(q)=3", "deck:3: .ic: no node is called 'q'"),
         (".subckt a p\nR1 p m 1k\nR2 m 0 1k\n.ends\nX1 in a\nR1 in X1_m 1k", "node X1_m is also the node x1.m"),
+        (
+            ".subckt a p\nR1 p 0 1k\n.ends\n.subckt b p\nXb p a\n.ends\nXa in b\nXa_Xb in a",
+            r"deck:4: Resistor Xa_Xb_R1 \(in 0\): two elements are called 'Xa_Xb_R1'",
+        ),
         ("R1 in n+1 1k", "only letters, digits and _ are allowed"),
     ],
 )

@@ -21,6 +21,7 @@ from emulator import (
     VoltageSource,
 )
 from emulator.circuit import Element
+from emulator.opamp import preset
 from emulator.patching import Patch, patches
 
 Change = Callable[[list[Element]], Iterable[Element]]
@@ -101,7 +102,7 @@ def test_what_belongs_to_an_amplifier_is_none_of_its_inputs() -> None:
             VoltageSource("U1_minus_bias", "U1_minus_bias", dc_v=-65.0),
             Resistor("U1_minus_ohm", "s", "U1_minus_bias", 1e12),
             Resistor("RBIAS", "p", "0", 1e5),
-            OpAmp("U1", "p", "s", "out", IDEAL),
+            OpAmp("U1", "p", "s", "out", preset("tl07x")),
         ]
     )
     assert patches(circuit) == {"U1": Patch("U1", "s", "out", ("R1",), ("C1",))}
