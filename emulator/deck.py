@@ -40,6 +40,17 @@ MAX_WORK = 50_000
 
 MAX_SAMPLES = 10_000_000
 
+MAX_VALUES = 50_000_000
+"""Samples times nodes that are recorded at once: 400 MB."""
+
+MAX_EVENTS = 10_000_000
+"""Of one run; some minutes."""
+
+SLICE_SAMPLES = 1000
+
+SHORTEST_PERIOD_S = 1e-12
+LONGEST_PERIOD_S = 1e6
+
 
 @dataclass(frozen=True, eq=False)
 class Deck:
@@ -87,22 +98,36 @@ class Deck:
         nodal = Nodal(self.circuit)
         dials: dict[str, float] = {}
         system = nodal.at(dials)
-        engine = Engine(system, self.circuit.nodes if nodes is None else nodes, self.sample_rate_hz)
+        recorded = self.circuit.nodes if nodes is None else nodes
+        engine = Engine(system, recorded, self.sample_rate_hz)
         engine.state = np.array([self.initial_v.get(state, 0.0) for state in system.states])
-        blocks = []
+        volts = self._room(len(recorded))
         for sample, turned in [*sorted(self.turns, key=lambda turn: turn[0]), (self.samples - 1, {})]:
-            blocks.append(self._run(engine, sample + 1 - engine.recorded))
+            self._run(engine, sample + 1, volts)
             dials |= turned
             engine.set_system(nodal.at(dials))
-        return np.concatenate(blocks)
+        return volts
 
-    def _run(self, engine: Engine, samples: int) -> NDArray[np.float64]:
-        start, stop = engine.window(samples)
-        edges = {}
-        for name, train in self.edges.items():
-            first, last = np.searchsorted(train.ticks, (start, stop))
-            edges[name] = Edges(train.ticks[first:last], train.levels_v[first:last])
-        return engine.run(samples, edges)
+    def _room(self, nodes: int) -> NDArray[np.float64]:
+        if self.samples * nodes > MAX_VALUES:
+            raise CircuitError(
+                f"{self.samples} samples of {nodes} nodes: more than {MAX_VALUES} values; name fewer nodes"
+            )
+        return np.empty((self.samples, nodes))
+
+    def _run(self, engine: Engine, until: int, volts: NDArray[np.float64]) -> None:
+        """In slices, which change no bit: between two a run can be interrupted, and one without end be given up."""
+        while engine.recorded < until:
+            done = engine.recorded
+            samples = min(SLICE_SAMPLES, until - done)
+            start, stop = engine.window(samples)
+            edges = {}
+            for name, train in self.edges.items():
+                first, last = np.searchsorted(train.ticks, (start, stop))
+                edges[name] = Edges(train.ticks[first:last], train.levels_v[first:last])
+            volts[done : done + samples] = engine.run(samples, edges)
+            if engine.counts.events > MAX_EVENTS:
+                raise CircuitError(f"more than {MAX_EVENTS} events in {engine.recorded} samples: it oscillates")
 
 
 def read_deck(text: str, name: str = "deck") -> Deck:
@@ -155,6 +180,8 @@ class _Run:
             raise CircuitError("expected: sample period, end, 0, longest step, uic")
         if not times_s[0] > 0 or not times_s[1] >= 0:
             raise CircuitError("the sample period must be positive, and the end not negative")
+        if not SHORTEST_PERIOD_S <= times_s[0] <= LONGEST_PERIOD_S:
+            raise CircuitError(f"the sample period must be from {SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s")
         if times_s[1] / times_s[0] > MAX_SAMPLES:
             raise CircuitError(f"has more than {MAX_SAMPLES} samples")
         return cls(round(times_s[1] / times_s[0]) + 1, times_s[0])

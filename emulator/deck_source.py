@@ -43,10 +43,10 @@ def steps(shape: str, numbers: Sequence[float], stop_s: float) -> tuple[Step, ..
 
     Raises CircuitError for a level that ramps, for instants out of order, and for more than MAX_EDGES edges.
     """
-    return tuple(_pwl(numbers) if shape == "pwl" else _pulse(numbers, stop_s))
+    return tuple(_pwl(numbers, stop_s) if shape == "pwl" else _pulse(numbers, stop_s))
 
 
-def _pwl(numbers: Sequence[float]) -> Iterator[Step]:
+def _pwl(numbers: Sequence[float], end_s: float) -> Iterator[Step]:
     points = list(zip(numbers[::2], numbers[1::2], strict=False))
     if not points or len(numbers) % 2 or points[0][0] < 0:
         raise CircuitError("PWL needs pairs of an instant, from 0 s on, and a level")
@@ -56,7 +56,8 @@ def _pwl(numbers: Sequence[float]) -> Iterator[Step]:
             raise CircuitError(f"PWL: {stop_s:g} s does not come after {start_s:g} s")
         if before != after:
             _check_step(stop_s - start_s)
-            yield start_s, after
+            if start_s <= end_s:
+                yield start_s, after
 
 
 def _pulse(numbers: Sequence[float], stop_s: float) -> Iterator[Step]:

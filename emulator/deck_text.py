@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -11,6 +12,9 @@ from .errors import CircuitError, EmulatorError
 __all__ = ["MAX_NESTING", "Card", "Definition", "located", "parse"]
 
 MAX_CHARACTERS = 8 << 20
+
+MAX_ASSIGNMENTS = 50_000
+"""On one card."""
 
 MAX_NESTING = 20
 """Subcircuits within subcircuits."""
@@ -44,7 +48,9 @@ class Card:
         Braces and quotes hold together. Raises CircuitError for a name assigned twice, or text between assignments.
         """
         masked = _QUOTED.sub(lambda match: "#" * len(match.group()), self.text)
-        found = list(_ASSIGNMENT.finditer(masked))
+        found = list(itertools.islice(_ASSIGNMENT.finditer(masked), MAX_ASSIGNMENTS + 1))
+        if len(found) > MAX_ASSIGNMENTS:
+            raise CircuitError(f"has more than {MAX_ASSIGNMENTS} assignments")
         ends = [*(match.start() for match in found[1:]), len(self.text)][: len(found)]
         words = list(self._words(masked, found[0].start() if found else len(masked)))
         values: dict[str, str] = {}

@@ -329,3 +329,48 @@ def test_current_comes_out_of_a_sources_second_node() -> None:
 def test_bad_current_source_is_named(card: str, message: str) -> None:
     with pytest.raises(CircuitError, match=message):
         read_deck(f"title\nR1 a 0 1k\n{card}\n.tran 50u 1m uic\n.end\n")
+
+
+def test_level_that_is_to_come_long_after_the_end_does_not_come() -> None:
+    deck = read_deck("late\nV1 a 0 PWL(0 5 3000 5 3000.0000000005 1)\nR1 a 0 1k\n.tran 1n 5n uic\n.end\n")
+    assert deck.volts(["a"]).ravel().tolist() == [5.0] * 6
+
+
+@pytest.mark.parametrize("period", ["5e-324", "1e-13", "1e7"])
+def test_sample_period_beyond_all_reason_is_refused(period: str) -> None:
+    with pytest.raises(CircuitError, match="the sample period must be from 1e-12 to 1e.06 s"):
+        read_deck(f"period\nV1 a 0 1\nR1 a 0 1k\n.tran {period} {period} uic\n.end\n")
+
+
+def test_card_of_assignments_without_end_is_refused() -> None:
+    with pytest.raises(CircuitError, match="R1: has more than 50000 assignments"):
+        read_deck("many\nR1 " + "a=" * 100_000 + "\n.tran 50u 1m uic\n.end\n")
+
+
+def test_more_than_memory_should_hold_is_refused() -> None:
+    resistors = "\n".join(f"R{i} n{i} 0 1k\nV{i} n{i} 0 1" for i in range(20))
+    deck = read_deck(f"large\n{resistors}\n.tran 1u 9 uic\n.end\n")
+    with pytest.raises(CircuitError, match="9000001 samples of 20 nodes: more than 50000000 values; name fewer nodes"):
+        deck.volts()
+
+
+def test_slices_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = read_deck(INVERTER).volts()
+    monkeypatch.setattr("emulator.deck.SLICE_SAMPLES", 7)
+    assert read_deck(INVERTER).volts().tobytes() == whole.tobytes()
+
+
+def test_circuit_that_oscillates_without_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relaxation oscillator: some events a period of 0.2 ms, for ten seconds."""
+    text = """relaxation
+X1 p m out opamp
+R1 out p 10k
+R2 p 0 10k
+R3 out m 10k
+C1 m 0 10n IC=1
+.tran 50u 10 uic
+.end
+"""
+    monkeypatch.setattr("emulator.deck.MAX_EVENTS", 10_000)
+    with pytest.raises(CircuitError, match="more than 10000 events in [0-9]+ samples: it oscillates"):
+        read_deck(text).volts(["out"])
