@@ -24,11 +24,11 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench cost wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every other target does it when needed
 
@@ -53,6 +53,9 @@ format: $(PRODUCTS) ## lay out the Python sources
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json
+	@$(BIN)/python -m estimator_c.evidence.cost
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
