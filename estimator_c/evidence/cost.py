@@ -1,0 +1,329 @@
+"""What the estimator costs on a Cortex-M: instructions per step, bytes of code, bytes of state. `make cost`.
+
+Every block of code that QEMU executes is logged, and the instructions of a step are counted, from its first to its
+last: exact, and the same each time. The caller (the section .outside of image.ld) is not counted. Prints a table and
+writes build/cost.json, a list of {name, value, unit, limit, compared_with, ratio}.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+__all__ = ["Cost", "costs", "count_steps", "link", "main", "missing_tools"]
+
+HERE = Path(__file__).parent
+CORE = HERE.parent / "core"
+RESULTS = Path("build/cost.json")
+
+COMPILER = "arm-none-eabi-gcc"
+SIMULATOR = "qemu-system-arm"
+PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm"}
+
+FLAGS = (
+    *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
+    *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are unsigned here
+    *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}"),
+)
+
+EVEN = 1.2
+"""The worst step may take so many times the instructions of a typical one."""
+
+
+@dataclass(frozen=True)
+class Processor:
+    """One that code is made for, and the board of QEMU that runs it."""
+
+    name: str
+    flags: tuple[str, ...]
+    machine: str
+
+
+M4F = Processor("M4F", ("-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"), "mps2-an386")
+M3 = Processor("M3", ("-mcpu=cortex-m3",), "mps2-an385")
+M0 = Processor("M0", ("-mcpu=cortex-m0",), "mps2-an385")
+"""QEMU has no board of this kind with an M0, whose instructions are some of an M3's."""
+
+
+@dataclass(frozen=True)
+class Orders:
+    """na, nb, nk and the offset, of a generator on the card's clock or, with may_slip, on one of its own."""
+
+    na: int
+    nb: int
+    nk: int
+    offset: int
+    may_slip: bool = False
+
+    @property
+    def count(self) -> int:
+        """Of the parameters."""
+        return self.na + self.nb + self.offset
+
+    @property
+    def name(self) -> str:
+        """For the table."""
+        return f"n = {self.count}, edges {'may slip' if self.may_slip else 'locked'}"
+
+    def flags(self, *, fixed: bool) -> tuple[str, ...]:
+        """For the subject; and for the core, if it is to know them when it is compiled."""
+        orders = {"NA": self.na, "NB": self.nb, "NK": self.nk, "OFFSET": self.offset}
+        chosen = tuple(f"-DSUBJECT_{name}={value}U" for name, value in orders.items())
+        if not self.may_slip:
+            chosen += ("-DSUBJECT_LOCKED",)
+        if not fixed:
+            return chosen
+        return (*chosen, *(f"-DEST_FIXED_{name}={value}U" for name, value in {**orders, "NC": 0}.items()))
+
+
+SMALL = Orders(2, 2, 1, 0)
+LARGE = Orders(2, 3, 0, 1)
+FREE = Orders(2, 3, 0, 1, may_slip=True)
+"""The default configuration."""
+
+# A build with the default trigger and nothing that can be left out.
+TRIGGER_ALONE = tuple(f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH"))
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One line of the table. ratio: the value over the limit, or over what it is compared with."""
+
+    name: str
+    value: float
+    unit: str
+    limit: float | None = None
+    compared_with: str = ""
+    ratio: float | None = None
+
+    def __str__(self) -> str:
+        """A row of the table that is printed."""
+        row = f"{self.name:<58} {self.value:>6.6g} {self.unit:<12}"
+        if self.limit is not None:
+            row += f" {'within' if self.value <= self.limit else 'BEYOND'} {self.limit:g}"
+        if self.compared_with:
+            row += f" {self.ratio:.2f} times {self.compared_with}"
+        return row.rstrip()
+
+
+# ---- images
+
+
+def run(command: Sequence[str | Path]) -> str:
+    """What a tool prints; SystemExit with its complaint if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"cost: {' '.join(map(str, command[:1]))} failed:\n{done.stderr}")
+    return done.stdout
+
+
+def link(image: Path, sources: Iterable[Path], flags: Iterable[str]) -> Path:
+    """Compile and link the sources into the file ``image``; laid out by image.ld."""
+    script = HERE / "image.ld"
+    run([COMPILER, *FLAGS, *flags, "-T", script, *sources, "-lgcc", "-o", image])
+    return image
+
+
+def core_sources() -> list[Path]:
+    """The estimator, whatever files it has."""
+    return sorted(CORE.glob("*.c"))
+
+
+def symbols(image: Path) -> dict[str, tuple[int, int]]:
+    """Address and size of each symbol of an image; without the lowest bit, which stands for Thumb code."""
+    rows = (line.split() for line in run(["arm-none-eabi-nm", "-S", image]).splitlines())
+    sized = {row[-1]: (int(row[0], 16) & ~1, int(row[1], 16) if len(row) == 4 else 0) for row in rows if len(row) >= 3}
+    return {name: place for name, place in sized.items() if not name.startswith("$")}
+
+
+def section_bytes(image: Path, *names: str) -> int:
+    """The size of these sections together."""
+    rows = (line.split() for line in run(["arm-none-eabi-size", "-A", image]).splitlines())
+    return sum(int(row[1]) for row in rows if row and row[0] in names)
+
+
+# ---- instructions
+
+
+def _between(log: Iterable[bytes], ends: set[int]) -> Iterator[int]:
+    """The instructions executed from one of these addresses to the next.
+
+    QEMU disassembles each block of straight-line code once, after "IN:", and names it each time it executes it:
+    Trace 0: 0x7f.. [00000000/address/flags/flags] function
+    """
+    length: dict[int, int] = {}
+    block = count = 0
+    begun = False
+    for line in log:
+        if line.startswith(b"Trace "):
+            address = int(line.split(b"/", 2)[1], 16)
+            if address in ends:
+                if begun:
+                    yield count
+                begun, count = True, 0
+            count += length[address]
+        elif line.startswith(b"IN:"):
+            block = 0
+        elif line.startswith(b"0x"):
+            address = int(line[:10], 16)
+            block = block or address
+            length[block] = 1 if address == block else length[block] + 1
+
+
+def count_steps(image: Path, machine: str, step: str) -> list[int]:
+    """How many instructions each call of the function ``step`` took, in the order of the calls.
+
+    SystemExit if the image judges that its run was not what it is made for: subject_judge() in its source.
+    """
+    places = symbols(image)
+    first, last = places["measured_start"][0], places["measured_end"][0]
+    command = [
+        "timeout",
+        "120",
+        SIMULATOR,
+        "-M",
+        machine,
+        "-kernel",
+        str(image),
+        "-nographic",
+        "-monitor",
+        "none",
+        "-serial",
+        "null",
+    ]
+    command += ["-semihosting", "-d", "in_asm,exec,nochain", "-dfilter", f"{first:#x}..{last - 1:#x}"]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE) as simulator:
+        assert simulator.stderr is not None  # noqa: S101 - it is a pipe
+        counts = list(_between(simulator.stderr, {places[name][0] for name in (step, "after_last_step")}))
+    if simulator.returncode != 0:
+        raise SystemExit(
+            f"cost: {image.name} ended with status {simulator.returncode}: see subject_judge() in its source"
+        )
+    return counts
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The instructions of each step of a run, and what was run."""
+
+    name: str
+    counts: Sequence[int]
+
+    @property
+    def typical(self) -> float:
+        """The median."""
+        return statistics.median(self.counts)
+
+    def costs(self, limit: float | None, rival: Steps) -> Iterator[Cost]:
+        """The typical step, and how much longer the longest is."""
+        yield Cost(self.name, self.typical, "instructions", limit, rival.name, self.typical / rival.typical)
+        worst = max(self.counts)
+        yield Cost(
+            f"{self.name}, worst", worst, "instructions", EVEN * self.typical, "the typical step", worst / self.typical
+        )
+
+
+class Bench:
+    """Makes images in a folder, and runs them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def estimator(self, processor: Processor, orders: Orders, *, fixed: bool = False, alone: bool = False) -> Steps:
+        """The steps of the estimator; orders fixed at compile time or not, with all it can do or the trigger alone."""
+        name = f"{processor.name}, {orders.name}{', fixed' if fixed else ''}{', trigger alone' if alone else ''}"
+        sources = [HERE / "image.c", HERE / "subject_est.c", *core_sources()]
+        flags = (*orders.flags(fixed=fixed), *(TRIGGER_ALONE if alone else ()))
+        return self._steps(name, processor, sources, flags, "est_step")
+
+    def textbook(self, processor: Processor, n: int, *, factors: bool) -> Steps:
+        """The steps of a textbook's least squares."""
+        name = f"{processor.name}, n = {n}, textbook {'U-D' if factors else 'covariance'}"
+        flags = (f"-DTEXTBOOK_N={n}U", *(("-DTEXTBOOK_FACTORS",) if factors else ()))
+        return self._steps(name, processor, [HERE / "image.c", HERE / "textbook.c"], flags, "textbook_step")
+
+    def _steps(
+        self, name: str, processor: Processor, sources: Sequence[Path], flags: Sequence[str], step: str
+    ) -> Steps:
+        image = link(self._folder / "image.elf", sources, ("-O2", *processor.flags, *flags))
+        return Steps(name, count_steps(image, processor.machine, step))
+
+    def text_bytes(self, *flags: str) -> int:
+        """Code and constants of the core, without memset and memcpy of a C library."""
+        sources = [HERE / "footprint.c", *core_sources()]
+        image = link(self._folder / "footprint.elf", sources, ("-Os", *M4F.flags, *flags))
+        return section_bytes(image, ".text", ".rodata")
+
+    def state_bytes(self) -> int:
+        """sizeof(est_t)."""
+        image = link(self._folder / "footprint.elf", [HERE / "footprint.c", *core_sources()], ("-Os", *M4F.flags))
+        return symbols(image)["estimator"][1]
+
+
+# ---- the table
+
+
+def costs(folder: Path) -> Iterator[Cost]:
+    """Everything; images are made in ``folder``."""
+    bench = Bench(folder)
+    yield from instructions(bench)
+    yield from soft_float(bench)
+    for name, flags, limit in (
+        ("code of the core at -Os, everything", ("-DFOOTPRINT_ALL",), 4096),
+        ("code of the core at -Os, trigger alone", TRIGGER_ALONE, 1536),
+    ):
+        text_bytes = bench.text_bytes(*flags)
+        yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
+    state_bytes = bench.state_bytes()
+    yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
+
+
+def instructions(bench: Bench) -> Iterator[Cost]:
+    """On the M4F."""
+    rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
+    for orders, at_run_time, at_compile_time in ((SMALL, 400, 260), (LARGE, 750, 520), (FREE, 750, 520)):
+        rival = rivals[orders.count][1]
+        for fixed, limit in ((False, at_run_time), (True, at_compile_time)):
+            yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit, rival)
+            if not orders.may_slip:
+                yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit, rival)
+    for steps in (*rivals[4], *rivals[6]):
+        yield Cost(steps.name, steps.typical, "instructions")
+
+
+def soft_float(bench: Bench) -> Iterator[Cost]:
+    """On processors without floating point: libgcc's routines, whose length depends on the numbers."""
+    for processor in (M3, M0):
+        rivals = [bench.textbook(processor, SMALL.count, factors=factors) for factors in (False, True)]
+        yield from bench.estimator(processor, SMALL).costs(7000, rivals[1])
+        for steps in rivals:
+            yield Cost(steps.name, steps.typical, "instructions")
+
+
+def missing_tools() -> list[str]:
+    """The Debian packages that this machine lacks."""
+    return [package for program, package in PACKAGES.items() if shutil.which(program) is None]
+
+
+def main() -> None:
+    """Print the table and write the file."""
+    if missing_tools():
+        sys.exit(f"make cost needs a cross compiler and a simulator: apt-get install {' '.join(missing_tools())}")
+    measured = []
+    with tempfile.TemporaryDirectory() as folder:
+        for cost in costs(Path(folder)):
+            print(cost, flush=True)
+            measured.append(cost)
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps([asdict(cost) for cost in measured], indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

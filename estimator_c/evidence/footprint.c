@@ -1,0 +1,38 @@
+/// Uses what a program uses of the estimator, so that the linker keeps that and drops the rest; with -DFOOTPRINT_ALL the
+/// whole of its interface.
+
+#include "est.h"
+
+#include <stddef.h>
+
+#define OUTSIDE __attribute__((section(".outside"), used))
+
+est_t                 estimator;
+static est_config_t   config;
+static volatile float sink;
+
+OUTSIDE void reset(void) {
+    config = est_config_default();
+    (void)est_init(&estimator, &config);
+    const est_step_t step = est_step(&estimator, (est_sample_t){ .u = sink, .y = sink, .valid = true });
+    sink                  = step.statistic + est_theta(&estimator, 0U);
+#ifdef FOOTPRINT_ALL
+    sink = est_variance(&estimator, 0U) + est_noise_variance(&estimator);
+    sink = (float)(est_counters(&estimator).alarms + est_theta_count(&estimator));
+    sink = est_invariants_hold(&estimator) ? 1.0F : 0.0F;
+#endif
+}
+
+__attribute__((section(".library"), used)) void* memset(void* const to, const int value, const size_t n) {
+    for (size_t i = 0U; i < n; i++) {
+        ((volatile unsigned char*)to)[i] = (unsigned char)value;
+    }
+    return to;
+}
+
+__attribute__((section(".library"), used)) void* memcpy(void* const to, const void* const from, const size_t n) {
+    for (size_t i = 0U; i < n; i++) {
+        ((volatile unsigned char*)to)[i] = ((const unsigned char*)from)[i];
+    }
+    return to;
+}

@@ -1,0 +1,83 @@
+/// Bare metal for a Cortex-M: makes the samples of a realistic run, enters them one after another into a subject, and ends
+/// the simulation. What lies in the section .outside is not counted (see cost.py).
+
+#include "plant.h"
+#include "subject.h"
+
+#include <stddef.h>
+
+#define OUTSIDE __attribute__((section(".outside"), noinline, used))
+
+#define SAMPLES_N 600U
+#define MISSING_SAMPLE 330U
+#define LATE_SAMPLE 381U  ///< the edges of a drifting generator cross the sampling instant here
+#define SOFT_SAMPLE 480U  ///< the plant is another one from here on
+
+static plant_codes_t codes[SAMPLES_N];
+
+extern uint32_t stack_top;
+
+OUTSIDE void reset(void);
+
+__attribute__((section(".vectors"), used)) static const void* const vectors[16] = { &stack_top, (const void*)reset };
+
+#ifdef __ARM_FP
+OUTSIDE static void enable_fpu(void) {
+    *(volatile uint32_t*)0xE000ED88U |= 0xFUL << 20U;  // CPACR
+    __asm volatile("dsb\n isb");
+}
+#endif
+
+OUTSIDE static void make_samples(void) {
+    // the edges come at the very instants of samples
+    plant_t plant = plant_at_rest(PLANT_FRONT, 1U, 10U * PLANT_TICKS_PER_SAMPLE);
+    for (uint32_t k = 0U; k < SAMPLES_N; k++) {
+        plant.reads_first = subject_drifts && (k >= LATE_SAMPLE);
+        if (k == SOFT_SAMPLE) {
+            plant.mechanics = PLANT_FRONT_SOFT;
+        }
+        codes[k] = plant_next(&plant);
+    }
+}
+
+/// SYS_EXIT_EXTENDED of Arm's semihosting.
+OUTSIDE static void end_simulation(const uint32_t status) {
+    const uint32_t           block[2]              = { 0x20026U, status };
+    register uint32_t        operation __asm("r0") = 0x20U;
+    register const uint32_t* argument __asm("r1")  = block;
+    __asm volatile("bkpt 0xab" : : "r"(operation), "r"(argument) : "memory");
+    for (;;) {
+    }
+}
+
+/// Lies inside: the count of the last step ends here.
+__attribute__((noinline, used)) void after_last_step(void) { __asm volatile(""); }
+
+OUTSIDE void reset(void) {
+#ifdef __ARM_FP
+    enable_fpu();
+#endif
+    make_samples();
+    subject_begin();
+    for (uint32_t k = 0U; k < SAMPLES_N; k++) {
+        subject_enter((float)codes[k].u, (float)codes[k].y, k != MISSING_SAMPLE);
+    }
+    after_last_step();
+    end_simulation(subject_judge());
+}
+
+// The compiler calls these; they stand in for those of the C library.
+
+__attribute__((section(".library"), used)) void* memset(void* const to, const int value, const size_t n) {
+    for (size_t i = 0U; i < n; i++) {
+        ((volatile unsigned char*)to)[i] = (unsigned char)value;
+    }
+    return to;
+}
+
+__attribute__((section(".library"), used)) void* memcpy(void* const to, const void* const from, const size_t n) {
+    for (size_t i = 0U; i < n; i++) {
+        ((volatile unsigned char*)to)[i] = ((const unsigned char*)from)[i];
+    }
+    return to;
+}

@@ -1,0 +1,39 @@
+/// The estimator as a subject. With -DSUBJECT_LOCKED the generator is on the card's clock; -DSUBJECT_NA=2U, _NB, _NK and
+/// _OFFSET are the orders.
+
+#include "est.h"
+#include "subject.h"
+
+#ifdef SUBJECT_LOCKED
+const bool subject_drifts = false;
+#else
+const bool subject_drifts = true;
+#endif
+
+static est_t        estimator;
+static est_config_t config;
+
+const uint32_t subject_state_bytes = sizeof(est_t);
+
+SUBJECT void subject_begin(void) {
+    config        = est_config_default();
+    config.na     = SUBJECT_NA;
+    config.nb     = SUBJECT_NB;
+    config.nk     = SUBJECT_NK;
+    config.offset = SUBJECT_OFFSET;
+#ifdef SUBJECT_LOCKED
+    config.edge_instants = EST_EDGES_LOCKED;
+#endif
+    (void)est_init(&estimator, &config);  // a refusal leaves nothing to count, and subject_judge() says so
+}
+
+SUBJECT void subject_enter(const float u, const float y, const bool valid) {
+    (void)est_step(&estimator, (est_sample_t){ .u = u, .y = y, .valid = valid });
+}
+
+/// The change of the plant was seen, a drift was not taken for one, and the gap was a gap.
+SUBJECT uint32_t subject_judge(void) {
+    const est_counters_t counters = est_counters(&estimator);
+    return (est_invariants_hold(&estimator) ? 0U : 1U) | ((counters.alarms == 1U) ? 0U : 2U) |
+           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U);
+}
