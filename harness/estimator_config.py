@@ -55,7 +55,8 @@ class EstimatorConfig:
     refresh_n: int = 50
     """Take C from the estimate of A after so many equations, and each time A has moved; 0: never."""
     stuck_n: int = 16
-    """The displacement is stuck once it was the same for so many samples after an edge of the force; 0: never."""
+    """The displacement is stuck once it was the same for so many samples after an edge of the force, at most
+    255; 0: never."""
     idle_n: int = 1000
     """Excitation is lost once the force had no edge for so many samples; 0: never."""
     forgetting: float = 0.99

@@ -166,7 +166,7 @@ static bool stuck(est_t* const self, const float y, const bool edge) {
     if (!same(y, self->y[0])) {
         self->same_n = 0U;
     } else if (edge || (self->same_n > 0U)) {
-        count(&self->same_n);
+        self->same_n = (uint8_t)(self->same_n + ((self->same_n < UINT8_MAX) ? 1U : 0U));
     } else {
         // no edge that it has not answered
     }
@@ -184,7 +184,7 @@ static void doubt_edge(est_t* const self) {
 }
 
 static void enter_edge(est_t* const self) {
-    self->idle_n = 0U;
+    self->edges.since_n = 0U;
     if (!EST_WITH_EDGES) {
         return;
     }
@@ -207,7 +207,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
         return EST_REFUSED;
     }
     if (EST_WITH_WATCH || EST_WITH_EDGES) {
-        count(&self->idle_n);
+        count(&self->edges.since_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
         est_edges_age(&self->edges);
@@ -256,7 +256,7 @@ read_otherwise(est_t* const self, const est_shape_t shape, const float* const ph
     const float e = residual(phi, self->edges.theta, est_shape_count(shape));
     float       early;
     float       late;
-    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, self->idle_n, &early, &late);
+    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
     readings[1] = e - early;
     readings[2] = e - late;
 }
@@ -502,7 +502,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         }
         shift_y(self, sample.y);
     }
-    step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->idle_n >= self->config->idle_n);
+    step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edges.since_n >= self->config->idle_n);
     return step;
 }
 

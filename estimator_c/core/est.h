@@ -130,7 +130,7 @@ typedef struct {
     bool    offset;           ///< estimate the constant d as well
     bool    noise_estimated;  ///< follow the variance of the noise, beginning with noise_variance
     uint16_t refresh_n;       ///< take C from the estimate of A after so many equations and each time A has moved; 0: never
-    uint16_t stuck_n;         ///< y is stuck once it was the same for so many samples after an edge of u; 0: never
+    uint8_t  stuck_n;         ///< y is stuck once it was the same for so many samples after an edge of u; 0: never
     uint16_t idle_n;          ///< excitation is lost once u had no edge for so many samples; 0: never
     est_edge_instants_t edge_instants;
     float   forgetting;      ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
@@ -216,7 +216,8 @@ typedef struct {
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
-    uint8_t age_n;  ///< samples since the first of these edges, that one included; 0: no doubt
+    uint8_t  age_n;    ///< samples since the first of these edges, that one included; 0: no doubt
+    uint16_t since_n;  ///< samples since the last edge of u
     est_past_t early;  ///< their share in the whitened equations
     est_past_t late;
     float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
@@ -238,13 +239,12 @@ typedef struct {
 typedef struct {
     const est_config_t* config;
     uint8_t             count;      ///< of parameters
+    uint8_t             same_n;     ///< samples since an edge of u for which y has been the same
     uint8_t             pending_n;  ///< samples to come before the next equation is complete
     bool                adaptive;   ///< there is more to adapt than theta and C
     bool                afresh;     ///< P is to be reset before the next equation
     bool                known;      ///< the sample before this one is known
     uint16_t            refresh_in;  ///< equations to come before C is taken from A; 0: never
-    uint16_t            same_n;          ///< samples since an edge of u for which y has been the same
-    uint16_t            idle_n;          ///< samples since the last edge of u
     float               noise_variance;  ///< [codes^2]
     float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
     float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...

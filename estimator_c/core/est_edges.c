@@ -32,13 +32,12 @@ void est_edges_shares(est_edges_t* const          self,
                       const est_config_t* const   config,
                       const est_whitener_t* const whitener,
                       const float* const          u,
-                      const uint16_t              since_n,
                       float* const                early,
                       float* const                late) {
     const float* const b         = &self->theta[config->na];
     float              early_raw = 0.0F;
     float              late_raw  = 0.0F;
-    for (uint8_t j = 0U; (j < config->nb) && (since_n < (config->nb + config->nk)); j++) {
+    for (uint8_t j = 0U; (j < config->nb) && (self->since_n < (config->nb + config->nk)); j++) {
         const uint8_t lag = (uint8_t)(config->nk + j);
         if (lag < self->age_n) {
             late_raw -= b[j] * height(config, &u[lag]);

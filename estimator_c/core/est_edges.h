@@ -28,13 +28,11 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 void est_edges_begin(
     est_edges_t* self, const est_config_t* config, const float* theta, uint8_t count, float step, bool after_equation);
 
-/// What the edges, had they come early, and late, would have added to the present equation, whitened. since_n: samples since
-/// the last edge.
+/// What the edges, had they come early, and late, would have added to the present equation, whitened.
 void est_edges_shares(est_edges_t*          self,
                       const est_config_t*   config,
                       const est_whitener_t* whitener,
                       const float*          u,
-                      uint16_t              since_n,
                       float*                early,
                       float*                late);
 

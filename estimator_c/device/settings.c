@@ -28,7 +28,7 @@ static const field_t FIELDS[] = {
     MEMBER(OFFSET, offset, 1U),
     MEMBER(NOISE_ESTIMATED, noise_estimated, 1U),
     MEMBER(REFRESH_N, refresh_n, UINT16_MAX),
-    MEMBER(STUCK_N, stuck_n, UINT16_MAX),
+    MEMBER(STUCK_N, stuck_n, UINT8_MAX),
     MEMBER(IDLE_N, idle_n, UINT16_MAX),
     MEMBER(EDGE_INSTANTS, edge_instants, EST_EDGES_ANYWHERE),
     MEMBER(TRIGGER, trigger.kind, EST_TRIGGER_CUSUM),

@@ -26,7 +26,7 @@ int driver_init(const driver_config_t* in) {
     config = (est_config_t){
         .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .nc = (uint8_t)in->nc,
         .offset = in->offset != 0, .noise_estimated = in->noise_estimated != 0, .refresh_n = (uint16_t)in->refresh_n,
-        .stuck_n = (uint16_t)in->stuck_n, .idle_n = (uint16_t)in->idle_n,
+        .stuck_n = (uint8_t)in->stuck_n, .idle_n = (uint16_t)in->idle_n,
         .edge_instants = (est_edge_instants_t)in->edge_instants, .forgetting = (float)in->forgetting,
         .random_walk = (float)in->random_walk, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
         .noise_variance = (float)in->noise_variance, .c = { (float)in->c[0], (float)in->c[1] },

@@ -313,7 +313,7 @@ VALUES = {
     Key.NC: 1.0,
     Key.NOISE_ESTIMATED: 1.0,
     Key.REFRESH_N: 128.0,
-    Key.STUCK_N: 300.0,
+    Key.STUCK_N: 200.0,
     Key.IDLE_N: 77.0,
     Key.RANDOM_WALK: 0.5,
     Key.CODE_LOW: -0.5,
