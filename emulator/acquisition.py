@@ -35,6 +35,9 @@ _EARLIEST_PROBES = 1
 class Playable(Protocol):
     """A machine that can be played, at the rate it was made for (SuspensionComputer)."""
 
+    @property
+    def sample_rate_hz(self) -> float: ...
+
     def play(
         self,
         excitation: Excitation,
@@ -72,9 +75,11 @@ def acquired(
 
     Yields what the sample-and-holds see, in blocks, float64 (block_samples or, last, fewer; channels), V. rng: of the
     jitter. The conventions of Excitation and of SuspensionComputer.play hold for the nominal instants: a channel that
-    is taken later can show a tweak after sample k in sample k already. Raises what play raises.
+    is taken later can show a tweak after sample k in sample k already. Raises SamplerError for a machine that was made
+    for another rate, and what play raises.
     """
     count = probes_per_sample(card)
+    _check_rate(machine, card, count)
     if count == 1 and card.clock_drift_ppm == 0:
         return machine.play(excitation, samples, tweaks, block_samples)
     clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
@@ -82,6 +87,15 @@ def acquired(
     turns = [(k * count, settings, ramp_n * count) for k, settings, ramp_n in map(in_full, tweaks)]
     probed = machine.play(slow, samples * count, turns, block_samples * count)
     return _picked(probed, card, count, rng)
+
+
+def _check_rate(machine: Playable, card: Card, count: int) -> None:
+    wanted_hz = card.true_rate_hz * count
+    if not math.isclose(machine.sample_rate_hz, wanted_hz, rel_tol=1e-9):
+        raise SamplerError(
+            f"card: the machine has sample_rate_hz {machine.sample_rate_hz:g}, and this card needs {wanted_hz:g}: "
+            f"{count} times its own rate"
+        )
 
 
 def _offsets(card: Card, count: int) -> NDArray[np.float64]:

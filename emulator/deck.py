@@ -68,10 +68,10 @@ class Deck:
     title: str = ""
 
     @classmethod
-    def load(cls, path: Path) -> Deck:
+    def load(cls, path: str | Path) -> Deck:
         """The deck in a file. Raises what read_deck raises, and CircuitError for a file that cannot be read."""
         try:
-            text = path.read_text(encoding="utf-8", errors="replace")
+            text = Path(path).read_text(encoding="utf-8", errors="replace")
         except OSError as cause:
             raise CircuitError(f"{path}: {cause.strerror or cause}") from cause
         return read_deck(text, str(path))

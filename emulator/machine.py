@@ -90,8 +90,8 @@ class AnalogComputer:
 
     components: with which the circuit was fitted; they say where wipers come to rest, and how they sound on the way.
 
-    Raises CircuitError for errors of patching and for an integrator that is none, EngineError for a rate or a delay
-    that cannot be.
+    Raises CircuitError for errors of patching, a reading that is no node and an integrator that is none, EngineError
+    for a rate or a delay that cannot be.
     """
 
     def __init__(
@@ -113,6 +113,8 @@ class AnalogComputer:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
         # First, for it refuses a circuit that is too large at once.
         self._nodals = {Mode.OPERATE: Nodal(circuit)}
+        if missing := [node for node in readings if node not in circuit.nodes]:
+            raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {', '.join(circuit.nodes)}")
         self._patched = circuit
         self._readings = tuple(readings)
         self._patches = patches(circuit)

@@ -117,6 +117,11 @@ class NoisySuspension:
         self._op_amps = op_amps
         self._temperature_c = temperature_c
 
+    @property
+    def sample_rate_hz(self) -> float:
+        """The computer's."""
+        return self._computer.sample_rate_hz
+
     def play(
         self,
         excitation: Excitation,

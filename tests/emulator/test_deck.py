@@ -276,6 +276,11 @@ def test_a_deck_beyond_the_limits_is_refused_at_once(cards: str, message: str) -
     assert time.perf_counter() - start_s < 5.0
 
 
+def test_a_file_may_be_given_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "a.cir").write_text("t\nV1 a 0 1\nR1 a 0 1k\n.tran 50u 100u uic")
+    assert Deck.load(str(tmp_path / "a.cir")).samples == 3
+
+
 def test_a_file_is_named_in_its_errors(tmp_path: Path) -> None:
     path = tmp_path / "wrong.cir"
     with pytest.raises(CircuitError, match="wrong.cir: No such file"):

@@ -71,6 +71,11 @@ def test_an_error_of_patching_is_refused(change: Change, message: str) -> None:
         AnalogComputer(Circuit(change(healthy)), ["u5"])
 
 
+def test_a_reading_of_no_node_is_refused_when_the_machine_is_made() -> None:
+    with pytest.raises(CircuitError, match="readings: no node is called 'u9'; there are in, s1, u1"):
+        AnalogComputer(SuspensionComputer("front").circuit, ["u5", "u9"])
+
+
 def test_an_integrator_without_a_capacitor_is_refused() -> None:
     circuit = SuspensionComputer("front").circuit
     with pytest.raises(CircuitError, match=r"OpAmp U4 \(0 s4 u4\): an integrator without a capacitor .* s4 and u4"):

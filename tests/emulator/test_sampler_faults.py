@@ -40,14 +40,14 @@ class Wave:
     """A machine whose every voltage is the time in microseconds, at the rate it was made for."""
 
     def __init__(self, rate_hz: float, channels: int = 4) -> None:
-        self.rate_hz = rate_hz
+        self.sample_rate_hz = rate_hz
         self.channels = channels
 
     def play(
         self, excitation: Excitation, samples: int, tweaks: Sequence[Tweak | RampedTweak] = (), block_samples: int = 256
     ) -> Iterator[Volts]:
         del excitation, tweaks
-        times = np.arange(samples) / self.rate_hz * 1e6
+        times = np.arange(samples) / self.sample_rate_hz * 1e6
         for first in range(0, samples, block_samples):
             yield np.tile(times[first : first + block_samples, None], self.channels)
 
@@ -109,6 +109,13 @@ def test_without_timing_faults_the_machine_is_played_as_it_is() -> None:
     rng = np.random.default_rng(1)
     volts = np.concatenate(list(acquired(SuspensionComputer("front"), Card(), Excitation(), 50, rng=rng)))
     assert volts.tobytes() == np.concatenate(list(SuspensionComputer("front").play(Excitation(), 50))).tobytes()
+
+
+@pytest.mark.parametrize("card", [CARDS["skewed"], Card(clock_drift_ppm=1000.0), Card(rate_hz=1e4)])
+def test_a_machine_made_for_another_rate_is_refused_naming_both(card: Card) -> None:
+    machine, wanted_hz = SuspensionComputer("front"), card.true_rate_hz * probes_per_sample(card)
+    with pytest.raises(SamplerError, match=f"sample_rate_hz 20000, and this card needs {wanted_hz:g}"):
+        acquired(machine, card, Excitation(), 10, rng=np.random.default_rng(1))
 
 
 def test_aperture_delay_shifts_every_channel() -> None:
