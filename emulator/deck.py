@@ -14,6 +14,7 @@ means what it means to ngspice: case does not count, gnd is 0, the first line is
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -138,9 +139,18 @@ def read_deck(text: str, name: str = "deck") -> Deck:
     whatever exceeds the limits of the modules deck_*.py or of the engine.
     """
     title, top = parse(text, name)
-    scope = Scope(top.parameters, Budget(MAX_WORK))
-    run = _Run.of(name, top, scope)
-    return _Reading(name, run, Expansion(name, top, scope, run.stop_s)).deck(title)
+    try:
+        scope = Scope(top.parameters, Budget(MAX_WORK))
+        run = _Run.of(name, top, scope)
+        return _Reading(name, run, Expansion(name, top, scope, run.stop_s)).deck(title)
+    except EmulatorError as error:
+        if _CARD.match(title):
+            raise type(error)(f"{error} (line 1 is the title: {title[:40]!r})") from error
+        raise
+
+
+_CARD = re.compile(r"\.[a-z]+\s|[rcvix]\w*(\s+\w+){2,}\s+[-+{.\d]", re.IGNORECASE)
+"""What looks like a card, and was perhaps meant as one."""
 
 
 @dataclass(frozen=True)

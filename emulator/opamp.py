@@ -25,6 +25,9 @@ CLAMP_RATE = 1e9
 """Rate in 1/s at which an output beyond its swing is pulled back."""
 
 
+LEAST_GBW_HZ = 1.0
+
+
 @dataclass(frozen=True)
 class OpAmpModel:
     """One type of op-amp. The defaults are the ideal one (v+ = v-, no state); every non-ideality is off on its own.
@@ -56,6 +59,8 @@ class OpAmpModel:
             raise CircuitError(f"op-amp: swing_v must lie on both sides of 0 V, got {self.swing_v!r}")
         if not self.has_state and (self.slews or self.clamps):
             raise CircuitError("op-amp: slew_v_per_s and swing_v need a finite gbw_hz")
+        if self.gbw_hz < LEAST_GBW_HZ:
+            raise CircuitError(f"op-amp: gbw_hz {self.gbw_hz!r} is below {LEAST_GBW_HZ:g} Hz (in a deck 1M is 1e-3)")
 
     @property
     def has_state(self) -> bool:

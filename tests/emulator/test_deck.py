@@ -379,3 +379,13 @@ C1 m 0 10n IC=1
     monkeypatch.setattr("emulator.deck.MAX_EVENTS", 10_000)
     with pytest.raises(CircuitError, match="more than 10000 events in [0-9]+ samples: it oscillates"):
         read_deck(text).volts(["out"])
+
+
+def test_error_of_a_deck_without_a_title_says_what_was_taken_for_it() -> None:
+    with pytest.raises(CircuitError, match=r"no parameter is called 'r'.* \(line 1 is the title: '.param r=10k'\)"):
+        read_deck(".param r=10k\nV1 a 0 1\nR1 a 0 {r}\n.tran 50u 1m uic\n.end\n")
+
+
+def test_megahertz_written_as_millihertz_are_refused() -> None:
+    with pytest.raises(CircuitError, match="gbw_hz 0.001 is below 1 Hz .in a deck 1M is 1e-3."):
+        read_deck(INVERTER.replace("opamp", "opamp gbw=1M"))
