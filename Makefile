@@ -25,7 +25,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench cost fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench cost bit-exact fuzz wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -64,6 +64,9 @@ fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it f
 
 cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json
 	@$(BIN)/python -m estimator_c.evidence.cost
+
+bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every compiler and on every target
+	@$(BIN)/python -m estimator_c.evidence.bit_exact
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

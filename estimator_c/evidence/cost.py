@@ -29,7 +29,7 @@ PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm"}
 
 FLAGS = (
     *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
-    *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are unsigned here
+    *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are one byte here
     *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}"),
 )
 

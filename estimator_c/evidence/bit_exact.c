@@ -1,0 +1,204 @@
+/// Runs the estimator in every configuration on data that are the same everywhere, and prints how many steps there were,
+/// what happened in them, and a hash of all results. bit_exact.py compares the outputs of compilers and targets.
+
+#include "est.h"
+#include "plant.h"
+
+#include <stdio.h>
+
+#define STEPS_N 120U  ///< in each configuration
+
+typedef struct {
+    uint64_t hash;
+    uint32_t steps;
+    uint32_t nan_n;
+    uint32_t alarms;
+    uint32_t slips;
+    uint32_t refused;
+    uint32_t missing;
+    uint32_t refreshes;
+    uint32_t violations;  ///< steps after which the invariants did not hold
+} record_t;
+
+/// FNV-1a of the four bytes, the lowest first.
+static void enter_bits(record_t* const self, const uint32_t bits) {
+    for (uint32_t shift = 0U; shift < 32U; shift += 8U) {
+        self->hash = (self->hash ^ ((bits >> shift) & 0xFFU)) * 1099511628211U;
+    }
+}
+
+typedef union {
+    float    number;
+    uint32_t bits;
+} word_t;
+
+/// The bits of a NaN depend on the target: it is counted instead, and there should be none.
+static void enter_number(record_t* const self, const float number) {
+    const word_t word = { .number = number };
+    if ((word.bits & 0x7FFFFFFFU) > 0x7F800000U) {
+        self->nan_n++;
+    } else {
+        enter_bits(self, word.bits);
+    }
+}
+
+static float of_bits(const uint32_t bits) {
+    const word_t word = { .bits = bits };
+    return word.number;
+}
+
+/// A trigger of the caller's own: the squared innovation in units of its variance, averaged over some ten equations.
+static float own_trigger(void* const context, const float innovation, const float variance, const bool anew) {
+    float* const mean = context;
+    *mean             = anew ? 0.0F : *mean;
+    *mean += 0.1F * (((innovation * innovation) / variance) - *mean);
+    return *mean;
+}
+
+/// Takes the digits of a number off its end, base by base: so one number stands for a whole configuration.
+static uint32_t digit(uint32_t* const number, const uint32_t base) {
+    const uint32_t out = *number % base;
+    *number /= base;
+    return out;
+}
+
+static est_trigger_config_t trigger_of(const est_trigger_kind_t kind, uint32_t* const random, float* const context) {
+    static const float ceilings[] = { 1.0F, 30.0F, 8.0F, 11.5F, 12.0F };
+    return (est_trigger_config_t){ .kind       = kind,
+                                   .reset      = (digit(random, 2U) > 0U) ? EST_RESET_ALL : EST_RESET_COVARIANCE,
+                                   .absolute   = digit(random, 2U) > 0U,
+                                   .hold_off_n = (uint16_t)digit(random, 8U),
+                                   .warm_up_n  = (uint16_t)(5U * digit(random, 4U)),
+                                   .ceiling    = ceilings[kind],
+                                   .custom     = own_trigger,
+                                   .context    = context };
+}
+
+/// The orders, triggers and edges in every combination, a C that filters or none; the rest by chance.
+static est_config_t configuration_of(uint32_t number, uint32_t random, float* const context) {
+    static const float forgettings[] = { 1.0F, 0.99F, 0.9F, 0.5F };
+    static const float walks[]       = { 0.0F, 1.0e-6F, 0.01F };
+    est_config_t       config        = est_config_default();
+    config.na                        = (uint8_t)(1U + digit(&number, 2U));
+    config.nb                        = (uint8_t)(1U + digit(&number, 3U));
+    config.nk                        = (uint8_t)digit(&number, 2U);
+    config.nc                        = (uint8_t)digit(&number, 3U);
+    config.offset                    = digit(&number, 2U) > 0U;
+    config.edge_instants             = (est_edge_instants_t)digit(&number, 3U);
+    config.trigger                   = trigger_of((est_trigger_kind_t)digit(&number, 5U), &random, context);
+    config.forgetting                = forgettings[digit(&random, 4U)];
+    config.random_walk               = walks[digit(&random, 3U)];
+    config.noise_estimated           = digit(&random, 2U) > 0U;
+    config.refresh_n                 = (uint16_t)(10U * digit(&random, 3U));
+    config.stuck_n                   = (uint16_t)(6U * digit(&random, 2U));
+    config.idle_n                    = (uint16_t)(20U * digit(&random, 2U));
+    config.code_low                  = -1000.0F;
+    config.code_high                 = 5000.0F;
+    const float zero                 = 0.2F * (float)digit(&random, 5U);  // of C, twice
+    config.c[0]                      = -zero;
+    config.c[1]                      = 0.0F;
+    if (config.na == 2U) {
+        config.c[0] = -2.0F * zero;
+        config.c[1] = zero * zero;
+    }
+    return config;
+}
+
+/// What a card delivers: now and then nothing, nonsense, or the same again and again.
+static est_sample_t sample_of(plant_t* const plant, const uint32_t k) {
+    static const uint32_t nonsense[] = { 0x7FC00000U, 0x7F800000U, 0xFF800000U, 0x45BB8000U,
+                                         0x7F7FFFFFU };  // NaN first
+    const plant_codes_t   codes      = plant_next(plant);
+    const uint32_t        chance     = plant_random(plant);
+    est_sample_t          sample     = { .u = (float)codes.u, .y = (float)codes.y, .valid = (chance % 64U) != 0U };
+    if ((chance % 64U) == 1U) {
+        const float absurd = of_bits(nonsense[(chance / 64U) % 5U]);
+        if ((chance / 512U) > 63U) {
+            sample.u = absurd;
+        } else {
+            sample.y = absurd;
+        }
+    }
+    if ((k >= 85U) && (k < 97U)) {
+        sample.y = 1234.0F;
+    }
+    return sample;
+}
+
+static void enter_step(record_t* const self, const est_t* const estimator, const est_step_t step) {
+    enter_bits(self, (uint32_t)step.status | (step.alarm ? 16U : 0U) | (step.idle ? 32U : 0U));
+    enter_number(self, step.innovation);
+    enter_number(self, step.statistic);
+    for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
+        enter_number(self, est_theta(estimator, i));
+    }
+    self->violations += est_invariants_hold(estimator) ? 0U : 1U;
+    self->steps++;
+}
+
+static void enter_end(record_t* const self, const est_t* const estimator) {
+    const est_counters_t c     = est_counters(estimator);
+    const uint32_t       all[] = { c.updated, c.missing,  c.refused, c.saturated, c.stuck,
+                                   c.alarms,  c.restarts, c.slips,   c.refreshes };
+    for (uint32_t i = 0U; i < (sizeof(all) / sizeof(all[0])); i++) {
+        enter_bits(self, all[i]);
+    }
+    for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
+        enter_number(self, est_variance(estimator, i));
+    }
+    enter_number(self, est_noise_variance(estimator));
+    self->missing += c.missing;
+    self->refused += c.refused;
+    self->alarms += c.alarms;
+    self->slips += c.slips;
+    self->refreshes += c.refreshes;
+}
+
+/// The edges come at the instants of samples, across which they drift, or anywhere.
+static plant_t plant_of(const est_edge_instants_t edge_instants, const uint32_t seed) {
+    plant_t plant           = plant_at_rest(PLANT_FRONT, seed, 5U * PLANT_TICKS_PER_SAMPLE);
+    plant.half_period_ticks = 10U * PLANT_TICKS_PER_SAMPLE;
+    if (edge_instants == EST_EDGES_ANYWHERE) {
+        plant.half_period_ticks += 5U;
+    }
+    return plant;
+}
+
+static bool run(record_t* const self, const uint32_t number) {
+    plant_t seeds = { .random = number };
+    (void)plant_random(&seeds);
+    const uint32_t     random  = (plant_random(&seeds) << 16U) | plant_random(&seeds);
+    float              context = 0.0F;
+    const est_config_t config  = configuration_of(number, random, &context);
+    plant_t            plant   = plant_of(config.edge_instants, number);
+    est_t              estimator;
+    if (!est_init(&estimator, &config)) {
+        return false;
+    }
+    for (uint32_t k = 0U; k < STEPS_N; k++) {
+        if (k == 60U) {
+            plant.mechanics = PLANT_FRONT_SOFT;
+        }
+        plant.reads_first = (config.edge_instants == EST_EDGES_MAY_SLIP) && ((k % 40U) >= 20U);
+        enter_step(self, &estimator, est_step(&estimator, sample_of(&plant, k)));
+    }
+    enter_end(self, &estimator);
+    return true;
+}
+
+int main(void) {
+    record_t record = { .hash = 14695981039346656037U };
+    for (uint32_t number = 0U; number < (2U * 3U * 2U * 3U * 2U * 3U * 5U); number++) {
+        if (!run(&record, number)) {
+            (void)printf("configuration %lu was refused\n", (unsigned long)number);
+            return 1;
+        }
+    }
+    (void)printf(
+        "steps %lu nan %lu violations %lu alarms %lu slips %lu refused %lu missing %lu refreshes %lu hash %08lx%08lx\n",
+        (unsigned long)record.steps, (unsigned long)record.nan_n, (unsigned long)record.violations,
+        (unsigned long)record.alarms, (unsigned long)record.slips, (unsigned long)record.refused,
+        (unsigned long)record.missing, (unsigned long)record.refreshes, (unsigned long)(record.hash >> 32U),
+        (unsigned long)(record.hash & 0xFFFFFFFFU));
+    return 0;
+}
