@@ -25,7 +25,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench cost bit-exact fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench cost coverage bit-exact fuzz wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -61,6 +61,9 @@ fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it f
 	    -DEST_NC_MAX=2U -Iestimator_c/core estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c -o $(BUILD)/fuzz/fuzz_est
 	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
 	    then grep "^stat::" log; else tail -60 log; exit 1; fi
+
+coverage: $(PRODUCTS) ## which lines and branches of the core its tests go through
+	@$(BIN)/python -m estimator_c.evidence.coverage
 
 cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json
 	@$(BIN)/python -m estimator_c.evidence.cost

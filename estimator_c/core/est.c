@@ -42,16 +42,20 @@ static bool within(const float x, const float low, const float high) { return (x
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-static bool orders_fixed(const est_config_t* const config) {
-    const est_shape_t shape = est_shape_of(config);
-    return (config->na == shape.na) && (config->nb == shape.nb) && (config->nk == shape.nk) && (config->nc == shape.nc) &&
-           (config->offset == shape.offset);
+EST_INLINE bool alike(const est_shape_t a, const est_shape_t b) {
+    return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
+}
+
+static est_shape_t asked_for(const est_config_t* const config) {
+    return (est_shape_t){
+        .na = config->na, .nb = config->nb, .nk = config->nk, .nc = config->nc, .offset = config->offset
+    };
 }
 
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
-           (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) && orders_fixed(config) &&
-           (est_shape_count(est_shape_of(config)) <= EST_THETA_MAX);
+           (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) &&
+           (est_shape_count(asked_for(config)) <= EST_THETA_MAX);
 }
 
 static bool variances_valid(const est_config_t* const config) {
@@ -72,8 +76,9 @@ static bool adaptive(const est_config_t* const config) {
     return (config->nc > 0U) || config->noise_estimated || (config->random_walk > 0.0F);
 }
 
+/// A build may have left something out, or know one shape only.
 static bool in_this_build(const est_config_t* const config) {
-    return (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
+    return alike(asked_for(config), est_shape_of(config)) && (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
            (EST_WITH_ADAPTATION || (!adaptive(config) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
@@ -411,10 +416,6 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     step->statistic  = self->trigger.statistic;
     step->alarm      = finding == EST_ALARM;
     react(self, finding);
-}
-
-EST_INLINE bool alike(const est_shape_t a, const est_shape_t b) {
-    return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
 }
 
 /// The usual shapes have code of their own, unless the build has one anyway, or room is scarce.

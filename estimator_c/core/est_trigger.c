@@ -92,7 +92,7 @@ void est_trigger_begin_doubt(est_trigger_t* const self) {
 }
 
 est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
-    if ((config->kind == EST_TRIGGER_CUSUM) && (self->statistic >= config->ceiling)) {
+    if (self->statistic >= config->ceiling) {
         return EST_SLIP;
     }
     for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {

@@ -88,6 +88,33 @@ int driver_theta_count(void) { return est_theta_count(&self); }
 
 float driver_variance(int index) { return est_variance(&self, (uint8_t)index); }
 
+/* Sets counters to one below their limits, as after years. */
+void driver_age_counters(void) {
+    self.counters = (est_counters_t){ UINT32_MAX - 1U, UINT32_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
+                                      UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
+                                      UINT16_MAX - 1U };
+}
+
+/* Damages the state in one way, asks for the invariants, and mends it. */
+int driver_invariants_hold_if_damaged(int way) {
+    const est_t  kept    = self;
+    est_config_t invalid = config;
+    invalid.na           = 0U;
+    switch (way) {
+    case 0: self.config = 0; break;
+    case 1: self.config = &invalid; break;
+    case 2: self.count++; break;
+    case 3: self.factors.d[1] = -1.0F; break;
+    case 4: self.theta[0] = __builtin_nanf(""); break;
+    case 5: self.trigger.statistic = -1.0F; break;
+    case 6: self.noise_variance = 0.0F; break;
+    default: break;
+    }
+    const int held = est_invariants_hold((way == 7) ? 0 : &self) ? 1 : 0;
+    self           = kept;
+    return held;
+}
+
 float driver_noise_variance(void) { return est_noise_variance(&self); }
 
 void driver_counters(unsigned out[9]) {

@@ -24,6 +24,9 @@ STRICT = [
     "-ffp-contract=off",
     "-DEST_NC_MAX=2U",
 ]
+COVERED = ("-O0", "--coverage", "-DNDEBUG", "-D__OPTIMIZE_SIZE__=1", "-DEST_NA_MAX=3U")
+"""One copy of every line, and loops over EST_NA_MAX that are loops."""
+
 COUNTERS = ("updated", "missing", "refused", "alarms", "restarts", "slips", "saturated", "stuck", "refreshes")
 
 NONE, PREDICTION_ERROR, MEAN_BETWEEN_FAULTS, CUSUM, CUSTOM = range(5)
@@ -100,6 +103,14 @@ class Estimator:
             theta, innovation, statistic, np.flatnonzero(alarm), status, idle, named, variance, noise_variance
         )
 
+    def age_counters(self) -> None:
+        """Sets all counters to one below their limits."""
+        self._c.driver_age_counters()
+
+    def invariants_hold_if_damaged(self, way: int) -> bool:
+        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 7; 8: not at all."""
+        return bool(self._c.driver_invariants_hold_if_damaged(way))
+
     def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Whole runs (t, n), each from the start: where the alarms came (t, n), and theta at the end (t, p). Fast."""
         runs, samples = u.shape
@@ -113,6 +124,8 @@ class Estimator:
 
 def compile_driver(folder: Path, *options: str) -> Path:
     """The driver as a shared library, with the strict warnings of the project; options come last."""
+    if not options and os.environ.get("EST_COVERAGE"):  # estimator_c/evidence/coverage.py counts there
+        folder, options = Path(os.environ["EST_COVERAGE"]), COVERED
     library = folder / f"est_driver_{len(list(folder.iterdir()))}.so"
     sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c"))]
     command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", f"-I{CORE}"]

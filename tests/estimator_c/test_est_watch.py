@@ -105,3 +105,41 @@ def test_walking_parameters_are_followed_where_forgetting_nothing_is_stuck(estim
     true = (1.0 / 18000.0) * (2940.0 / 4096) / (0.1996 / 4096)
     assert gains[1e-7] == pytest.approx(true, rel=0.04)
     assert gains[0.0] < true * 0.93
+
+
+def test_excitation_is_never_lost_where_it_is_not_watched(estimator: Estimator) -> None:
+    assert estimator.init(idle_n=0)
+    assert not estimator.run(np.zeros(300), np.full(300, 410.0)).idle.any()
+
+
+def test_counters_stay_at_their_limits(estimator: Estimator) -> None:
+    u, y = front()
+    y[300:330] = np.nan
+    y[400:600] = y[399]
+    y[610:650] = 5000.0
+    valid = np.ones(N)
+    valid[200:220] = 0
+    assert estimator.init(code_high=4500.0, code_low=-10.0)
+    estimator.age_counters()
+    counters = estimator.run(u, y, valid).counters
+    limits = {"updated": 2**32 - 1, "missing": 2**32 - 1, "refused": 2**16 - 1, "saturated": 2**16 - 1}
+    limits |= {"stuck": 2**16 - 1, "restarts": 2**16 - 1}
+    assert {name: counters[name] for name in limits} == limits
+
+
+def test_variance_of_no_noise_at_all_stays_positive(estimator: Estimator) -> None:
+    assert estimator.init(noise_estimated=1, kind=NONE)
+    assert estimator.run(np.zeros(6000), np.zeros(6000)).noise_variance == pytest.approx(1e-9, rel=1e-3)
+
+
+def test_mean_between_faults_goes_on_beyond_the_range_of_its_counter(estimator: Estimator) -> None:
+    assert estimator.init(kind=2, ceiling=1e6, absolute=1, refresh_n=0, stuck_n=0)
+    y = np.tile([1.0, -1.0], 35_000)
+    assert np.isfinite(estimator.run(np.zeros(70_000), y).statistic).all()
+
+
+def test_damaged_state_is_noticed(estimator: Estimator) -> None:
+    assert estimator.init()
+    u, y = front()
+    estimator.run(u, y)
+    assert [estimator.invariants_hold_if_damaged(way) for way in range(9)] == [False] * 8 + [True]
