@@ -1,0 +1,92 @@
+"""What the estimator costs on a Cortex-M stays within the limits (estimator_c/evidence/cost.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from estimator_c.evidence import cost
+
+pytestmark = pytest.mark.skipif(bool(cost.missing_tools()), reason=f"apt-get install {' '.join(cost.missing_tools())}")
+
+KNOWN_STEP = """
+#include "subject.h"
+const bool subject_drifts = false;
+/// One instruction, LENGTH turns of two, and the return.
+__attribute__((naked, noinline)) void known_step(void) {
+    __asm volatile("movs r0, #LENGTH\\n 1: subs r0, #1\\n bne 1b\\n bx lr");
+}
+SUBJECT void subject_begin(void) {}
+SUBJECT void subject_enter(float u, float y, bool valid) { (void)u; (void)y; (void)valid; known_step(); }
+SUBJECT uint32_t subject_judge(void) { return STATUS; }
+"""
+
+
+def known(folder: Path, status: int) -> Path:
+    source = folder / "known.c"
+    source.write_text(KNOWN_STEP.replace("LENGTH", "50").replace("STATUS", str(status)))
+    flags = (f"-I{cost.HERE}", *cost.M3.flags)
+    return cost.link(folder / "known.elf", [cost.HERE / "image.c", source], flags)
+
+
+def test_a_step_of_known_length_is_counted_exactly_and_its_caller_is_not(tmp_path: Path) -> None:
+    counts = cost.count_steps(known(tmp_path, 0), cost.M3.machine, "known_step")
+    assert counts == [1 + 2 * 50 + 1] * 600
+
+
+def test_a_run_that_was_not_what_it_is_made_for_counts_for_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"status 2.*subject_judge"):
+        cost.count_steps(known(tmp_path, 2), cost.M3.machine, "known_step")
+
+
+@pytest.fixture(scope="module")
+def costs(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, cost.Cost]:
+    return {figure.name: figure for figure in cost.costs(tmp_path_factory.mktemp("cost"))}
+
+
+LOCKED = [
+    f"M4F, n = {n}, edges locked{fixed}{alone}"
+    for n in (4, 6)
+    for fixed in ("", ", fixed")
+    for alone in ("", ", trigger alone")
+]
+STEPS = [*LOCKED, "M4F, n = 6, edges may slip", "M4F, n = 6, edges may slip, fixed"]
+STEPS += [f"{processor}, n = 4, edges locked" for processor in ("M3", "M0")]
+SIZES = [f"M4F, code of the core at -Os, {what}" for what in ("everything", "trigger alone")] + [
+    "M4F, state: sizeof(est_t)"
+]
+LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
+
+BEYOND = {
+    "M4F, n = 4, edges locked, fixed": "360 instructions",
+    "M4F, n = 4, edges locked, fixed, trigger alone": "308 instructions",
+    "M4F, n = 4, edges locked, worst": "1.30 times the typical step: the first after a gap or an alarm",
+    "M4F, n = 4, edges locked, fixed, worst": "1.31 times the typical step: the same",
+    "M4F, n = 6, edges locked, worst": "1.21 times the typical step: the same",
+    "M4F, n = 6, edges locked, fixed, worst": "1.22 times the typical step: the same",
+    "M4F, n = 6, edges may slip, worst": "1.64 times the typical step: a doubt about an edge",
+    "M4F, n = 6, edges may slip, fixed, worst": "1.67 times the typical step: a doubt about an edge",
+    "M3, n = 4, edges locked, worst": "1.201 times the typical step",
+    "M0, n = 4, edges locked": "14,600 instructions; the textbook's U-D alone takes 10,800 with libgcc's soft float",
+    "M4F, code of the core at -Os, everything": "4798 B",
+    "M4F, code of the core at -Os, trigger alone": "2608 B",
+}
+"""What the core still misses, as measured; a limit that it comes to keep must be taken off this list."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.xfail(reason=BEYOND[name], strict=True) if name in BEYOND else ())
+        for name in LIMITED
+    ],
+)
+def test_cost_is_within_its_limit(name: str, costs: Mapping[str, cost.Cost]) -> None:
+    limit = costs[name].limit
+    assert limit is not None and costs[name].value <= limit
+
+
+def test_no_limit_goes_untested(costs: Mapping[str, cost.Cost]) -> None:
+    assert {name for name, figure in costs.items() if figure.limit is not None} == set(LIMITED)
