@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,20 +32,25 @@ from .circuit import (
     Circuit,
     CurrentSource,
     DiodeLimiter,
+    Element,
     OpAmp,
     Pot,
     Resistor,
     Switch,
     VoltageSource,
     refused,
+    unknown,
 )
 from .errors import CircuitError
 from .opamp import CLAMP_RATE
 from .pot import checked_dial, legs_ohm
 
-__all__ = ["Kink", "Nodal", "PiecewiseLinear", "piecewise_linear"]
+__all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "piecewise_linear"]
 
 Matrix = NDArray[np.float64]
+
+_PIECE_SLACK = 1e-9
+"""Of a kink's bound: less than this beyond it may be rounding."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,21 @@ class Kink:
         at_lower = (between - below) * self.lower if np.isfinite(self.lower) else 0.0
         at_upper = (between - above) * self.upper if np.isfinite(self.upper) else 0.0
         return at_lower, 0.0, at_upper
+
+    def piece(self, w: float, now: int) -> int:
+        """In which piece w lies: 0, 1 or 2; the present one where rounding may be all that puts it beyond."""
+        for piece, bound in ((0, self.lower), (1, self.upper)):
+            slack = _PIECE_SLACK * (1.0 + abs(bound))
+            if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
+                return piece
+        return 2 if math.isfinite(self.upper) else 1
+
+
+class Rest(NamedTuple):
+    """Where a circuit rests: its state, (n,) in V, and the voltage of every node."""
+
+    state: Matrix
+    volts: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -113,24 +134,53 @@ class PiecewiseLinear:
             missing = next(node for node in nodes if node not in self.nodes)
             raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
 
-    def rest(self, levels_v: Matrix) -> Matrix:
-        """The state (n,) at which nothing moves, with the inputs held at levels_v (m,) and no kink at its limit.
+    def rest(self, levels_v: Matrix) -> Rest:
+        """Where nothing moves with the inputs held at levels_v (m,): the limits that are reached there count.
 
-        Amplifiers neither slew nor clamp then, and limiters do not conduct.
-        Raises CircuitError naming a state that nothing brings to rest.
+        Pieces are tried from the middle ones on, each time those in which the rest of the last ones lies, until they
+        stand; so this needs not be the only rest, nor the one to which the circuit would come from its present state.
+        Raises CircuitError naming a state that nothing brings to rest, or what has no rest in any piece tried.
         """
-        size = len(self.states)
-        slopes = np.array([kink.slopes[1] for kink in self.kinks])
+        pieces = np.ones(len(self.kinks), np.intp)
+        for _ in range(2 * len(self.kinks) + 1):
+            rest, w = self._rest_within(pieces, levels_v)
+            reached = np.array([kink.piece(*at) for kink, *at in zip(self.kinks, w, pieces, strict=True)], np.intp)
+            if (reached == pieces).all():
+                return rest
+            unsettled, pieces = reached != pieces, reached
+        names = dict.fromkeys(kink.element for kink, moves in zip(self.kinks, unsettled, strict=True) if moves)
+        raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")
+
+    def _rest_within(self, pieces: NDArray[np.intp], levels_v: Matrix) -> tuple[Rest, Matrix]:
+        """The rest, and w there, were every kink the line of that piece everywhere."""
+        states, kinks = len(self.states), range(len(self.kinks))
+        slopes = np.array([self.kinks[k].slopes[pieces[k]] for k in kinks])
+        intercepts = np.array([self.kinks[k].intercepts[pieces[k]] for k in kinks])
+        w_of_z = self.cde.copy()
+        for k in kinks:
+            w_of_z[:, -1] += self.w_phi[:, k] * intercepts[k]
+        failed = _solve(np.eye(len(self.kinks)) - self.w_phi * slopes, w_of_z)
+        if failed >= 0:
+            raise CircuitError(f"the limits of {self.kinks[failed].element} leave no unique solution")
         flow = self.abc.copy()
-        for k, slope in enumerate(slopes):
-            flow += np.outer(self.g[:, k] * slope, self.cde[k])
-        left = np.ascontiguousarray(flow[:, :size])
-        right = -(flow[:, size:] * np.append(levels_v, 1.0)).sum(axis=1, keepdims=True)
-        failed = library.load().engine_solve(size, 1, left.ctypes.data, right.ctypes.data)
+        for k in kinks:
+            flow += np.outer(self.g[:, k] * slopes[k], w_of_z[k])
+            flow[:, -1] += self.g[:, k] * intercepts[k]
+        held = np.append(levels_v, 1.0)
+        right = -(flow[:, states:] * held).sum(axis=1, keepdims=True)
+        failed = _solve(flow[:, :states], right)
         if failed >= 0:
             raise CircuitError(f"nothing brings {self.states[failed]} to rest")
-        state: Matrix = right[:, 0]
-        return state
+        z = np.concatenate((right[:, 0], held))
+        w = np.asarray((w_of_z * z).sum(axis=1))
+        volts = (self.lmn * z).sum(axis=1) + (self.v_phi * (slopes * w + intercepts)).sum(axis=1)
+        return Rest(right[:, 0], dict(zip(self.nodes, volts.tolist(), strict=True))), w
+
+
+def _solve(left: Matrix, solution: Matrix) -> int:
+    """Solves left x = solution (contiguous, at least as many rows) in place; the unknown without a pivot, or -1."""
+    matrix = left.copy(order="C")
+    return int(library.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
@@ -148,17 +198,16 @@ class Nodal:
     """
 
     def __init__(self, circuit: Circuit) -> None:
+        kinds = _Kinds.of(circuit.elements)
         self._elements = circuit.elements
-        self._pots = circuit.of(Pot)
-        self._switches = circuit.of(Switch)
-        self._limiters = circuit.of(DiodeLimiter)
-        self._capacitors = circuit.of(Capacitor)
+        self._pots = kinds.pots
+        self._switches = kinds.switches
+        self._limiters = kinds.limiters
+        self._capacitors = kinds.capacitors
         self._inputs = circuit.inputs
-        self._poles = tuple(amp for amp in circuit.of(OpAmp) if amp.model.has_state)
-        branches = [element.name for element in self._capacitors] + [
-            source.name for source in circuit.of(VoltageSource)
-        ]
-        branches += [amp.name for amp in circuit.of(OpAmp) if not (amp.model.has_state and amp.model.rout_ohm > 0)]
+        self._poles = tuple(amp for amp in kinds.amps if amp.model.has_state)
+        branches = [element.name for element in self._capacitors] + [source.name for source in kinds.voltage_sources]
+        branches += [amp.name for amp in kinds.amps if not (amp.model.has_state and amp.model.rout_ohm > 0)]
 
         self._nodes = circuit.nodes
         self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
@@ -180,7 +229,7 @@ class Nodal:
         ends = [(switch.a, switch.b) for switch in self._switches]
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
-        self._enter(circuit)
+        self._enter(kinds)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
         """The state space with the pots named in dials and the switches named in closed set so.
@@ -235,23 +284,22 @@ class Nodal:
             if count > limit:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
-    def _enter(self, circuit: Circuit) -> None:
-        resistors = circuit.of(Resistor)
-        places = self._places([(resistor.a, resistor.b) for resistor in resistors])
-        siemens = [1.0 / resistor.ohm for resistor in resistors]
+    def _enter(self, kinds: _Kinds) -> None:
+        places = self._places([(resistor.a, resistor.b) for resistor in kinds.resistors])
+        siemens = [1.0 / resistor.ohm for resistor in kinds.resistors]
         np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
         for capacitor in self._capacitors:
             row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
             self._right[row, self._state[capacitor.name]] = 1.0
-        for source in circuit.of(VoltageSource):
+        for source in kinds.voltage_sources:
             row = self._voltage_branch(source.name, source.plus, source.minus)
             column, volts = self._drive(source)
             self._right[row, column] = volts
-        for drive in circuit.of(CurrentSource):
+        for drive in kinds.current_sources:
             column, amperes = self._drive(drive)
             self._right[self._row[drive.plus], column] -= amperes
             self._right[self._row[drive.minus], column] += amperes
-        for amp in circuit.of(OpAmp):
+        for amp in kinds.amps:
             self._enter_opamp(amp)
         for i, limiter in enumerate(self._limiters):
             self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
@@ -321,10 +369,9 @@ class Nodal:
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
         """Every unknown as a function of what the columns of right stand for, and a last row for ground, of zeros."""
         size = len(self._unknowns)
-        matrix = np.ascontiguousarray(left[:size, :size])
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
-        failed = library.load().engine_solve(size, right.shape[1], matrix.ctypes.data, solution.ctypes.data)
+        failed = _solve(left[:size, :size], solution)
         if failed >= 0:
             raise self._singular(failed)
         return solution
@@ -353,6 +400,46 @@ class Nodal:
         spread = np.zeros((solution.shape[0], len(self._kinks)))
         spread[:, len(self._kinks) - len(self._limiters) :] = solution[:, self._columns :]
         return spread
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """The elements of a circuit by kind, in netlist order."""
+
+    resistors: list[Resistor] = field(default_factory=list)
+    capacitors: list[Capacitor] = field(default_factory=list)
+    pots: list[Pot] = field(default_factory=list)
+    switches: list[Switch] = field(default_factory=list)
+    amps: list[OpAmp] = field(default_factory=list)
+    voltage_sources: list[VoltageSource] = field(default_factory=list)
+    current_sources: list[CurrentSource] = field(default_factory=list)
+    limiters: list[DiodeLimiter] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, elements: Sequence[Element]) -> _Kinds:
+        """Sorted; CircuitError for an element of none of these kinds."""
+        kinds = cls()
+        for element in elements:
+            match element:
+                case Resistor():
+                    kinds.resistors.append(element)
+                case Capacitor():
+                    kinds.capacitors.append(element)
+                case Pot():
+                    kinds.pots.append(element)
+                case Switch():
+                    kinds.switches.append(element)
+                case OpAmp():
+                    kinds.amps.append(element)
+                case VoltageSource():
+                    kinds.voltage_sources.append(element)
+                case CurrentSource():
+                    kinds.current_sources.append(element)
+                case DiodeLimiter():
+                    kinds.limiters.append(element)
+                case _:
+                    raise unknown(element)
+        return kinds
 
 
 _STAMP = np.array((1.0, 1.0, -1.0, -1.0))
