@@ -52,7 +52,7 @@ class EstimatorConfig:
     offset: bool = True
     noise_estimated: bool = False
     """Follow the variance of the noise, beginning with ``noise_variance``."""
-    refresh_n: int = 50
+    refresh_n: int = 40
     """Take C from the estimate of A after so many equations, and each time A has moved; 0: never."""
     stuck_n: int = 16
     """The displacement is stuck once it was the same for so many samples after an edge of the force, at most

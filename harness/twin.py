@@ -20,6 +20,7 @@ SLIP_DOUBT = 1000.0
 
 CONTRACTION = 0.99
 REFRESH_STEP = 0.002
+REFRESH_STRIDE, REFRESH_DOUBT = 0.05, 100.0
 
 NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
 
@@ -300,10 +301,14 @@ class Twin:
     def _refresh(self) -> None:
         self.equations = 0
         c = [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
-        moved = any(abs(new - old) > REFRESH_STEP for new, old in zip(c, self.whitener.c, strict=True))
-        if moved and _stable(c):
+        step = max(abs(new - old) for new, old in zip(c, self.whitener.c, strict=True))
+        if step > REFRESH_STEP and _stable(c):
             self.whitener.c = c
-            self.whitener.rows = [(list(c), 1.0) for _ in range(max(len(c), 1))]
+            if step > REFRESH_STRIDE:
+                self.whitener.restart()
+                self.covariance.inflate(REFRESH_DOUBT)
+            else:
+                self.whitener.rows = [(list(c), 1.0) for _ in range(max(len(c), 1))]
             self.refreshes += 1
 
     # ---- changes

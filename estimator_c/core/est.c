@@ -26,6 +26,12 @@
 /// variance at most 1 % too large with poles up to 0.95. 0.02 may put a zero of C on the unit circle.
 #define REFRESH_STEP 0.002F
 
+/// A coefficient that moves by more than this makes another filter: what the old one left of the noise of the equations before
+/// is not white to the new one, which therefore begins anew; and what was estimated with the old one is biased, and so less
+/// certain than P says, by this factor.
+#define REFRESH_STRIDE 0.02F
+#define REFRESH_DOUBT 100.0F
+
 /// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
 /// counts as no more, so that a change of the plant is not taken for noise; of Gaussian noise that keeps NOISE_KEPT.
 #define NOISE_RATE 0.005F
@@ -293,14 +299,21 @@ static void refresh_prefilter(est_t* const self) {
     float         c[EST_NA_MAX];
     float         factor = 1.0F;
     bool          moved  = false;
+    bool          far    = false;
     for (uint8_t i = 0U; i < na; i++) {
         factor *= CONTRACTION;
         c[i]  = self->theta[i] * factor;
-        moved = moved || !within(c[i] - self->whitener.c[i], -REFRESH_STEP, REFRESH_STEP);
+        const float step = c[i] - self->whitener.c[i];
+        moved = moved || !within(step, -REFRESH_STEP, REFRESH_STEP);
+        far   = far || !within(step, -REFRESH_STRIDE, REFRESH_STRIDE);
     }
     if (moved && est_whitener_accepts(c, na)) {
         est_whitener_set(&self->whitener, c, na);
         count(&self->counters.refreshes);
+        if (far) {
+            est_whitener_restart(&self->whitener);
+            est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
+        }
     }
 }
 
@@ -446,7 +459,7 @@ est_config_t est_config_default(void) {
         .nk             = 0U,
         .nc             = 0U,
         .offset         = true,
-        .refresh_n      = EST_WITH_ADAPTATION ? 50U : 0U,
+        .refresh_n      = EST_WITH_ADAPTATION ? 40U : 0U,
         .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
         .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
         .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,

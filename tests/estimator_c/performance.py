@@ -31,7 +31,7 @@ ONSET_SPAN_N = 100
 HORIZON_N = 300
 """A change not noticed after so many samples is missed, and counts with that delay."""
 
-ADAPTED: Settings = {"refresh_n": 50, "warm_up_n": 150}
+ADAPTED: Settings = {"refresh_n": 40, "warm_up_n": 150}
 """C follows the estimate of A; until it has, the innovations are coloured, and the trigger waits."""
 
 SHARED_CLOCK: Settings = {
