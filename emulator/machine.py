@@ -13,13 +13,14 @@ bounce.
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
 from .components import NOMINAL, Components, contact_of, is_part_of
 from .engine import Engine
-from .errors import CircuitError, EngineError, ModeError, PotError
+from .errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .nodal import Nodal, PiecewiseLinear
 from .patching import Patch, patches
@@ -190,22 +191,26 @@ class AnalogComputer:
         With ramp_n they turn evenly while run() plays on, and arrive ramp_n samples after the last one taken (sample 0
         when there is none yet). Wipers rest on the nearest winding, on the way too. A pot that is turned again goes on
         from where it is.
-        Raises PotError for a dial off its track, a pot that is not there or a ramp of less than no samples, with
-        nothing turned.
+        Raises PotError for a dial off its track, a pot that is not there or a ramp of less than no samples, and
+        EngineError for a circuit that the engine refuses (a machine that has not been played yet: run() does); nothing
+        is turned then.
         """
         goals = self.resting(dials)
         if ramp_n < 0:
             raise PotError(f"pots {', '.join(dials)}: cannot turn in {ramp_n} samples")
-        for pot in goals:
-            self._turns.pop(pot, None)
-        if ramp_n:
-            first = max(self.recorded - 1, 0)
-            moving = {pot: dial for pot, dial in goals.items() if dial != self._dials[pot]}
-            self._turns |= {pot: _Turn(self._dials[pot], dial, first, first + ramp_n) for pot, dial in moving.items()}
-        else:
-            self._dials |= goals
-        self._dials |= self._wipers.contacts_at_rest(goals)
-        self._change()
+        with self._changing():
+            for pot in goals:
+                self._turns.pop(pot, None)
+            if ramp_n:
+                first = max(self.recorded - 1, 0)
+                self._turns |= {
+                    pot: _Turn(self._dials[pot], dial, first, first + ramp_n)
+                    for pot, dial in goals.items()
+                    if dial != self._dials[pot]
+                }
+            else:
+                self._dials |= goals
+            self._dials |= self._wipers.contacts_at_rest(goals)
 
     def resting(self, dials: Mapping[str, float]) -> dict[str, float]:
         """Where the wipers come to rest when pots are turned to these dials. Raises PotError, as turn does."""
@@ -219,10 +224,13 @@ class AnalogComputer:
             raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
 
     def throw(self, closed: Mapping[str, bool]) -> None:
-        """Throws switches of the circuit, in any mode. Raises CircuitError for one that is not there."""
+        """Throws switches of the circuit, in any mode.
+
+        Raises CircuitError for one that is not there, EngineError as turn() does; nothing is thrown then.
+        """
         self._patched.with_switches(closed)
-        self._closed |= closed
-        self._change()
+        with self._changing():
+            self._closed |= closed
 
     def coefficient(self, pot: str) -> float:
         """Reads a pot in POT SET: the voltage of its wiper, under load, with its top on the reference, per reference.
@@ -261,19 +269,25 @@ class AnalogComputer:
         self._solved: PiecewiseLinear | None = None
 
     def set_initial(self, initial_v: Mapping[str, float]) -> None:
-        """Sets the output voltages to which INITIAL CONDITION charges integrators. Raises CircuitError."""
+        """Sets the output voltages to which INITIAL CONDITION charges integrators.
+
+        Raises CircuitError and, as turn() does, EngineError; nothing is set then.
+        """
         wanted = self._initial_v | dict(initial_v)
         if wanted.keys() != self._initial_v.keys():
             strangers = ", ".join(sorted(wanted.keys() - self._initial_v.keys()))
             raise CircuitError(f"{strangers}: no such integrator; there are {', '.join(self._initial_v) or 'none'}")
         self._check_integrators(wanted)
-        self._initial_v = wanted
-        self._nodals = {mode: nodal for mode, nodal in self._nodals.items() if mode in (Mode.HOLD, Mode.OPERATE)}
-        self._change()
-        self._charge_at_once(self._engine)
+        with self._changing(charged=self._powered):
+            self._initial_v = wanted
+            self._nodals = {mode: nodal for mode, nodal in self._nodals.items() if mode in (Mode.HOLD, Mode.OPERATE)}
 
     def switch(self, mode: Mode) -> None:
-        """Switches at the present instant. The present mode again changes nothing. Raises ModeError."""
+        """Switches at the present instant. The present mode again changes nothing.
+
+        Raises ModeError, and EngineError or CircuitError for a circuit that cannot be in that mode; the machine stays
+        in its mode then.
+        """
         self._check_switches([mode])
         self._enter(mode)
 
@@ -383,7 +397,7 @@ class AnalogComputer:
             edges = _after(edges, until)
             self._dials |= self._dials_at(last)
             self._turns = {pot: turn for pot, turn in self._turns.items() if turn.last > last}
-            self._change()
+            self._changed()
         yield self._engine.run(stop - self.recorded, edges)
 
     def _while_turning(self, sample: float) -> PiecewiseLinear:
@@ -417,21 +431,41 @@ class AnalogComputer:
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self._mode:
-            engine = self._engine
-            self._mode = mode
-            self._change()
-            self._charge_at_once(engine)
+            with self._changing(charged=self._engine):
+                self._mode = mode
 
-    def _change(self) -> None:
-        """Relays, pots, switches or initial voltages have another position."""
+    @contextlib.contextmanager
+    def _changing(self, charged: Engine | None = None) -> Iterator[None]:
+        """Relays, pots, switches or initial voltages get another position within; all or, when it is refused, none."""
+        before = self._position
+        try:
+            yield
+            self._changed()
+            if charged is not None:
+                self._charge_at_once(charged)
+        except EmulatorError:
+            self._position = before
+            self._changed()
+            raise
+
+    def _changed(self) -> None:
         self._solved = None
         if self._powered is not None:
             self._powered.set_system(self._system)
 
+    @property
+    def _position(self) -> _Position:
+        mode, nodals = self._mode, dict(self._nodals)
+        return _Position(mode, nodals, self._initial_v, dict(self._dials), dict(self._turns), dict(self._closed))
+
+    @_position.setter
+    def _position(self, position: _Position) -> None:
+        self._mode, self._nodals, self._initial_v, self._dials, self._turns, self._closed = position
+
     def _charge_at_once(self, engine: Engine) -> None:
         if self._ic_ohm is None and self._mode in (Mode.INITIAL_CONDITION, Mode.POT_SET):
             levels_v = [self._levels_v[name] for name in self._system.inputs]
-            engine.state = self._system.rest(np.array(levels_v))
+            engine.state = self._system.rest(np.array(levels_v)).state
 
     def _wired(self, mode: Mode) -> Circuit:
         """The circuit with the relays in the position of a mode."""
@@ -497,8 +531,7 @@ class AnalogComputer:
     def _reading(self, nodal: Nodal, pot: str, dial: float) -> float:
         system = nodal.at(self._dials | {pot: dial}, self._closed)
         levels_v = np.array([self._levels_v[name] for name in system.inputs])
-        z = np.concatenate((system.rest(levels_v), levels_v, (1.0,)))
-        return float((system.readings([self._terminal(pot, "wiper")])[0] * z).sum()) / REFERENCE_V
+        return system.rest(levels_v).volts[self._terminal(pot, "wiper")] / REFERENCE_V
 
 
 @dataclass(frozen=True)
@@ -521,6 +554,17 @@ class _Turn:
         """Into how many pieces of standing dials a sample is cut: the error goes with speed / pieces^2."""
         speed_per_sample = abs(self.goal - self.start) / (self.last - self.first)
         return min(max(math.ceil(math.sqrt(speed_per_sample / _SLOW_PER_SAMPLE)), 1), _MOST_PIECES)
+
+
+class _Position(NamedTuple):
+    """All that decides which circuit the machine is."""
+
+    mode: Mode
+    nodals: dict[Mode, Nodal]
+    initial_v: dict[str, float]
+    dials: dict[str, float]
+    turns: dict[str, _Turn]
+    closed: dict[str, bool]
 
 
 class _Wipers:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,12 @@ from .errors import CircuitError
 from .opamp import CLAMP_RATE
 from .pot import checked_dial, legs_ohm
 
-__all__ = ["Kink", "Nodal", "PiecewiseLinear", "piecewise_linear"]
+__all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "piecewise_linear"]
 
 Matrix = NDArray[np.float64]
+
+_PIECE_SLACK = 1e-9
+"""Of a kink's bound: less than this beyond it may be rounding."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,21 @@ class Kink:
         at_lower = (between - below) * self.lower if np.isfinite(self.lower) else 0.0
         at_upper = (between - above) * self.upper if np.isfinite(self.upper) else 0.0
         return at_lower, 0.0, at_upper
+
+    def piece(self, w: float, now: int) -> int:
+        """In which piece w lies: 0, 1 or 2; the present one where rounding may be all that puts it beyond."""
+        for piece, bound in ((0, self.lower), (1, self.upper)):
+            slack = _PIECE_SLACK * (1.0 + abs(bound))
+            if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
+                return piece
+        return 2 if math.isfinite(self.upper) else 1
+
+
+class Rest(NamedTuple):
+    """Where a circuit rests: its state, (n,) in V, and the voltage of every node."""
+
+    state: Matrix
+    volts: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -113,24 +132,53 @@ class PiecewiseLinear:
             missing = next(node for node in nodes if node not in self.nodes)
             raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
 
-    def rest(self, levels_v: Matrix) -> Matrix:
-        """The state (n,) at which nothing moves, with the inputs held at levels_v (m,) and no kink at its limit.
+    def rest(self, levels_v: Matrix) -> Rest:
+        """Where nothing moves with the inputs held at levels_v (m,): the limits that are reached there count.
 
-        Amplifiers neither slew nor clamp then, and limiters do not conduct.
-        Raises CircuitError naming a state that nothing brings to rest.
+        Pieces are tried from the middle ones on, each time those in which the rest of the last ones lies, until they
+        stand; so this needs not be the only rest, nor the one to which the circuit would come from its present state.
+        Raises CircuitError naming a state that nothing brings to rest, or what has no rest in any piece tried.
         """
-        size = len(self.states)
-        slopes = np.array([kink.slopes[1] for kink in self.kinks])
+        pieces = np.ones(len(self.kinks), np.intp)
+        for _ in range(2 * len(self.kinks) + 1):
+            rest, w = self._rest_within(pieces, levels_v)
+            reached = np.array([kink.piece(*at) for kink, *at in zip(self.kinks, w, pieces, strict=True)], np.intp)
+            if (reached == pieces).all():
+                return rest
+            unsettled, pieces = reached != pieces, reached
+        names = dict.fromkeys(kink.element for kink, moves in zip(self.kinks, unsettled, strict=True) if moves)
+        raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")
+
+    def _rest_within(self, pieces: NDArray[np.intp], levels_v: Matrix) -> tuple[Rest, Matrix]:
+        """The rest, and w there, were every kink the line of that piece everywhere."""
+        states, kinks = len(self.states), range(len(self.kinks))
+        slopes = np.array([self.kinks[k].slopes[pieces[k]] for k in kinks])
+        intercepts = np.array([self.kinks[k].intercepts[pieces[k]] for k in kinks])
+        w_of_z = self.cde.copy()
+        for k in kinks:
+            w_of_z[:, -1] += self.w_phi[:, k] * intercepts[k]
+        failed = _solve(np.eye(len(self.kinks)) - self.w_phi * slopes, w_of_z)
+        if failed >= 0:
+            raise CircuitError(f"the limits of {self.kinks[failed].element} leave no unique solution")
         flow = self.abc.copy()
-        for k, slope in enumerate(slopes):
-            flow += np.outer(self.g[:, k] * slope, self.cde[k])
-        left = np.ascontiguousarray(flow[:, :size])
-        right = -(flow[:, size:] * np.append(levels_v, 1.0)).sum(axis=1, keepdims=True)
-        failed = library.load().engine_solve(size, 1, left.ctypes.data, right.ctypes.data)
+        for k in kinks:
+            flow += np.outer(self.g[:, k] * slopes[k], w_of_z[k])
+            flow[:, -1] += self.g[:, k] * intercepts[k]
+        held = np.append(levels_v, 1.0)
+        right = -(flow[:, states:] * held).sum(axis=1, keepdims=True)
+        failed = _solve(flow[:, :states], right)
         if failed >= 0:
             raise CircuitError(f"nothing brings {self.states[failed]} to rest")
-        state: Matrix = right[:, 0]
-        return state
+        z = np.concatenate((right[:, 0], held))
+        w = np.asarray((w_of_z * z).sum(axis=1))
+        volts = (self.lmn * z).sum(axis=1) + (self.v_phi * (slopes * w + intercepts)).sum(axis=1)
+        return Rest(right[:, 0], dict(zip(self.nodes, volts.tolist(), strict=True))), w
+
+
+def _solve(left: Matrix, solution: Matrix) -> int:
+    """Solves left x = solution (contiguous, at least as many rows) in place; the unknown without a pivot, or -1."""
+    matrix = left.copy(order="C")
+    return int(library.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
@@ -321,10 +369,9 @@ class Nodal:
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
         """Every unknown as a function of what the columns of right stand for, and a last row for ground, of zeros."""
         size = len(self._unknowns)
-        matrix = np.ascontiguousarray(left[:size, :size])
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
-        failed = library.load().engine_solve(size, right.shape[1], matrix.ctypes.data, solution.ctypes.data)
+        failed = _solve(left[:size, :size], solution)
         if failed >= 0:
             raise self._singular(failed)
         return solution

@@ -1,7 +1,8 @@
 """Thermal noise of the resistors and input noise of the op-amps, exact at the samples.
 
-The noise is small, so it is the solution of the linear circuit (no amplifier at a limit) driven by white sources alone,
-and adds to what the engine plays. With dx = A x dt + B dw, one sample period T takes the noise x to
+The noise is small, so it is the solution of the linear circuit driven by white sources alone (no amplifier at a limit
+and no diode limiter conducting, also while they are: a bump stop that is reached does not change its noise), and adds
+to what the engine plays. With dx = A x dt + B dw, one sample period T takes the noise x to
 
     Phi x + w,   Phi = exp(A T),   cov(w) = integral over 0..T of exp(A s) B B' exp(A' s) ds
 
@@ -164,7 +165,7 @@ def _of(response: Mapping[str, Matrix], names: Sequence[str]) -> Matrix:
 
 
 def _linear(system: PiecewiseLinear) -> Matrix:
-    """A when no amplifier is at a limit: (n, n)."""
+    """A when no amplifier is at a limit and no diode limiter conducts: (n, n)."""
     slopes = np.array([kink.slopes[1] for kink in system.kinks])
     n = len(system.states)
     return system.abc[:, :n] + _product(system.g * slopes, system.cde[:, :n])

@@ -196,6 +196,60 @@ def test_a_limiter_across_the_capacitor_stays_there_and_readings_show_what_it_do
     assert set(computer.lamps.values()) == {None}
 
 
+def test_a_pot_into_a_limiter_is_read_and_set_as_the_engine_plays_it() -> None:
+    """Half of 10 k on 10 V into R1 and, beyond 1 V, 10 ohm: by hand the wiper stands at 1.016 V."""
+    computer = machine(integrator([DiodeLimiter("D1", "w", "0", 1.0, 10.0, 1e9)]), ic_ohm=None)
+    computer.switch(POT_SET)
+    legs, load, limiter = 2 / 5e3, 1 / 100e3 + 1e-9, 1 / 10.0 - 1e-9
+    wiper_v = (10.0 / 5e3 + 1.0 * limiter) / (legs + load + limiter)
+    assert computer.coefficient("P1") == pytest.approx(wiper_v / 10.0, abs=1e-9)
+    computer.run(2, level(10.0))
+    assert computer.read()["w"] == pytest.approx(wiper_v, abs=1e-6)
+    computer.set_coefficient("P1", 0.1015)
+    assert computer.coefficient("P1") == pytest.approx(0.1015, abs=1e-9)
+
+
+def test_a_machine_that_charges_at_once_begins_where_its_limiters_leave_it() -> None:
+    computer = SuspensionComputer("bump-stop").machine
+    charged = AnalogComputer(computer.circuit, ["u1", "u3"], initial_v={"U2": 0.0, "U3": -8.0}, ic_ohm=None)
+    volts = charged.run(50)
+    assert volts[0, 0] == pytest.approx(13.364, abs=1e-3)
+    np.testing.assert_allclose(volts, np.broadcast_to(volts[0], volts.shape), rtol=0, atol=1e-6)
+
+
+def latching() -> AnalogComputer:
+    """U2 doubles P1's wiper and feeds it back through S1 and a limiter: more than one for one when S1 is closed."""
+    feedback = [
+        Pot("P1", "in", "w", "0", 10e3, 0.5),
+        OpAmp("U2", "w", "m", "o", IDEAL),
+        Resistor("R1", "o", "m", 10e3),
+        Resistor("R2", "m", "0", 10e3),
+        DiodeLimiter("D1", "o", "f", 1.0, 1.0, 1e9),
+        Switch("S1", "f", "w", 1.0, 1e9, closed=False),
+    ]
+    return AnalogComputer(Circuit([VoltageSource("V1", "in"), *feedback]), ["o"])
+
+
+def test_a_switch_or_pot_that_the_engine_refuses_is_put_back_and_the_machine_plays_on() -> None:
+    computer, undisturbed = latching(), latching()
+    for each in (computer, undisturbed):
+        each.turn({"P1": 0.0})
+        each.run(3, level(1.0))
+    computer.throw({"S1": True})
+    undisturbed.throw({"S1": True})
+    with pytest.raises(EngineError, match="no unique solution"):
+        computer.turn({"P1": 0.5})
+    assert computer.dials == {"P1": 0.0}
+    np.testing.assert_array_equal(computer.run(5), undisturbed.run(5))
+    for each in (computer, undisturbed):
+        each.throw({"S1": False})
+        each.turn({"P1": 0.5})
+    with pytest.raises(EngineError, match="no unique solution"):
+        computer.throw({"S1": True})
+    assert not computer.circuit.of(Switch)[0].closed
+    np.testing.assert_array_equal(computer.run(5), undisturbed.run(5))
+
+
 def test_a_switch_of_the_circuit_can_be_thrown() -> None:
     computer = machine(integrator([Switch("S1", "in", "s", 100e3, 1e12, closed=False)]), ic_ohm=None)
     computer.switch(OPERATE)

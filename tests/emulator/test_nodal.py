@@ -21,7 +21,7 @@ from emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from emulator.nodal import Nodal
+from emulator.nodal import Kink, Nodal, PiecewiseLinear
 from emulator.opamp import CLAMP_RATE
 
 SOURCE = VoltageSource("V1", "in")
@@ -148,3 +148,24 @@ def test_a_constant_source_and_an_offset_are_constants_beside_a_limiter_too() ->
     ]
     system = piecewise_linear(Circuit(elements))
     np.testing.assert_allclose(system.readings(["in", "n", "out"])[:, -1], [3.0, 2e-3, -3.0 + 4e-3], rtol=1e-12)
+
+
+def test_a_rest_lies_in_the_piece_of_the_limiter_where_it_is() -> None:
+    """dx/dt = -x + a + g max(0, x - 5): at a = 4 below the threshold, at a = 6 where x = (a - 5 g) / (1 - g)."""
+    assert limited(-1.0, 4.0, 0.5).rest(np.empty(0)).state.tolist() == [4.0]
+    assert limited(-1.0, 6.0, 0.5).rest(np.empty(0)).state == pytest.approx([7.0])
+    assert limited(-1.0, 6.0, -2.0).rest(np.empty(0)).state == pytest.approx([16 / 3])
+
+
+def test_a_limiter_without_a_rest_on_either_side_is_named() -> None:
+    """dx/dt = -x + 6 + 2 max(0, x - 5) is never below 1."""
+    with pytest.raises(CircuitError, match="nothing brings D1 to rest"):
+        limited(-1.0, 6.0, 2.0).rest(np.empty(0))
+
+
+def limited(slope: float, constant: float, gain: float) -> PiecewiseLinear:
+    """dx/dt = slope x + constant + gain max(0, x - 5)."""
+    kink = Kink(-math.inf, 5.0, (1.0, 0.0, 1.0), "D1")
+    zero = np.zeros((1, 1))
+    flow, w = np.array([[slope, constant]]), np.array([[1.0, 0.0]])
+    return PiecewiseLinear(("C1",), (), ("n",), (kink,), flow, np.array([[gain]]), w, zero, w, zero)
