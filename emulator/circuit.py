@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from numbers import Real
-from typing import ClassVar, TypeAlias, TypeVar
+from typing import ClassVar, Never, TypeAlias, TypeVar
 
 from .errors import CircuitError
 from .opamp import OpAmpModel
@@ -32,6 +32,7 @@ __all__ = [
     "VoltageSource",
     "label",
     "refused",
+    "unknown",
 ]
 
 GROUND = "0"
@@ -323,6 +324,11 @@ def label(element: Element) -> str:
 def refused(element: Element, why: str) -> CircuitError:
     """The error that an element cannot be, or cannot be there."""
     return CircuitError(f"{label(element)}: {why}", element=element.name)
+
+
+def unknown(element: Never) -> CircuitError:
+    """The error for an element of no kind that is known; mypy sees that a match that ends in it leaves none out."""
+    return refused(element, "no such kind of element is known")
 
 
 def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -> None:

@@ -23,7 +23,19 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
+from .circuit import (
+    GROUND,
+    Capacitor,
+    CurrentSource,
+    DiodeLimiter,
+    Element,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+    unknown,
+)
 from .errors import CircuitError
 from .opamp import OpAmpModel
 from .pot import PotModel
@@ -291,8 +303,10 @@ class Components:
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
-            case _:
+            case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch():
                 yield element
+            case _:
+                raise unknown(element)
 
     def _draws(self, name: str) -> NDArray[np.float64]:
         return np.random.default_rng([self.seed, *name.lower().encode()]).uniform(-1.0, 1.0, _DRAWS)

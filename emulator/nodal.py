@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,12 +32,14 @@ from .circuit import (
     Circuit,
     CurrentSource,
     DiodeLimiter,
+    Element,
     OpAmp,
     Pot,
     Resistor,
     Switch,
     VoltageSource,
     refused,
+    unknown,
 )
 from .errors import CircuitError
 from .opamp import CLAMP_RATE
@@ -196,17 +198,16 @@ class Nodal:
     """
 
     def __init__(self, circuit: Circuit) -> None:
+        kinds = _Kinds.of(circuit.elements)
         self._elements = circuit.elements
-        self._pots = circuit.of(Pot)
-        self._switches = circuit.of(Switch)
-        self._limiters = circuit.of(DiodeLimiter)
-        self._capacitors = circuit.of(Capacitor)
+        self._pots = kinds.pots
+        self._switches = kinds.switches
+        self._limiters = kinds.limiters
+        self._capacitors = kinds.capacitors
         self._inputs = circuit.inputs
-        self._poles = tuple(amp for amp in circuit.of(OpAmp) if amp.model.has_state)
-        branches = [element.name for element in self._capacitors] + [
-            source.name for source in circuit.of(VoltageSource)
-        ]
-        branches += [amp.name for amp in circuit.of(OpAmp) if not (amp.model.has_state and amp.model.rout_ohm > 0)]
+        self._poles = tuple(amp for amp in kinds.amps if amp.model.has_state)
+        branches = [element.name for element in self._capacitors] + [source.name for source in kinds.voltage_sources]
+        branches += [amp.name for amp in kinds.amps if not (amp.model.has_state and amp.model.rout_ohm > 0)]
 
         self._nodes = circuit.nodes
         self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
@@ -228,7 +229,7 @@ class Nodal:
         ends = [(switch.a, switch.b) for switch in self._switches]
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
-        self._enter(circuit)
+        self._enter(kinds)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
         """The state space with the pots named in dials and the switches named in closed set so.
@@ -283,23 +284,22 @@ class Nodal:
             if count > limit:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
-    def _enter(self, circuit: Circuit) -> None:
-        resistors = circuit.of(Resistor)
-        places = self._places([(resistor.a, resistor.b) for resistor in resistors])
-        siemens = [1.0 / resistor.ohm for resistor in resistors]
+    def _enter(self, kinds: _Kinds) -> None:
+        places = self._places([(resistor.a, resistor.b) for resistor in kinds.resistors])
+        siemens = [1.0 / resistor.ohm for resistor in kinds.resistors]
         np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
         for capacitor in self._capacitors:
             row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
             self._right[row, self._state[capacitor.name]] = 1.0
-        for source in circuit.of(VoltageSource):
+        for source in kinds.voltage_sources:
             row = self._voltage_branch(source.name, source.plus, source.minus)
             column, volts = self._drive(source)
             self._right[row, column] = volts
-        for drive in circuit.of(CurrentSource):
+        for drive in kinds.current_sources:
             column, amperes = self._drive(drive)
             self._right[self._row[drive.plus], column] -= amperes
             self._right[self._row[drive.minus], column] += amperes
-        for amp in circuit.of(OpAmp):
+        for amp in kinds.amps:
             self._enter_opamp(amp)
         for i, limiter in enumerate(self._limiters):
             self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
@@ -400,6 +400,46 @@ class Nodal:
         spread = np.zeros((solution.shape[0], len(self._kinks)))
         spread[:, len(self._kinks) - len(self._limiters) :] = solution[:, self._columns :]
         return spread
+
+
+@dataclass(frozen=True)
+class _Kinds:
+    """The elements of a circuit by kind, in netlist order."""
+
+    resistors: list[Resistor] = field(default_factory=list)
+    capacitors: list[Capacitor] = field(default_factory=list)
+    pots: list[Pot] = field(default_factory=list)
+    switches: list[Switch] = field(default_factory=list)
+    amps: list[OpAmp] = field(default_factory=list)
+    voltage_sources: list[VoltageSource] = field(default_factory=list)
+    current_sources: list[CurrentSource] = field(default_factory=list)
+    limiters: list[DiodeLimiter] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, elements: Sequence[Element]) -> _Kinds:
+        """Sorted; CircuitError for an element of none of these kinds."""
+        kinds = cls()
+        for element in elements:
+            match element:
+                case Resistor():
+                    kinds.resistors.append(element)
+                case Capacitor():
+                    kinds.capacitors.append(element)
+                case Pot():
+                    kinds.pots.append(element)
+                case Switch():
+                    kinds.switches.append(element)
+                case OpAmp():
+                    kinds.amps.append(element)
+                case VoltageSource():
+                    kinds.voltage_sources.append(element)
+                case CurrentSource():
+                    kinds.current_sources.append(element)
+                case DiodeLimiter():
+                    kinds.limiters.append(element)
+                case _:
+                    raise unknown(element)
+        return kinds
 
 
 _STAMP = np.array((1.0, 1.0, -1.0, -1.0))

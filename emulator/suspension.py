@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from .machine import AnalogComputer, Mode
 from .opamp import OpAmpModel, preset
 from .pot import PotModel, checked_dial
 from .program import CHANNELS, SOURCE, Program, Scales
-from .quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts
-from .two_mass import TWO_MASS, TwoMassParts
+from .quarter_car import BUMP_STOP, FRONT, SHOCK
+from .two_mass import TWO_MASS
 
 __all__ = ["CHANNELS", "PROGRAMS", "SOURCE", "PlannedTurn", "RampedTweak", "SuspensionComputer", "Tweak", "in_full"]
 
@@ -54,7 +54,7 @@ class SuspensionComputer:
     """The wired machine: it knows what its pots show, sets them, and is played.
 
     program: a name in PROGRAMS or a Program. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
-    parts: the component values of the diagram, the program's own when None; components: what is fitted for them.
+    components: what is fitted for the parts of the program's diagram; Components(given=...) changes single ones.
     Pots are set from the program's own values, with the real load connected.
     rng, offset_v: when an rng is given, each op-amp has an offset of its own, uniform within +-offset_v (drawn from U1
     on).
@@ -68,7 +68,6 @@ class SuspensionComputer:
         program: str | Program = "front",
         *,
         opamp: str | OpAmpModel = "tl07x",
-        parts: SuspensionParts | TwoMassParts | None = None,
         components: Components = NOMINAL,
         rng: np.random.Generator | None = None,
         offset_v: float = 3e-3,
@@ -76,9 +75,8 @@ class SuspensionComputer:
     ) -> None:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
-        wired = self.program if parts is None else replace(cast(Any, self.program), parts=parts)
         models = _models(opamp, self.program.amplifiers, rng, offset_v)
-        circuit = Circuit(components.fitted(wired.netlist(models)))
+        circuit = Circuit(components.fitted(self.program.netlist(models)))
         self._pots = _pots(self.program, circuit, components)
         self._signs = self.program.channel_signs
         self.machine = AnalogComputer(

@@ -320,8 +320,8 @@ def test_two_inputs_may_change_at_the_same_instant() -> None:
 
 
 def test_what_cannot_be_recorded_is_refused_with_the_number() -> None:
-    with pytest.raises(EngineError, match="200 nodes are to be recorded; the engine takes at most 128"):
-        Engine(follower(), ["out"] * 200)
+    with pytest.raises(EngineError, match="300 nodes are to be recorded; the engine takes at most 256"):
+        Engine(follower(), ["out"] * 300)
     with pytest.raises(EngineError, match="sample_rate_hz must be positive and finite, got inf"):
         Engine(follower(), ["out"], sample_rate_hz=float("inf"))
     with pytest.raises(EngineError, match="cannot record -3 samples"):

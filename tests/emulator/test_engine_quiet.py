@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from emulator import (
-    FRONT,
-    SHOCK,
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
+    Components,
     Edges,
     Engine,
     Excitation,
@@ -25,7 +24,6 @@ from emulator import (
     Pot,
     Resistor,
     SuspensionComputer,
-    SuspensionParts,
     VoltageSource,
     piecewise_linear,
 )
@@ -37,9 +35,11 @@ SAMPLE_RATE_HZ = 20e3
 NODES = ("u1", "u2", "u3", "u4", "u5", "wm", "wb", "wk")
 
 
-def machine(program: str, opamp: str = "tl07x", parts: SuspensionParts | None = None) -> Circuit:
+def machine(program: str, opamp: str = "tl07x", given: Mapping[str, float] | None = None) -> Circuit:
     rng = np.random.default_rng(4)
-    return SuspensionComputer(program, opamp=opamp, parts=parts, rng=rng, offset_v=3e-3).circuit
+    return SuspensionComputer(
+        program, opamp=opamp, components=Components(given=given or {}), rng=rng, offset_v=3e-3
+    ).circuit
 
 
 def played(circuit: Circuit, excitation: Excitation, samples: int, *, reduced: bool) -> tuple[Volts, Engine]:
@@ -83,16 +83,9 @@ def test_slow_states_alone_give_the_same_voltages_whatever_limits(
     program: str, opamp: str, by: tuple[float, float, float, float], excitation: Excitation
 ) -> None:
     """Amplifiers slew and clamp at will: no event may be slept through."""
-    nominal = {"front": FRONT, "shock": SHOCK}[program].parts
-    parts = replace(
-        nominal,
-        rfb_ohm=nominal.rfb_ohm * by[0],
-        rb_ohm=nominal.rb_ohm * by[1],
-        c1_farad=nominal.c1_farad * by[2],
-        c2_farad=nominal.c2_farad * by[3],
-    )
-    full, _ = played(machine(program, opamp, parts), excitation, 200, reduced=False)
-    volts, _ = played(machine(program, opamp, parts), excitation, 200, reduced=True)
+    given = {name: factor - 1.0 for name, factor in zip(("RFB", "RB", "C1", "C2"), by, strict=True)}
+    full, _ = played(machine(program, opamp, given), excitation, 200, reduced=False)
+    volts, _ = played(machine(program, opamp, given), excitation, 200, reduced=True)
     assert np.abs(volts - full).max() < 1e-7
 
 

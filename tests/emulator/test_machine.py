@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
@@ -38,6 +39,7 @@ from emulator import (
     SuspensionComputer,
     Switch,
     VoltageSource,
+    read_deck,
     to_spice,
 )
 from emulator.circuit import Element
@@ -196,6 +198,19 @@ def test_a_limiter_across_the_capacitor_stays_there_and_readings_show_what_it_do
     assert set(computer.lamps.values()) == {None}
 
 
+def test_every_node_of_a_large_circuit_is_shown_and_played() -> None:
+    """200 equal resistors in a row divide the voltage evenly."""
+    nodes = ["in", *(f"n{i}" for i in range(1, 200)), "0"]
+    row: list[Element] = [Resistor(f"R{i}", a, b, 1e3) for i, (a, b) in enumerate(itertools.pairwise(nodes))]
+    circuit = Circuit([VoltageSource("V1", "in"), *row])
+    computer = AnalogComputer(circuit, ["in"])
+    computer.run(1, level(10.0))
+    expected_v = 10.0 * (1.0 - np.arange(200) / 200)
+    assert [computer.read()[node] for node in nodes[:-1]] == pytest.approx(expected_v.tolist(), abs=1e-9)
+    deck = read_deck(to_spice(circuit, samples=2, edges=level(10.0)))
+    assert deck.volts()[-1] == pytest.approx(expected_v, abs=1e-9)
+
+
 def test_a_pot_into_a_limiter_is_read_and_set_as_the_engine_plays_it() -> None:
     """Half of 10 k on 10 V into R1 and, beyond 1 V, 10 ohm: by hand the wiper stands at 1.016 V."""
     computer = machine(integrator([DiodeLimiter("D1", "w", "0", 1.0, 10.0, 1e9)]), ic_ohm=None)
@@ -219,7 +234,7 @@ def test_a_machine_that_charges_at_once_begins_where_its_limiters_leave_it() -> 
 
 def latching() -> AnalogComputer:
     """U2 doubles P1's wiper and feeds it back through S1 and a limiter: more than one for one when S1 is closed."""
-    feedback = [
+    feedback: list[Element] = [
         Pot("P1", "in", "w", "0", 10e3, 0.5),
         OpAmp("U2", "w", "m", "o", IDEAL),
         Resistor("R1", "o", "m", 10e3),

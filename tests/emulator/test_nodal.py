@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from emulator import (
     Capacitor,
     Circuit,
     CircuitError,
+    Components,
     DiodeLimiter,
     OpAmp,
     OpAmpModel,
@@ -21,6 +23,7 @@ from emulator import (
     VoltageSource,
     piecewise_linear,
 )
+from emulator.circuit import _TwoEnded
 from emulator.nodal import Kink, Nodal, PiecewiseLinear
 from emulator.opamp import CLAMP_RATE
 
@@ -169,3 +172,16 @@ def limited(slope: float, constant: float, gain: float) -> PiecewiseLinear:
     zero = np.zeros((1, 1))
     flow, w = np.array([[slope, constant]]), np.array([[1.0, 0.0]])
     return PiecewiseLinear(("C1",), (), ("n",), (kink,), flow, np.array([[gain]]), w, zero, w, zero)
+
+
+@dataclass(frozen=True)
+class Inductor(_TwoEnded):
+    """An element that nobody has provided for."""
+
+
+def test_an_element_of_no_known_kind_is_refused_by_its_name() -> None:
+    strange = cast(Any, Inductor("L1", "in", "0"))
+    with pytest.raises(CircuitError, match=r"Inductor L1 \(in 0\): no such kind of element"):
+        Nodal(Circuit([SOURCE, strange]))
+    with pytest.raises(CircuitError, match=r"Inductor L1 \(in 0\): no such kind of element"):
+        Components(given={"V1": 0.0}).fitted([SOURCE, strange])

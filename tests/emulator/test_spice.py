@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -15,11 +15,11 @@ from emulator import (
     TICKS_PER_SAMPLE,
     Circuit,
     CircuitError,
+    Components,
     Engine,
     Excitation,
     OpAmpModel,
     SuspensionComputer,
-    SuspensionParts,
     piecewise_linear,
     to_spice,
 )
@@ -88,7 +88,7 @@ def test_a_generator_with_a_clock_of_its_own_agrees_with_ngspice_at_every_amplif
 
 def test_slewing_and_clamping_amplifiers_agree_with_ngspice(ngspice: NgSpice) -> None:
     # 741s slew for 40 us at each edge of this drive, and twice the summer's gain drives U1 into its clamp.
-    computer = SuspensionComputer("front", opamp="741", parts=SuspensionParts(rfb_ohm=200e3))
+    computer = SuspensionComputer("front", opamp="741", components=Components(given={"RFB": 1.0}))
     excitation = Excitation(low_v=-10.0, high_v=10.0, frequency_hz=400.0, clock="free", phase=0.237)
     reference = ngspice(deck_of(computer, excitation, 300), AMPLIFIERS, 300)
     volts = every_amplifier(computer, excitation, 300)
@@ -115,7 +115,7 @@ def test_random_machines_agree_with_ngspice_at_every_amplifier(ngspice: NgSpice,
 
 def random_machine(rng: np.random.Generator) -> SuspensionComputer:
     program = (FRONT, SHOCK)[rng.integers(2)]
-    values = {name: value * rng.uniform(0.7, 1.4) for name, value in asdict(program.parts).items()}
+    given = {_element(field.name): rng.uniform(0.7, 1.4) - 1.0 for field in fields(program.parts)}
     model = OpAmpModel(
         avol=10 ** rng.uniform(4, 6),
         gbw_hz=10 ** rng.uniform(5.7, 7.3),
@@ -124,8 +124,14 @@ def random_machine(rng: np.random.Generator) -> SuspensionComputer:
         rout_ohm=rng.uniform(10, 300),
     )
     # Pots are set from the program's nominal parts, whatever these are.
-    parts = replace(SuspensionParts(**values), pot_m_ohm=10e3, pot_b_ohm=10e3, pot_k_ohm=10e3)
-    return SuspensionComputer(program, opamp=model, parts=parts, rng=rng, offset_v=5e-3)
+    for pot in ("M", "B", "K"):
+        del given[pot]
+    return SuspensionComputer(program, opamp=model, components=Components(given=given), rng=rng, offset_v=5e-3)
+
+
+def _element(part: str) -> str:
+    """The element that has the value of a field of SuspensionParts: RFB for rfb_ohm, R4 for r4_in_ohm."""
+    return "".join(word for word in part.split("_") if word not in ("pot", "in", "ohm", "farad")).upper()
 
 
 def random_excitation(rng: np.random.Generator) -> Excitation:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from emulator import (
     FRONT,
     PROGRAMS,
     CircuitError,
+    Components,
     EngineError,
     Excitation,
     ExcitationError,
@@ -202,7 +202,7 @@ def test_offsets_come_from_the_generator_and_move_the_rest_position() -> None:
 
 
 def test_parts_off_their_nominal_values_move_the_plant_and_not_the_pots() -> None:
-    soft = SuspensionComputer("front", opamp="ideal", parts=replace(FRONT.parts, rfb_ohm=101e3))
+    soft = SuspensionComputer("front", opamp="ideal", components=Components(given={"RFB": 0.01}))
     assert soft.coefficients == pytest.approx(SuspensionComputer("front").coefficients)
     assert played(soft, 100, excitation=Excitation(frequency_hz=10.0))[-1, 3] != 0.0
 
