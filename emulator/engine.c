@@ -704,7 +704,7 @@ static enum engine_status cross(engine *self, int level)
 }
 
 /* One step, of at most the given number of ticks. */
-static enum engine_status stride(engine *self, int64_t ticks)
+static enum engine_status one_step(engine *self, int64_t ticks)
 {
     int level = longest_level(self, ticks);
     enum judgement judgement = attempt(self, level, self->there);
@@ -1176,7 +1176,7 @@ static enum engine_status advance(engine *self, int64_t tick)
             continue;
         }
         leave_quiet(self);
-        status = stride(self, tick - self->now);
+        status = one_step(self, tick - self->now);
     }
     return status;
 }
@@ -1555,14 +1555,14 @@ static void gather_shortly(int n, double step_s, const double *a, const double *
 /* Twice the step: P + Phi P Phi' and Phi Phi - I, with Phi = I + change, so that slow states lose no digits. */
 static void gather_twice(int n, double *change, double *cov)
 {
-    double grown[MAX_SQUARE] = {0.0}, turned[MAX_SQUARE] = {0.0}, both[MAX_SQUARE];
+    double grown[MAX_SQUARE] = {0.0}, transposed[MAX_SQUARE] = {0.0}, both[MAX_SQUARE];
     multiply(n, change, cov, false, grown);
     for (int i = 0; i < n * n; i++) {
-        turned[i] = grown[(i % n) * n + i / n];
+        transposed[i] = grown[(i % n) * n + i / n];
     }
-    multiply(n, change, turned, false, both);
+    multiply(n, change, transposed, false, both);
     for (int i = 0; i < n * n; i++) {
-        cov[i] = 2.0 * cov[i] + grown[i] + turned[i] + both[i];
+        cov[i] = 2.0 * cov[i] + grown[i] + transposed[i] + both[i];
     }
     multiply(n, change, change, false, both);
     for (int i = 0; i < n * n; i++) {

@@ -28,7 +28,7 @@ _REASONS = {
     2: "the circuit is too stiff: it has a time constant 10^17 times shorter than a sample period",
     3: "more events within one sample than events_per_sample allows: does an amplifier oscillate?",
     4: "the state is no longer finite: the circuit is unstable",
-    5: "the edges are out of order, not after the last sample recorded, or beyond the last sample of the run",
+    5: "the edges are out of order, before the last sample recorded, or beyond the last sample of the run",
     6: "no circuit was set, or the last one was refused",
     7: "limiters and amplifiers feed one another so that there is no unique solution: is there positive feedback?",
 }
@@ -130,8 +130,9 @@ class Engine:
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
 
-        edges: by input; every edge after the last instant recorded and up to the last of this run (window() says which
-        ticks). Cutting a run into several calls gives the same bits. Raises EngineError; the engine is then of no
+        edges: by input; every edge from the instant where the engine stands to the last of this run. One at the very
+        instant of the last sample recorded comes after it; in a run that is cut, window() says which ticks each part
+        takes. Cutting a run into several calls gives the same bits. Raises EngineError; the engine is then of no
         further use.
         """
         volts = self._room(samples)

@@ -39,7 +39,7 @@ class ModeError(EmulatorError):
 
 
 class SamplerError(EmulatorError):
-    """A field of a Card is out of range, or a voltage is not a number."""
+    """A field of a Card is out of range, or a voltage is not finite."""
 
 
 class EngineError(EmulatorError):

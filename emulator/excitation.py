@@ -18,6 +18,9 @@ __all__ = ["TICKS_PER_SAMPLE", "Edges", "Excitation"]
 
 TICKS_PER_SAMPLE = 1 << 22
 
+_MOST_TICKS = 2.0**53
+"""Whole numbers of ticks up to here are exact in float64."""
+
 SHAPES = ("square", "pulse", "prbs")
 CLOCKS = ("card", "free")
 
@@ -113,13 +116,18 @@ class Excitation:
 
         Any way of cutting a range into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
         hours at 20 kHz).
-        Raises ExcitationError for a frequency above half the sample rate.
+        Raises ExcitationError for a frequency above half the sample rate, or so low that a period has more ticks.
         """
         if self.frequency_hz > 0.5 * sample_rate_hz:
             raise ExcitationError(
                 f"excitation: frequency_hz {self.frequency_hz!r} exceeds half the sample rate of {sample_rate_hz!r} Hz"
             )
         period = TICKS_PER_SAMPLE * sample_rate_hz / (self.frequency_hz * (1.0 + 1e-6 * self.drift_ppm))
+        if not period <= _MOST_TICKS:
+            raise ExcitationError(
+                f"excitation: frequency_hz {self.frequency_hz!r} is too low at {sample_rate_hz!r} samples/s: "
+                "a period has more than 2^53 ticks"
+            )
         # An edge on the card's clock may be up to a sample later than its ideal instant: begin a period early.
         first = math.floor(start_tick / period) - 1
         last = math.ceil(stop_tick / period) + 1

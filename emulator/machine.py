@@ -32,7 +32,7 @@ from .errors import CircuitError, EmulatorError, EngineError, ModeError, PotErro
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .nodal import Nodal, PiecewiseLinear
 from .patching import Patch, patches
-from .pot import END_FRACTION, checked_dial
+from .pot import END_FRACTION, checked_dial, checked_ramp
 
 __all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch"]
 
@@ -191,13 +191,12 @@ class AnalogComputer:
         With ramp_n they turn evenly while run() plays on, and arrive ramp_n samples after the last one taken (sample 0
         when there is none yet). Wipers rest on the nearest winding, on the way too. A pot that is turned again goes on
         from where it is.
-        Raises PotError for a dial off its track, a pot that is not there or a ramp of less than no samples, and
+        Raises PotError for a dial off its track, a pot that is not there or a ramp of no whole number of samples, and
         EngineError for a circuit that the engine refuses (a machine that has not been played yet: run() does); nothing
         is turned then.
         """
         goals = self.resting(dials)
-        if ramp_n < 0:
-            raise PotError(f"pots {', '.join(dials)}: cannot turn in {ramp_n} samples")
+        checked_ramp(ramp_n, dials)
         with self._changing():
             for pot in goals:
                 self._turns.pop(pot, None)
@@ -301,13 +300,16 @@ class AnalogComputer:
         """Records the next samples: float64 (samples, readings), V.
 
         edges: by input, within window(samples). switches: in order of time, from the present instant to the last of
-        the run; one at the instant of a sample comes right after that sample.
+        the run; one at the instant of a sample comes right after that sample. There are none while a pot is turning.
         Raises ModeError and EngineError, the former before anything is played.
         """
         edges = edges or {}
         self._check_switches([mode for _, mode in switches])
         if switches and self._turns:
-            raise ModeError(f"relays cannot switch between samples while {', '.join(self._turns)} are being turned")
+            raise ModeError(
+                f"relays cannot switch within a run while {', '.join(self._turns)} are being turned: "
+                "switch() between two runs"
+            )
         self._check_instants(samples, [tick for tick, _ in switches])
         volts = []
         stop = self.recorded + samples

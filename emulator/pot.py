@@ -11,14 +11,16 @@ which is less than its dial shows. An operator either sets the dial, or sets the
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CircuitError, PotError
+from .whole import is_whole
 
-__all__ = ["END_FRACTION", "PotModel", "checked_dial", "coefficient_under_load", "dial_for", "legs_ohm"]
+__all__ = ["END_FRACTION", "PotModel", "checked_dial", "checked_ramp", "coefficient_under_load", "dial_for", "legs_ohm"]
 
 _PLACES = 5000
 """Into which a continuous track is divided for its noise."""
@@ -32,6 +34,13 @@ def checked_dial(dial: float, name: str = "pot") -> float:
     if not 0.0 <= dial <= 1.0:
         raise PotError(f"pot {name}: dial {dial!r} is beyond the track (0 to 1)", element=name)
     return dial
+
+
+def checked_ramp(ramp_n: int, pots: Iterable[str]) -> int:
+    """The samples of a ramp when they are a whole number and not negative, else PotError naming the pots."""
+    if not (is_whole(ramp_n) and ramp_n >= 0):
+        raise PotError(f"pots {', '.join(pots)}: cannot turn in {ramp_n!r} samples")
+    return ramp_n
 
 
 def coefficient_under_load(dial: float, track_ohm: float, load_ohm: float) -> float:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import SamplerError
+from .whole import is_whole
 
 __all__ = ["CARDS", "RANGES_V", "Card", "Sampler", "drawn_levels"]
 
@@ -69,7 +70,9 @@ class Card:
     stuck_low: int = 0
 
     def __post_init__(self) -> None:
-        self._require("bits", 1 <= self.bits <= _MAX_BITS, f"must be 1 to {_MAX_BITS}")
+        self._require(
+            "bits", is_whole(self.bits) and 1 <= self.bits <= _MAX_BITS, f"must be a whole number, 1 to {_MAX_BITS}"
+        )
         self._require("rate_hz", math.isfinite(self.rate_hz) and self.rate_hz > 0, "must be positive and finite")
         for channel, (low, high) in enumerate(self.ranges_v):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -147,9 +150,11 @@ class Card:
         count = len(self.levels_lsb)
         if count not in (0, codes - 1) or not all(map(math.isfinite, self.levels_lsb)):
             raise SamplerError(f"card: levels_lsb must be {codes - 1} finite numbers or none, got {count}")
-        self._require("missing_codes", all(0 < c < codes - 1 for c in self.missing_codes), f"must be 1 to {codes - 2}")
+        given = all(is_whole(code) and 0 < code < codes - 1 for code in self.missing_codes)
+        self._require("missing_codes", given, f"must be whole numbers, 1 to {codes - 2}")
         for field in ("stuck_high", "stuck_low"):
-            self._require(field, 0 <= getattr(self, field) < codes, f"must be a mask of {self.bits} bits")
+            mask = getattr(self, field)
+            self._require(field, is_whole(mask) and 0 <= mask < codes, f"must be a mask of {self.bits} bits")
         self._require("stuck_high", not self.stuck_high & self.stuck_low, "has a bit that stuck_low has too")
 
     def _require(self, field: str, holds: object, what: str) -> None:
@@ -182,20 +187,23 @@ class Sampler:
 
         Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. Clipped says that what the
         converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
-        Raises SamplerError for a voltage that is not a number, or another shape.
+        Raises SamplerError for a voltage that is not finite, or another shape.
         """
         return self.converted(self.seen_lsb(volts))
 
     def seen_lsb(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
 
-        Raises SamplerError for a voltage that is not a number, or another shape.
+        Raises SamplerError for a voltage that is not finite, or another shape.
         """
         if volts.ndim != 2 or volts.shape[1] != self.card.channels:
             raise SamplerError(f"the card has {self.card.channels} channels, got volts of shape {volts.shape}")
-        if np.isnan(volts).any():
-            sample, channel = np.argwhere(np.isnan(volts))[0]
-            raise SamplerError(f"sample {sample} of the block, channel {channel}: the voltage is not a number")
+        if not np.isfinite(volts).all():
+            sample, channel = np.argwhere(~np.isfinite(volts))[0]
+            volt = volts[sample, channel]
+            raise SamplerError(
+                f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
+            )
         noise = self._rng.standard_normal(volts.shape) * self._noise_lsb + self._offset_lsb
         held_v = self._acquired(volts) * self._gain - self._droop_v
         return np.asarray((held_v - self._low_v) / self._lsb_v + noise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -16,10 +17,11 @@ from .errors import CircuitError, EngineError, PotError
 from .excitation import Excitation
 from .machine import AnalogComputer, Mode
 from .opamp import OpAmpModel, preset
-from .pot import PotModel, checked_dial
+from .pot import PotModel, checked_dial, checked_ramp
 from .program import CHANNELS, SOURCE, Program, Scales
 from .quarter_car import BUMP_STOP, FRONT, SHOCK
 from .two_mass import TWO_MASS
+from .whole import is_whole
 
 __all__ = ["CHANNELS", "PROGRAMS", "SOURCE", "PlannedTurn", "RampedTweak", "SuspensionComputer", "Tweak", "in_full"]
 
@@ -126,11 +128,11 @@ class SuspensionComputer:
         """What play(..., samples, tweaks) would do to the pots, in order of time. Raises PotError."""
         turns = []
         for sample, settings, ramp_n in sorted(map(in_full, tweaks), key=lambda tweak: tweak[0]):
-            if not 0 <= sample < samples:
+            if not (is_whole(sample) and 0 <= sample < samples):
                 raise PotError(
-                    f"tweak of {', '.join(settings)} at sample {sample}: the run has samples 0 to {samples - 1}"
+                    f"tweak of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
                 )
-            turns.append(PlannedTurn(sample, self.dials_for(**settings), ramp_n))
+            turns.append(PlannedTurn(sample, self.dials_for(**settings), checked_ramp(ramp_n, settings)))
         return turns
 
     def play(
@@ -234,6 +236,8 @@ def _program(program: str | Program) -> Program:
 
 
 def _models(opamp: str | OpAmpModel, count: int, rng: np.random.Generator | None, offset_v: float) -> list[OpAmpModel]:
+    if not 0 <= offset_v < math.inf:
+        raise CircuitError(f"offset_v must be finite and not negative, got {offset_v!r}")
     model = preset(opamp) if isinstance(opamp, str) else opamp
     if rng is None:
         return [model] * count

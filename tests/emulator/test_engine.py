@@ -245,6 +245,14 @@ def test_setting_an_equal_circuit_or_an_equal_level_changes_no_bit() -> None:
     assert touched.counts == plain.counts
 
 
+def test_an_edge_at_the_instant_of_the_last_sample_comes_after_it() -> None:
+    engine = Engine(follower(), ["out"])
+    assert engine.run(2, steps((0.0, 1.0)))[-1, 0] == pytest.approx(1.0)
+    assert engine.run(1, steps((1.0, 3.0)))[0, 0] == pytest.approx(3.0)
+    with pytest.raises(EngineError, match="before the last sample recorded"):
+        engine.run(1, steps((1.5, 2.0)))
+
+
 def test_a_new_circuit_takes_over_the_voltages() -> None:
     def low_pass(ohm: float) -> PiecewiseLinear:
         return piecewise_linear(Circuit([SOURCE, Resistor("R1", "in", "out", ohm), Capacitor("C1", "out", "0", 1e-9)]))

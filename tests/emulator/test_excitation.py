@@ -138,3 +138,8 @@ def test_a_field_out_of_range_is_refused_by_name(field: str, value: object) -> N
 def test_a_frequency_that_the_card_cannot_follow_is_refused() -> None:
     with pytest.raises(ExcitationError, match="frequency_hz 10001.0 exceeds half the sample rate"):
         Excitation(frequency_hz=10001.0).edges(0, 1, RATE_HZ)
+
+
+def test_a_period_of_more_ticks_than_can_be_counted_is_refused() -> None:
+    with pytest.raises(ExcitationError, match=r"frequency_hz 0.1 is too low .* more than 2\^53 ticks"):
+        Excitation(frequency_hz=0.1).edges(0, 1, 1e15)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from emulator import (
     COMPONENTS,
+    TICKS_PER_SAMPLE,
     AnalogComputer,
     Card,
     Components,
@@ -180,13 +182,16 @@ def test_lists_of_pots_do_not_show_their_contacts() -> None:
     assert computer.machine.coefficient("K") == pytest.approx(silent.coefficient("K"), rel=1e-7)
 
 
-def test_relays_do_not_switch_between_samples_while_a_pot_turns() -> None:
+def test_relays_do_not_switch_within_a_run_while_a_pot_turns() -> None:
     machine = SuspensionComputer("front").machine
     machine.switch(Mode.OPERATE)
     machine.run(2)
     machine.turn({"K": 0.5}, ramp_n=10)
     with pytest.raises(ModeError, match="while K are being turned"):
         machine.run(5, switches=[(machine.window(5)[0], Mode.HOLD)])
+    with pytest.raises(ModeError, match="within a run"):
+        machine.run(5, switches=[(2 * TICKS_PER_SAMPLE, Mode.HOLD)])
+    machine.switch(Mode.HOLD)
     machine.restart()
     assert 0.8 < machine.dials["K"] < 0.86
 
@@ -214,7 +219,8 @@ def test_a_noisy_machine_is_ramped_too() -> None:
 def test_a_ramp_that_cannot_be_is_refused() -> None:
     machine = SuspensionComputer("front").machine
     before = machine.dials
-    with pytest.raises(PotError, match="pots K: cannot turn in -1 samples"):
-        machine.turn({"K": 0.5}, ramp_n=-1)
+    for ramp_n in (-1, 2.5, 5.0, math.nan):
+        with pytest.raises(PotError, match=f"pots K: cannot turn in {ramp_n} samples"):
+            machine.turn({"K": 0.5}, ramp_n=ramp_n)  # type: ignore[arg-type]
     assert machine.dials == before
     assert isinstance(machine, AnalogComputer)

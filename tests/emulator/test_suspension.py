@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -231,12 +232,20 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
     computer = SuspensionComputer("front")
     with pytest.raises(PotError, match="tweak of M_kg at sample 100: the run has samples 0 to 99"):
         computer.play(Excitation(), 100, [(100, {"M_kg": 60.0})])
+    for sample in (5.0, 5.5, math.nan):
+        with pytest.raises(PotError, match="tweak of M_kg at sample .*: the run has samples 0 to 99"):
+            computer.play(Excitation(), 100, [(sample, {"M_kg": 60.0})])  # type: ignore[list-item]
+    with pytest.raises(PotError, match=r"pots M_kg: cannot turn in 2\.5 samples"):
+        computer.play(Excitation(), 100, [(5, {"M_kg": 60.0}, 2.5)])  # type: ignore[list-item]
     with pytest.raises(ExcitationError, match="half the sample rate"):
         computer.play(Excitation(frequency_hz=15e3), 100)
     with pytest.raises(EngineError, match="-1 samples"):
         computer.play(Excitation(), -1)
     with pytest.raises(CircuitError, match="unknown program 'rear'; there are front, shock, bump-stop, two-mass"):
         SuspensionComputer("rear")
+    for offset_v in (math.nan, math.inf, -1e-3):
+        with pytest.raises(CircuitError, match="offset_v must be finite and not negative"):
+            SuspensionComputer("front", rng=np.random.default_rng(1), offset_v=offset_v)
 
 
 @pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
