@@ -87,6 +87,8 @@ SMALL = Orders(2, 2, 1, 0)
 LARGE = Orders(2, 3, 0, 1)
 FREE = Orders(2, 3, 0, 1, may_slip=True)
 """The default configuration."""
+OTHER = Orders(2, 2, 1, 1)
+"""A shape for which est.c has no code of its own."""
 
 # A build with the default trigger and nothing that can be left out.
 TRIGGER_ALONE = tuple(f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH"))
@@ -294,6 +296,8 @@ def instructions(bench: Bench) -> Iterator[Cost]:
             yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit, rival)
             if not orders.may_slip:
                 yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit, rival)
+    other = bench.estimator(M4F, OTHER)
+    yield Cost(f"{other.name}, not one of the usual shapes", other.typical, "instructions")
     for steps in (*rivals[4], *rivals[6]):
         yield Cost(steps.name, steps.typical, "instructions")
 
