@@ -25,7 +25,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench cost coverage bit-exact fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench cost coverage bit-exact analyze fuzz wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -70,6 +70,9 @@ cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and buil
 
 bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every compiler and on every target
 	@$(BIN)/python -m estimator_c.evidence.bit_exact
+
+analyze: $(PRODUCTS) ## static checkers over the core: gcc -fanalyzer, cppcheck with MISRA; see estimator_c/MISRA.md
+	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
