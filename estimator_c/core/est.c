@@ -29,7 +29,7 @@
 /// A coefficient that moves by more than this makes another filter: what the old one left of the noise of the equations before
 /// is not white to the new one, which therefore begins anew; and what was estimated with the old one is biased, and so less
 /// certain than P says, by this factor.
-#define REFRESH_STRIDE 0.02F
+#define REFRESH_STRIDE 0.05F
 #define REFRESH_DOUBT 100.0F
 
 /// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
