@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
+from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
 from .components import NOMINAL, Components, contact_of, is_part_of
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
@@ -502,6 +502,20 @@ class AnalogComputer:
                 )
             if not math.isfinite(volts):
                 raise CircuitError(f"integrator {name}: initial voltage {volts!r} is not finite")
+            if abs(volts) > REFERENCE_V:
+                raise CircuitError(
+                    f"integrator {name}: initial voltage {volts:g} V is beyond the reference of {REFERENCE_V:g} V"
+                )
+        self._check_forgotten(initial_v)
+
+    def _check_forgotten(self, initial_v: Mapping[str, float]) -> None:
+        """An amplifier that only a capacitor feeds back drifts into its limit unless INITIAL CONDITION charges it."""
+        ends = [frozenset(part.nodes) for part in self._patched.elements if not isinstance(part, Capacitor | OpAmp)]
+        for amp in self._patched.of(OpAmp):
+            patch = self._patches[amp.name]
+            fed_back = any({patch.junction, patch.out} <= nodes for nodes in ends)
+            if patch.capacitors and not fed_back and amp.name not in initial_v:
+                raise CircuitError(f"{label(amp)}: an integrator needs an initial voltage, if only {amp.name}: 0.0")
 
     # ---- reading pots
 

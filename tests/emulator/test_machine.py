@@ -655,3 +655,13 @@ def test_a_coefficient_is_read_beyond_the_wiper_whatever_its_load_is_called(load
     machine = AnalogComputer(Circuit(parts.fitted(elements)), ["out"], components=parts)
     machine.switch(Mode.POT_SET)
     assert machine.coefficient("M") == pytest.approx(0.5 / 1.025 * 0.95, rel=1e-5)
+
+
+def test_integrator_whose_initial_voltage_was_forgotten_is_refused() -> None:
+    with pytest.raises(CircuitError, match=r"OpAmp U3 .* an integrator needs an initial voltage, if only U3: 0.0"):
+        AnalogComputer(SuspensionComputer("front").circuit, ["u3"], initial_v={"U2": 0.0})
+
+
+def test_initial_voltage_beyond_the_reference_is_refused() -> None:
+    with pytest.raises(CircuitError, match="integrator U3: initial voltage 50 V is beyond the reference of 10 V"):
+        AnalogComputer(SuspensionComputer("front").circuit, ["u3"], initial_v={"U2": 0.0, "U3": 50.0})
