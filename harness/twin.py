@@ -305,7 +305,7 @@ class Twin:
         if step > REFRESH_STEP and _stable(c):
             self.whitener.c = c
             if step > REFRESH_STRIDE:
-                self.whitener.restart()
+                self.pending = 1
                 self.covariance.inflate(REFRESH_DOUBT)
             else:
                 self.whitener.rows = [(list(c), 1.0) for _ in range(max(len(c), 1))]

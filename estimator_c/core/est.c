@@ -131,14 +131,18 @@ static void restart(est_t* const self, const uint8_t pending_n) {
     self->pending_n = larger(self->pending_n, pending_n);
 }
 
-/// One sample less to come before the next equation is complete. What an alarm leaves to do is done here, where there is time:
-/// the step that raises it is long enough.
+/// One sample less to come before the next equation is complete. What an alarm, or a new C, leaves to do to P is done here, where
+/// there is time: the step that finds it is long enough.
 static void gather(est_t* const self) {
     self->pending_n--;
-    if (self->afresh) {
-        self->afresh = false;
+    if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
+    } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_DOUBT)) {
+        est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
+    } else {
+        // P is as it should be
     }
+    self->renewal = EST_RENEWAL_NONE;
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
         count(&self->counters.restarts);
@@ -311,8 +315,8 @@ static void refresh_prefilter(est_t* const self) {
         est_whitener_set(&self->whitener, c, na);
         count(&self->counters.refreshes);
         if (far) {
-            est_whitener_restart(&self->whitener);
-            est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
+            self->renewal = EST_RENEWAL_DOUBT;
+            restart(self, 1U);
         }
     }
 }
@@ -362,7 +366,7 @@ static void estimate_afresh(est_t* const self) {
         zero(self->theta, self->count);
     }
     self->refresh_in = self->config->refresh_n;
-    self->afresh      = true;
+    self->renewal     = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
 }
 

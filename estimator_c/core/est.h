@@ -234,6 +234,11 @@ typedef struct {
     uint16_t mean_n;                    ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
 } est_trigger_t;
 
+/// The values of est_t.renewal. Private.
+#define EST_RENEWAL_NONE 0U
+#define EST_RENEWAL_RESET 1U  ///< P := P0, after an alarm
+#define EST_RENEWAL_DOUBT 2U  ///< less certain, after C has moved far
+
 /// The state of an estimator. The fields are private; read them through the functions below. The small ones come first: an
 /// offset below 128 bytes is a shorter instruction.
 typedef struct {
@@ -242,7 +247,7 @@ typedef struct {
     uint8_t             same_n;     ///< samples since an edge of u for which y has been the same
     uint8_t             pending_n;  ///< samples to come before the next equation is complete
     bool                adaptive;   ///< there is more to adapt than theta and C
-    bool                afresh;     ///< P is to be reset before the next equation
+    uint8_t             renewal;    ///< what is to be done to P before the next equation
     bool                known;      ///< the sample before this one is known
     uint16_t            refresh_in;  ///< equations to come before C is taken from A; 0: never
     float               noise_variance;  ///< [codes^2]

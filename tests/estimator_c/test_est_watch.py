@@ -19,7 +19,7 @@ def front(seed: int = 3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def test_stuck_displacement_is_refused_from_the_stated_sample_on_until_it_moves(estimator: Estimator) -> None:
     u, y = front()
     y[400:600] = y[399]
-    assert estimator.init(stuck_n=16, kind=NONE)
+    assert estimator.init(stuck_n=16, kind=NONE, refresh_n=0)
     result = estimator.run(u, y)
     # The first edge of the stuck stretch comes at 410: that sample is the first of the sixteen.
     assert (result.status[410:425] == UPDATED).all()
@@ -31,7 +31,7 @@ def test_stuck_displacement_is_refused_from_the_stated_sample_on_until_it_moves(
 
 def test_displacement_may_rest_while_the_force_does(estimator: Estimator) -> None:
     u, y = np.zeros(300), np.full(300, 410.0)
-    assert estimator.init()
+    assert estimator.init(refresh_n=0)
     assert (estimator.run(u, y).status[2:] == UPDATED).all()
 
 
@@ -40,7 +40,7 @@ def test_a_gap_does_not_make_a_stuck_displacement_good(estimator: Estimator) -> 
     y[400:600] = y[399]
     valid = np.ones(N)
     valid[[450, 500, 501]] = 0
-    assert estimator.init(kind=NONE)
+    assert estimator.init(kind=NONE, refresh_n=0)
     status = estimator.run(u, y, valid).status
     assert (status[[450, 500, 501]] == MISSING).all()
     assert (np.delete(status[425:600], [25, 75, 76]) == REFUSED).all()
@@ -52,7 +52,7 @@ def test_reading_at_the_end_of_the_converter_is_saturated(estimator: Estimator, 
     u, y = front()
     u, y = u * 0.8 + 300.0, y * 0.8 + 300.0
     (u if channel == "u" else y)[300] = code
-    assert estimator.init(code_low=0.0, code_high=4095.0, kind=NONE)
+    assert estimator.init(code_low=0.0, code_high=4095.0, kind=NONE, refresh_n=0)
     result = estimator.run(u, y)
     assert result.status[299:304].tolist() == [UPDATED, REFUSED, GATHERING, GATHERING, UPDATED]
     assert result.theta[300].tobytes() == result.theta[299].tobytes()
@@ -80,7 +80,7 @@ def test_lost_excitation_is_reported_and_its_return(estimator: Estimator) -> Non
 def test_own_trigger_is_asked_at_every_innovation_and_told_when_it_begins_anew(estimator: Estimator) -> None:
     u, y = front()
     assert not estimator.init(kind=CUSTOM)
-    assert estimator.init(kind=CUSTOM, custom=1, ceiling=100.0, warm_up_n=50, hold_off_n=10)
+    assert estimator.init(kind=CUSTOM, custom=1, refresh_n=0, ceiling=100.0, warm_up_n=50, hold_off_n=10)
     alarms = estimator.run(u, y).alarms
     # Two samples gathered, 50 of warm-up; after an alarm two gathered and ten held.
     assert alarms.tolist() == [151, 263, 375, 487, 599, 711]
