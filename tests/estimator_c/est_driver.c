@@ -1,6 +1,7 @@
 /* Runs whole blocks of samples through the public header est.h, for the tests. */
 
 #include "est.h"
+#include "est_isolation.h"
 
 #include <stddef.h>
 
@@ -123,5 +124,46 @@ void driver_counters(unsigned out[9]) {
                                c.refreshes };
     for (int i = 0; i < 9; i++) {
         out[i] = all[i];
+    }
+}
+
+int driver_can_isolate(void) {
+    static est_isolation_t isolation;
+    return est_isolation_init(&isolation, &config) ? 1 : 0;
+}
+
+/* t runs of n samples, each from the start; `slices` calls of est_isolation_work() after each sample. found, (t, 8): the first
+   alarm at or after `from`, the sample of the diagnosis (n: none), class, extent then and at the end, onset before the alarm,
+   the least and the most. */
+void driver_isolate(size_t t, size_t n, const double* u, const double* y, const unsigned char* valid, const long long* from,
+                    int slices, double* found) {
+    static est_isolation_t isolation;
+    for (size_t run = 0; run < t; run++) {
+        double* const out = &found[run * 8U];
+        out[0] = out[1] = (double)n;
+        out[2] = out[3] = 0.0;
+        est_init(&self, &config);
+        est_isolation_init(&isolation, &config);
+        for (size_t k = 0; k < n; k++) {
+            const size_t       at     = (run * n) + k;
+            const est_sample_t sample = { .u = (float)u[at], .y = (float)y[at], .valid = valid[at] != 0 };
+            const est_step_t   step   = est_step(&self, sample);
+            est_isolation_enter(&isolation, &self, sample, step);
+            for (int i = 0; (i < slices) && est_isolation_work(&isolation); i++) {
+            }
+            const est_diagnosis_t now = est_isolation_diagnosis(&isolation);
+            if (step.alarm && (out[0] >= (double)n) && ((long long)k >= from[run])) {
+                out[0] = (double)k;
+            }
+            if ((out[0] < (double)n) && (out[1] >= (double)n) && (now.change != EST_CHANGE_UNDECIDED)) {
+                out[1] = (double)k;
+                out[2] = (double)now.change;
+                out[3] = now.extent;
+                out[5] = now.onset_n;
+                out[6] = now.onset_low_n;
+                out[7] = now.onset_high_n;
+            }
+            out[4] = now.extent;
+        }
     }
 }

@@ -67,6 +67,29 @@ class Result:
     """After the last sample; codes^2."""
 
 
+CHANGES = ("undecided", "M", "B", "K", "several")
+
+
+@dataclass(frozen=True, eq=False)
+class Isolated:
+    """The diagnoses of t runs; (t,) each."""
+
+    alarm: NDArray[np.float64]
+    """Sample; the length of the run if there was none."""
+    at: NDArray[np.float64]
+    """Sample of the diagnosis; the length of the run if there was none."""
+    change: NDArray[np.str_]
+    """One of CHANGES."""
+    extent: NDArray[np.float64]
+    """New over old, at the diagnosis."""
+    refined: NDArray[np.float64]
+    """The same, at the end of the run."""
+    onset_n: NDArray[np.float64]
+    """Samples from the onset to the alarm, at the diagnosis; the least and the most likewise."""
+    least_n: NDArray[np.float64]
+    most_n: NDArray[np.float64]
+
+
 class Estimator:
     """One estimator at a time, as in the driver."""
 
@@ -120,6 +143,29 @@ class Estimator:
         pointers = (ctypes.c_void_p(a.ctypes.data) for a in arrays)
         self._c.driver_watch(ctypes.c_size_t(runs), ctypes.c_size_t(samples), *pointers)
         return alarm, theta
+
+    def can_isolate(self) -> bool:
+        """est_isolation_init() with the configuration of the last init()."""
+        return bool(self._c.driver_can_isolate())
+
+    def isolate(
+        self,
+        u: NDArray[np.float64],
+        y: NDArray[np.float64],
+        start: NDArray[np.int64],
+        valid: ArrayLike | None = None,
+        slices: int = 1000,
+    ) -> Isolated:
+        """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,)."""
+        runs, samples = u.shape
+        found = np.zeros((runs, 8))
+        valid_ = np.ascontiguousarray(np.ones((runs, samples)) if valid is None else valid, dtype=np.uint8)
+        inputs = (np.ascontiguousarray(u), np.ascontiguousarray(y), valid_, np.ascontiguousarray(start, np.int64))
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in inputs]
+        counts = (ctypes.c_size_t(runs), ctypes.c_size_t(samples))
+        self._c.driver_isolate(*counts, *pointers, slices, ctypes.c_void_p(found.ctypes.data))
+        alarm, at, change, extent, refined, onset, least, most = found.T
+        return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
 
 
 def compile_driver(folder: Path, *options: str) -> Path:

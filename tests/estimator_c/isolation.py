@@ -1,0 +1,168 @@
+"""Measures of the isolation: how often the class is right, how soon against the isolation bound, and the extent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.estimator_c.est_driver import Estimator, Isolated
+from tests.estimator_c.performance import Settings
+from tests.estimator_c.plants import (
+    CODES,
+    DISPLACEMENT_RANGE_M,
+    VARIANCE_LSB2,
+    Array,
+    Excitation,
+    Mechanics,
+    Trials,
+    simulate,
+)
+
+LEARNT_N = 600
+ONSET_SPAN_N = 100
+HORIZON_N = 150
+SAMPLES = LEARNT_N + ONSET_SPAN_N + HORIZON_N
+LN_CERTAIN = float(np.log(20.0))
+FACTORS = np.exp(np.linspace(np.log(0.25), np.log(4.0), 111))
+"""Magnitudes of a rival; the best is interpolated."""
+
+Change = Mapping[str, float]
+"""Factors of "M", "B", "K"; those that do not change are absent."""
+
+
+@dataclass(frozen=True)
+class Isolation:
+    """Of one change, over t trials."""
+
+    reported: float
+    """Share of the trials in which a class was reported within the horizon."""
+    right: float
+    """Share of the reports that named the true class."""
+    mean_n: float
+    """Samples from the change to the report, HORIZON_N where there was none."""
+    bound_n: float
+    """Mean of the isolation bounds of these very trials; NaN if not asked for."""
+    within_twice: float
+    """Share of the trials in which the report came within twice the bound of that trial."""
+    error: float
+    """Largest relative error of the extent in 95 % of the right reports, at the report; NaN if several had changed."""
+    error_refined: float
+    """The same at the end of the run."""
+
+
+def changed(plant: Mechanics, change: Change) -> Mechanics:
+    """The plant after the change."""
+    for parameter, factor in change.items():
+        plant = plant.scaled(parameter, factor)
+    return plant
+
+
+def play(plant: Mechanics, change: Change, excitation: Excitation, trials: int, seed: int) -> Trials:
+    """Onset and phase at random."""
+    onset = np.random.default_rng([seed, 1]).integers(LEARNT_N, LEARNT_N + ONSET_SPAN_N, trials)
+    return simulate((plant, changed(plant, change)), onset, excitation, SAMPLES, seed)
+
+
+def truth(change: Change) -> str:
+    """The class that should be reported."""
+    return next(iter(change)) if len(change) == 1 else "several"
+
+
+def judged(found: Isolated, played: Trials, change: Change, bound_n: Array) -> Isolation:
+    """The measures of these diagnoses; ``bound_n`` (t,)."""
+    reported, right = found.change != "undecided", found.change == truth(change)
+    taken_n = np.where(reported, found.at - played.onset, HORIZON_N)
+    errors = [float("nan")] * 2
+    if len(change) == 1 and right.any():
+        factor = change[truth(change)]
+        errors = [float(np.percentile(np.abs(e[right] / factor - 1.0), 95)) for e in (found.extent, found.refined)]
+    return Isolation(
+        reported=float(reported.mean()),
+        right=float(right.sum() / max(reported.sum(), 1)),
+        mean_n=float(taken_n.mean()),
+        bound_n=float(bound_n.mean()),
+        within_twice=float((taken_n <= 2.0 * bound_n).mean()),
+        error=errors[0],
+        error_refined=errors[1],
+    )
+
+
+def measure(
+    estimator: Estimator,
+    settings: Settings,
+    plant: Mechanics,
+    change: Change,
+    excitation: Excitation,
+    trials: int,
+    seed: int,
+    *,
+    bounded: bool = True,
+) -> Isolation:
+    """Play the change in so many trials; ``bounded``: with the bounds of these trials, which take a while."""
+    played = play(plant, change, excitation, trials, seed)
+    assert estimator.init(**settings)
+    found = estimator.isolate(played.u, played.y, played.onset)
+    bound_n = bounds(plant, change, excitation, played.onset, seed) if bounded else np.full(trials, np.nan)
+    return judged(found, played, change, bound_n)
+
+
+def bounds(
+    plant: Mechanics, change: Change, excitation: Excitation, onset: NDArray[np.int64], seed: int
+) -> NDArray[np.float64]:
+    """(t,) samples after which the trials of ``play`` separate the truth from every single rival at its best by ln 20.
+
+    All know the onset, and the course up to it. HORIZON_N where the data do not.
+    """
+    first = excitation.first_edges(np.random.default_rng(seed), len(onset))
+    course = _courses(plant, [changed(plant, change)], excitation, first, onset)[0]
+    least = np.full(course.shape, np.inf)
+    for rival in "MBK":
+        if rival != truth(change):
+            others = _courses(plant, [plant.scaled(rival, f) for f in FACTORS], excitation, first, onset)
+            least = np.minimum(least, _least(np.cumsum((others - course) ** 2, axis=1) / (2.0 * VARIANCE_LSB2)))
+    reached = least >= LN_CERTAIN
+    return np.asarray(np.where(reached.any(axis=0), reached.argmax(axis=0) + 1.0, float(HORIZON_N)))
+
+
+def _least(divergence: Array) -> Array:
+    """(f, n, t) at evenly spaced f: the least over f (n, t), by a parabola through the three lowest."""
+    at = np.clip(divergence.argmin(axis=0), 1, len(divergence) - 2)[None]
+    low, mid, high = (np.take_along_axis(divergence, at + i, axis=0)[0] for i in (-1, 0, 1))
+    curvature = low + high - 2.0 * mid
+    with np.errstate(all="ignore"):
+        least = mid - (high - low) ** 2 / (8.0 * curvature)
+    return np.asarray(np.maximum(np.where(curvature > 0.0, least, mid), 0.0))
+
+
+def _courses(
+    plant: Mechanics, plants: list[Mechanics], excitation: Excitation, first: Array, onset: NDArray[np.int64]
+) -> Array:
+    """(plants, HORIZON_N, t) codes of displacement in the samples after the onset, the plant as it was up to there."""
+    times = np.arange(HORIZON_N)[:, None] + onset
+    half_n = excitation.half_period_n * (1.0 + excitation.drift_ppm * 1e-6)
+    force_n = plant.force_range_n * excitation.part_of_range
+
+    def level(k: NDArray[np.int64]) -> Array:
+        return ((np.floor((k - first) / half_n) + 1.0) % 2.0) * force_n
+
+    def rest_n(k: NDArray[np.int64]) -> Array:
+        return k + 1.0 - (first + (np.floor((k - first) / half_n) + 1.0) * half_n)
+
+    def step(who: Mechanics, state: Array, k: NDArray[np.int64]) -> Array:
+        jump = level(k + 1) - level(k)
+        kick = np.where(jump != 0.0, who.response(np.where(jump != 0.0, rest_n(k), 1.0)) * jump, 0.0)
+        return np.asarray(who.transition(1.0) @ state + who.response(np.ones(1)) * level(k) + kick)
+
+    state = np.zeros((2, len(onset)))
+    for back in range(400, 0, -1):
+        state = step(plant, state, onset - back)
+    out = np.empty((len(plants), HORIZON_N, len(onset)))
+    for i, who in enumerate(plants):
+        now = state
+        for k in range(HORIZON_N):
+            now = step(who, now, times[k])
+            out[i, k] = now[0]
+    return out * (CODES / DISPLACEMENT_RANGE_M)
