@@ -45,6 +45,7 @@ OTHER_SOURCES = (
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/*/*.h",
+    "estimator_c/isolation/*",
     "estimator_c/catalogue/*",
     *FIXTURES,
 )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CORE = Path(__file__).parents[2] / "estimator_c" / "core"
+ISOLATION = CORE.parent / "isolation"
 STRICT = [
     "-std=c99",
     "-Wall",
@@ -173,7 +174,7 @@ def compile_driver(folder: Path, *options: str) -> Path:
     if not options and os.environ.get("EST_COVERAGE"):  # estimator_c/evidence/coverage.py counts there
         folder, options = Path(os.environ["EST_COVERAGE"]), COVERED
     library = folder / f"est_driver_{len(list(folder.iterdir()))}.so"
-    sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c"))]
-    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", f"-I{CORE}"]
+    sources = [Path(__file__).with_name("est_driver.c"), *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
+    command = [os.environ.get("CC", "cc"), "-O2", *STRICT, *options, "-shared", "-fPIC", f"-I{CORE}", f"-I{ISOLATION}"]
     subprocess.run([*command, "-o", str(library), *map(str, sources)], check=True)
     return library
