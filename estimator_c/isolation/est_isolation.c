@@ -9,9 +9,6 @@
 #define PUSH 3U  ///< the effect that stands for an onset between those that are tried
 #define NEVER UINT8_MAX
 
-/// Onsets are tried around the last sample whose statistic was zero: the sooner the alarm, the stronger the change, the
-/// closer together. What a push makes up for is an onset so far off that the force of the change has not yet moved y.
-#define SPACING_N(quiet_n) (((quiet_n) < 5U) ? 1U : (((quiet_n) < 9U) ? 2U : 4U))
 #define EARLIEST_N 24U  ///< before the alarm
 #define LATEST_N 1U
 
@@ -33,16 +30,25 @@
 /// Reciprocal variance, per noise variance, below which a change is not known at all.
 #define UNKNOWN 1.0e-3F
 
+/// Enough for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
+#define HALVINGS_N 8U
+
+/// Of the smallest a2, 1e-6.
+#define DOUBLINGS_N 20U
+
 #define LN_2 0.69314718F
 
 // ---------------------------------------------         PLANT          ---------------------------------------------
 
-/// Natural logarithm of 0 < x < 1: 2 artanh((x - 1) / (x + 1)) near 1.
-static float logarithm(float x) {
+/// Natural logarithm of 1e-6 < a < 1: 2 artanh((x - 1) / (x + 1)) near 1.
+static float logarithm(const float a) {
+    float x   = a;
     float out = 0.0F;
-    while (x < 0.70710678F) {
-        x += x;
-        out -= LN_2;
+    for (uint8_t i = 0U; i < DOUBLINGS_N; i++) {
+        if (x < 0.70710678F) {
+            x += x;
+            out -= LN_2;
+        }
     }
     const float t = (x - 1.0F) / (x + 1.0F);
     const float s = t * t;
@@ -58,12 +64,15 @@ static float root(const float x) {
     return out;
 }
 
-/// arcosh(x)^2, which is -arccos(x)^2 below 1. x > -1; is halved by cosh(w / 2)^2 = (1 + cosh(w)) / 2 until the series serves.
-static float squared_arcosh(float x) {
+/// arcosh(a)^2, which is -arccos(a)^2 below 1. a > -1; is halved by cosh(w / 2)^2 = (1 + cosh(w)) / 2 until the series serves.
+static float squared_arcosh(const float a) {
+    float x     = a;
     float scale = 2.0F;
-    while ((x > 1.1F) || (x < 0.9F)) {
-        x = root(0.5F * (1.0F + x));
-        scale *= 4.0F;
+    for (uint8_t i = 0U; i < HALVINGS_N; i++) {
+        if ((x > 1.1F) || (x < 0.9F)) {
+            x = root(0.5F * (1.0F + x));
+            scale *= 4.0F;
+        }
     }
     const float z = x - 1.0F;
     return scale * z * (1.0F - (z * (0.16666667F - (z * (0.044444444F - (z * 0.014285714F))))));
@@ -257,6 +266,7 @@ static uint8_t best(const est_fit_t* const fit) {
 
 /// What can be said so far. `unit`: squared codes per nat.
 static est_change_t verdict(const est_fit_t* const fit, const float unit, const float noise_variance) {
+    static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
     const uint8_t one    = best(fit);
     bool ruled = fit->known[one] > (EXTENT_KNOWN * noise_variance);
     for (uint8_t other = 0U; other < 3U; other++) {
@@ -270,7 +280,7 @@ static est_change_t verdict(const est_fit_t* const fit, const float unit, const 
                     ((fit->alone[one] - fit->alone[other]) >= (SURE * unit));
         }
     }
-    return ruled ? (est_change_t)(one + 1U) : EST_CHANGE_UNDECIDED;
+    return ruled ? alone[one] : EST_CHANGE_UNDECIDED;
 }
 
 /// 1 - old/new of M; new/old - 1 of B and K.
@@ -318,9 +328,18 @@ static void stop(est_isolation_t* const self) {
     self->quiet_n   = NEVER;
 }
 
+/// Onsets are tried around the last sample whose statistic was zero: the sooner the alarm, the stronger the change, the
+/// closer together. What a push makes up for is an onset so far off that the force of the change has not yet moved y.
+static uint32_t spacing(const uint8_t quiet_n) {
+    if (quiet_n < 5U) {
+        return 1U;
+    }
+    return (quiet_n < 9U) ? 2U : 4U;
+}
+
 /// How long before the alarm onset number i is tried: the first onset first.
 static uint8_t before(const uint8_t quiet_n, const uint8_t i, const uint8_t earliest_n) {
-    const uint32_t spacing_n = SPACING_N(quiet_n);
+    const uint32_t spacing_n = spacing(quiet_n);
     const uint32_t later_n   = spacing_n * i;
     const uint32_t n         = quiet_n + (spacing_n * (EST_ISOLATION_ONSETS_N / 2U));
     const uint32_t wanted_n  = (n > (later_n + LATEST_N)) ? (n - later_n) : LATEST_N;
