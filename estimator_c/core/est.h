@@ -290,6 +290,7 @@ uint8_t est_theta_count(const est_t* self);
 float est_theta(const est_t* self, uint8_t index);
 
 /// One diagonal element of P [noise variances]; index in [0, est_theta_count()), asserted. Cost: O(n).
+/// After an alarm it is that of before until the next sample.
 float est_variance(const est_t* self, uint8_t index);
 
 /// The variance of the noise [codes^2]: as configured, or as estimated.
