@@ -6,12 +6,11 @@ each answer says which message it answers.
 
 from __future__ import annotations
 
-import time
 from typing import TypeVar
 
 from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status
 from harness.errors import LinkError, LinkTimeout
-from harness.link import Clock, Link
+from harness.link import Link
 
 _SEQ = 256
 """Sequence numbers are modulo this."""
@@ -22,12 +21,12 @@ Answer = TypeVar("Answer", Hello, Firmware, Controlled, Configured, Status)
 class Conversation:
     """What the harness and one device say to each other. Errors lead with the device's name."""
 
-    def __init__(self, link: Link, name: str, timeout_s: float, clock: Clock = time.monotonic) -> None:
+    def __init__(self, link: Link, name: str, timeout_s: float) -> None:
         """Over ``link``, with the device ``name``; ``timeout_s`` is for all the answers to one message."""
         self.link = link
         self.name = name
         self.timeout_s = timeout_s
-        self.clock = clock
+        self.clock = link.clock
         self._seq = 0
         self._expected: int | None = None
         self._last: Message | None = None

@@ -10,7 +10,6 @@ import dataclasses
 import enum
 import secrets
 import struct
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -55,7 +54,8 @@ from harness.errors import (
 )
 from harness.estimator_config import EstimatorConfig
 from harness.host_process import HostProcess
-from harness.link import DEFAULT_BAUD, Clock, Link, MemoryLink, SerialLink
+from harness.link import FramedLink, Link
+from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire, Wire
 
 DEFAULT_TIMEOUT_S = 2.0
 LONGEST_TIMEOUT_S = 3600.0
@@ -139,10 +139,10 @@ class DeviceDescription:
 class Dut:
     """A device behind a link. Every error names the device, what was expected and what came instead."""
 
-    def __init__(self, link: Link, description: DeviceDescription, clock: Clock = time.monotonic) -> None:
+    def __init__(self, link: Link, description: DeviceDescription) -> None:
         """Take over ``link``; nothing is sent yet."""
         self._description = description
-        self._talk = Conversation(link, description.name, description.timeout_s, clock)
+        self._talk = Conversation(link, description.name, description.timeout_s)
         self._identity: Identity | None = None
         self._next_index = 0
 
@@ -419,7 +419,7 @@ def reopen_dut(description: Mapping[str, Any]) -> Dut:
 
 def connect(description: DeviceDescription) -> Dut:
     """Reach the device, shake hands, configure it; errors as ``open_dut``."""
-    dut = Dut(_link(description), description)
+    dut = Dut(FramedLink(_wire(description)), description)
     try:
         _handshake(dut, description)
         dut.configure()
@@ -438,12 +438,12 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
         raise LinkTimeout(f"{error}; the line was opened at {description.baud} baud") from error
 
 
-def _link(description: DeviceDescription) -> Link:
+def _wire(description: DeviceDescription) -> Wire:
     if description.kind == "host":
         return HostProcess()
     if description.kind == "inproc":
-        return MemoryLink(boot_nonce=secrets.randbits(32))
-    return SerialLink(str(description.url), description.baud)
+        return MemoryWire(boot_nonce=secrets.randbits(32))
+    return PortWire(str(description.url), description.baud)
 
 
 def _float32(value: float) -> float:

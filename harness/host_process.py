@@ -1,15 +1,14 @@
-"""The device as a process of this computer, behind a pseudo-terminal: a link that owns its other end."""
+"""The device as a process of this computer, behind a pseudo-terminal: a wire that owns its other end."""
 
 from __future__ import annotations
 
 import select
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from harness.catalogue import Message
 from harness.errors import LinkClosed, LinkError
-from harness.link import SerialLink
+from harness.wire import PortWire
 
 PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 
@@ -18,7 +17,7 @@ END_TIMEOUT_S = 2.0
 
 
 class HostProcess:
-    """Starts the host port and links to it. The process ends with the link, and when this process dies."""
+    """Starts the host port and is the wire to it. The process ends with the wire, and when this process dies."""
 
     name = "pty"
 
@@ -38,33 +37,30 @@ class HostProcess:
         except OSError as error:
             raise LinkError(f"cannot start {program}: {error.strerror}; run `make setup`") from error
         try:
-            self._link = SerialLink(self._terminal(), name=self.name)
+            self._wire = PortWire(self._terminal(), name=self.name)
         except BaseException:
             self._end()
             raise
+        self.clock = self._wire.clock
 
     @property
     def pid(self) -> int:
         return self._process.pid
 
-    @property
-    def dropped(self) -> int:
-        return self._link.dropped
-
-    def send(self, messages: Iterable[Message]) -> None:
+    def write(self, sent: bytes) -> None:
         try:
-            self._link.send(messages)
+            self._wire.write(sent)
         except LinkClosed as error:
             raise LinkClosed(self._obituary()) from error
 
-    def receive(self, timeout_s: float) -> Message | None:
+    def read(self, timeout_s: float) -> bytes:
         try:
-            return self._link.receive(timeout_s)
+            return self._wire.read(timeout_s)
         except LinkClosed as error:
             raise LinkClosed(self._obituary()) from error
 
     def close(self) -> None:
-        self._link.close()
+        self._wire.close()
         self._end()
 
     def _terminal(self) -> str:

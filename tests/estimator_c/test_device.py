@@ -42,7 +42,8 @@ from harness.catalogue import (
     Trigger,
     pack,
 )
-from harness.link import LIBRARY, MemoryLink
+from harness.link import FramedLink
+from harness.wire import LIBRARY, MemoryWire
 from tests.estimator_c.est_driver import Estimator
 
 M = TypeVar("M", bound=Message)
@@ -54,7 +55,7 @@ class Device:
     """A device and the numbering of what it is told."""
 
     def __init__(self, catalogue_hash: int = CATALOGUE_HASH) -> None:
-        self.link = MemoryLink(NONCE, catalogue_hash=catalogue_hash)
+        self.link = FramedLink(MemoryWire(NONCE, catalogue_hash=catalogue_hash))
         self.seq = 0
 
     def tell(self, message: Message) -> list[Message]:
@@ -437,7 +438,7 @@ def test_reset_is_as_good_as_new(device: Device) -> None:
     device.control(Command.REPORT_INTERVAL, 5)
     device.control(Command.START)
     device.sample(0, 1, 1)
-    device.link.send_bytes(b"\0garbage\0")
+    device.link.wire.write(b"\0garbage\0")
     assert device.control(Command.RESET) == Result.APPLIED
     assert set(device.counters().values()) == {0}
     assert current(device, Key.P0) == 10.0
@@ -484,7 +485,7 @@ def test_lost_message_is_a_gap_in_the_sequence(device: Device) -> None:
 def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
     damaged = bytearray(frame.encode(pack(Sample(device.seq % 256, 0, 0, 1, 2))))
     damaged[6] ^= 0x10
-    device.link.send_bytes(bytes(damaged))
+    device.link.wire.write(bytes(damaged))
     assert device.heard() == []
     assert device.counters()[Counter.FRAMES_DROPPED] == 1
 
@@ -492,7 +493,7 @@ def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
 def test_noise_is_never_answered_and_never_stops_it(device: Device) -> None:
     rng = random.Random(3)
     for _ in range(100):
-        device.link.send_bytes(rng.randbytes(1000))
+        device.link.wire.write(rng.randbytes(1000))
     assert device.heard() == []
     assert len(device.sample(0, 1, 2)) == 8
     assert device.counters()[Counter.FRAMES_DROPPED] > 100

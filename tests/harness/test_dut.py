@@ -40,7 +40,8 @@ from harness.errors import (
 )
 from harness.estimator_config import EstimatorConfig
 from harness.host_process import HostProcess
-from harness.link import Link, MemoryLink
+from harness.link import FramedLink, Link
+from harness.wire import MemoryWire, VirtualClock
 
 N = 400
 CHANGE_AT = 300
@@ -75,7 +76,7 @@ def started(link: Link, **settings: Any) -> Dut:
 
 @pytest.fixture(scope="module")
 def reference() -> Replies:
-    return feed(started(MemoryLink(1)), 0, N)
+    return feed(started(FramedLink(MemoryWire(1))), 0, N)
 
 
 def assert_same(one: Replies, other: Replies) -> None:
@@ -114,7 +115,7 @@ def test_line_and_exchange_change_nothing(reference: Replies, kind: Any, exchang
 
 @pytest.mark.parametrize("exchange", ["sample", "block"])
 def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) -> None:
-    dut = started(MemoryLink(1), exchange=exchange)
+    dut = started(FramedLink(MemoryWire(1)), exchange=exchange)
     bounds = [0, 1, 1, 14, 29, 100, 257, N]
     parts = [feed(dut, first, end) for first, end in itertools.pairwise(bounds)]
     assert np.array_equal(np.concatenate([part.theta for part in parts]), reference.theta)
@@ -122,7 +123,7 @@ def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) ->
 
 
 def test_second_run_is_as_the_first(reference: Replies) -> None:
-    dut = started(MemoryLink(1))
+    dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, 123)
     dut.stop()
     dut.start()
@@ -130,7 +131,7 @@ def test_second_run_is_as_the_first(reference: Replies) -> None:
 
 
 def test_alarms_beyond_sample_65535_are_counted_on() -> None:
-    dut = started(MemoryLink(1), exchange="block")
+    dut = started(FramedLink(MemoryWire(1)), exchange="block")
     rest = 65536 - 200
     still = np.zeros(rest, np.uint16)
     dut.feed(0, still, still, np.ones(rest, bool))
@@ -141,14 +142,14 @@ def test_alarms_beyond_sample_65535_are_counted_on() -> None:
 
 
 def test_skipped_indices_are_lost_samples_to_the_device() -> None:
-    dut = started(MemoryLink(1))
+    dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, 100)
     feed(dut, 130, 200)
     assert dut.stop()["samples_lost"] == 30
 
 
 def test_samples_that_come_again_are_the_callers_mistake() -> None:
-    dut = started(MemoryLink(1))
+    dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, 100)
     with pytest.raises(ValueError, match="sample 99 comes again: the next one is 100"):
         feed(dut, 99, 120)
@@ -156,11 +157,11 @@ def test_samples_that_come_again_are_the_callers_mistake() -> None:
 
 def test_arrays_of_different_lengths_are_the_callers_mistake() -> None:
     with pytest.raises(ValueError, match="shorter"):
-        started(MemoryLink(1)).feed(0, FORCE[:5], DISPLACEMENT[:4], MISSING[:5])
+        started(FramedLink(MemoryWire(1))).feed(0, FORCE[:5], DISPLACEMENT[:4], MISSING[:5])
 
 
 def test_counters_tell_what_the_device_did(reference: Replies) -> None:
-    dut = started(MemoryLink(1))
+    dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, N)
     counters = dut.stop()
     missing = int(MISSING.sum())
@@ -226,7 +227,7 @@ def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str
 
 
 def test_stranger_is_refused_with_both_catalogues() -> None:
-    dut = Dut(MemoryLink(1, catalogue_hash=0xDEADBEEF), DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), DeviceDescription(name="bob", kind="inproc"))
     with pytest.raises(
         CatalogueMismatch, match=f"device bob: it speaks catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
     ):
@@ -235,14 +236,14 @@ def test_stranger_is_refused_with_both_catalogues() -> None:
 
 def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> None:
     """As when the harness before was killed: answers are still under way, and the device is running."""
-    link = MemoryLink(1)
+    link = FramedLink(MemoryWire(1))
     feed(started(link), 0, 100)
     link.send([Sample(9, 0, 100, 1, 2), Identify(10), Sample(11, 0, 101, 1, 2)])
     assert_same(feed(started(link), 0, N), reference)
 
 
 def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
-    dut = Dut(MemoryLink(1), DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(FramedLink(MemoryWire(1)), DeviceDescription(name="bob", kind="inproc"))
     dut.handshake()
     with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
         dut.configure(EstimatorConfig(nb=7))
@@ -250,12 +251,12 @@ def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
 
 def test_running_device_cannot_be_configured() -> None:
     with pytest.raises(DeviceRefused, match=r"^device bob: na = 2 was not applied: RUNNING, it has 2$"):
-        started(MemoryLink(1)).configure(EstimatorConfig())
+        started(FramedLink(MemoryWire(1))).configure(EstimatorConfig())
 
 
 def test_running_device_cannot_be_started() -> None:
     with pytest.raises(DeviceRefused, match="^device bob: START was refused: RUNNING$"):
-        started(MemoryLink(1)).start()
+        started(FramedLink(MemoryWire(1))).start()
 
 
 # ---- faults of the line
@@ -270,10 +271,17 @@ class FaultyLink:
     dropped = 0
 
     def __init__(self) -> None:
-        self.inner = MemoryLink(boot_nonce=1)
+        self.clock = VirtualClock()
+        self.inner = FramedLink(MemoryWire(boot_nonce=1, clock=self.clock))
         self.to_device: Fault = lambda message: [message]
         self.from_device: Fault = lambda message: [message]
         self._waiting: list[Message] = []
+
+    def write(self, sent: bytes) -> None:
+        self.inner.wire.write(sent)
+
+    def reboot(self) -> None:
+        self.inner = FramedLink(MemoryWire(boot_nonce=2, clock=self.clock))
 
     def send(self, messages: Iterable[Message]) -> None:
         self.inner.send([passed for message in messages for passed in self.to_device(message)])
@@ -329,7 +337,7 @@ def test_lost_sample_is_told_and_the_device_found_alive(line: FaultyLink) -> Non
 
 def test_damaged_sample_is_told_with_the_devices_count(line: FaultyLink) -> None:
     def damage(message: Message) -> list[Message]:  # noqa: ARG001 - it is replaced by noise
-        line.inner.send_bytes(b"\0noise\0")
+        line.write(b"\0noise\0")
         return []
 
     dut = started(line)
@@ -400,8 +408,7 @@ def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:
 
 def test_nobody_at_the_line_is_told(line: FaultyLink) -> None:
     line.to_device = lose
-    ticks = iter(range(1000))
-    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"), clock=lambda: next(ticks) / 100)
+    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
     with pytest.raises(
         LinkTimeout, match=r"^device bob: no Hello in answer to Identify within 2 s \(last message: none\)$"
     ):
@@ -425,7 +432,8 @@ def test_device_that_misses_the_first_call_is_called_again(line: FaultyLink) -> 
 def test_babbling_device_ends_at_the_deadline(line: FaultyLink, message: Message) -> None:
     """Good messages without end, numbered as they should be or repeated, but never an answer."""
     ticks = iter(range(10_000))
-    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"), clock=lambda: next(ticks) / 100)
+    line.clock = lambda: next(ticks) / 100  # type: ignore[assignment]
+    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
     for numbered in (True, False):
         seq = iter(i % 256 if numbered else 7 for i in range(10_000))
         line.receive = lambda _timeout_s, seq=seq: message._replace(seq=next(seq))  # type: ignore[misc, method-assign]
@@ -440,7 +448,7 @@ def reboots_at(line: FaultyLink, sample: int) -> None:
     """The device is reset just before a sample."""
 
     def reboot(message: Message) -> list[Message]:
-        line.inner = MemoryLink(boot_nonce=2)
+        line.reboot()
         return [message]
 
     line.to_device = about(Sample, sample, reboot)
@@ -459,7 +467,7 @@ def test_reset_in_the_run_is_told_by_its_boot_nonce(line: FaultyLink) -> None:
 def test_reset_after_the_last_sample_is_told_at_stop(line: FaultyLink) -> None:
     dut = started(line)
     feed(dut, 0, N)
-    line.inner = MemoryLink(boot_nonce=2)
+    line.reboot()
     with pytest.raises(DeviceError, match="it was reset after the handshake"):
         dut.stop()
 
@@ -482,7 +490,7 @@ def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
 @pytest.fixture
 def host() -> Iterator[tuple[Dut, HostProcess]]:
     process = HostProcess()
-    dut = Dut(process, DeviceDescription(name="host", kind="host", timeout_s=0.1))
+    dut = Dut(FramedLink(process), DeviceDescription(name="host", kind="host", timeout_s=0.1))
     dut.handshake()
     dut.configure()
     dut.start()
