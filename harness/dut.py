@@ -1,4 +1,4 @@
-"""The device under test: handshake, configuration, samples in and estimates out, and how each kind is opened.
+"""The device under test: handshake, configuration, samples in and estimates out.
 
 The device never speaks without being asked, so every exchange is a question and its answers. It is lock-step: nothing
 is sent before the answers to the last message are complete, and what is not as it should be is an error, never a guess.
@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import secrets
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import config
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -44,6 +42,7 @@ from harness.catalogue import (
     Stepped,
 )
 from harness.conversation import Conversation
+from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -53,13 +52,7 @@ from harness.errors import (
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.host_process import HostProcess
-from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire, Wire
-
-DEFAULT_TIMEOUT_S = 2.0
-LONGEST_TIMEOUT_S = 3600.0
-MOST_BAUD = 100_000_000
+from harness.link import Link
 
 _HELLO_AGAIN_S = 0.25
 """A board that resets when its port is opened does not hear the first call."""
@@ -104,36 +97,6 @@ class Replies:
     flags: NDArray[np.uint8]
     """(n,): SteppedFlag."""
     alarms: tuple[RaisedAlarm, ...]
-
-
-@dataclass(frozen=True)
-class DeviceDescription:
-    """A file of fixtures/devices, or as much as the command line says."""
-
-    name: str
-    kind: Literal["host", "inproc", "serial"]
-    """host: a process of this computer on a pseudo-terminal. inproc: within this process. serial: at ``url``."""
-    url: str | None = None
-    """Anything pyserial can open."""
-    baud: int = DEFAULT_BAUD
-    exchange: Literal["sample", "block"] = "sample"
-    """Whether samples go one at a time or in blocks. The answers are the same; blocks are faster."""
-    timeout_s: float = DEFAULT_TIMEOUT_S
-    """For the answers to one message."""
-    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
-
-    def __post_init__(self) -> None:
-        if (self.kind == "serial") != (self.url is not None):
-            raise ValueError("a url goes with the kind 'serial', and with no other")
-        if not 0 < self.baud <= MOST_BAUD:
-            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
-        if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
-            raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
-
-    def as_table(self) -> dict[str, Any]:
-        """In plain values, from which the same can be made."""
-        table = dataclasses.asdict(self) | {"estimator": self.estimator.as_table()}
-        return {key: value for key, value in table.items() if value is not None}
 
 
 class Dut:
@@ -388,38 +351,32 @@ class _Collected:
 
 
 def open_dut(name: str) -> Dut:
-    """A shipped or own description by name, ``inproc``, or ``serial:URL``; connected, configured, ready to start.
+    """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
 
     :raises ConfigurationError: there is none, or it is wrong.
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    kind, _, url = name.partition(":")
-    if kind == "serial" and url:
-        return connect(DeviceDescription(name=name, kind="serial", url=url))
-    if name == "inproc":
-        return connect(DeviceDescription(name="inproc", kind="inproc"))
-    path = config.locate("devices", name)
-    return connect(config.build(DeviceDescription, {"name": path.stem, **config.read_toml(path)}, str(path)))
+    return connect(describe(name))
 
 
 def reopen_dut(description: Mapping[str, Any]) -> Dut:
     """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
 
-    What a file names is not opened on its word alone: a device at a URL must be named again.
+    What a file names is not opened on its word alone: a device elsewhere must be named again.
     """
     table = {key: value for key, value in description.items() if key != "identity"}
-    recorded = config.build(DeviceDescription, table, "the recorded device")
-    if recorded.kind == "serial":
+    recorded = from_table(table, "the recorded device")
+    if recorded.elsewhere:
         raise ConfigurationError(
-            f"the recorded device was at {recorded.url}: say --dut serial:{recorded.url}, or another"
+            f"the recorded device was {recorded.elsewhere}: say --dut {recorded.elsewhere}, or another"
         )
     return connect(recorded)
 
 
 def connect(description: DeviceDescription) -> Dut:
     """Reach the device, shake hands, configure it; errors as ``open_dut``."""
-    dut = Dut(FramedLink(_wire(description)), description)
+    dut = Dut(description.open(), description)
     try:
         _handshake(dut, description)
         dut.configure()
@@ -433,17 +390,9 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
     try:
         dut.handshake()
     except LinkTimeout as error:
-        if description.kind != "serial":
+        if not description.line:
             raise
-        raise LinkTimeout(f"{error}; the line was opened at {description.baud} baud") from error
-
-
-def _wire(description: DeviceDescription) -> Wire:
-    if description.kind == "host":
-        return HostProcess()
-    if description.kind == "inproc":
-        return MemoryWire(boot_nonce=secrets.randbits(32))
-    return PortWire(str(description.url), description.baud)
+        raise LinkTimeout(f"{error}; {description.line}") from error
 
 
 def _float32(value: float) -> float:

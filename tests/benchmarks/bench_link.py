@@ -10,7 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from harness.dut import DeviceDescription, connect
+from harness.devices import DeviceDescription, HostDevice, InprocDevice
+from harness.dut import connect
 
 from .figure import Figure
 
@@ -19,10 +20,10 @@ REPEATS = 5
 """The best of so many is reported: the machine is shared."""
 
 CASES: tuple[DeviceDescription, ...] = (
-    DeviceDescription(name="pty, lock-step by sample", kind="host", exchange="sample"),
-    DeviceDescription(name="pty, lock-step by block", kind="host", exchange="block"),
-    DeviceDescription(name="in process, by sample", kind="inproc", exchange="sample"),
-    DeviceDescription(name="in process, by block", kind="inproc", exchange="block"),
+    HostDevice(name="pty, lock-step by sample", exchange="sample"),
+    HostDevice(name="pty, lock-step by block", exchange="block"),
+    InprocDevice(name="in process, by sample", exchange="sample"),
+    InprocDevice(name="in process, by block", exchange="block"),
 )
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness import dut as dut_module
 from harness.catalogue import (
     CATALOGUE_HASH,
     Alarm,
@@ -28,7 +27,9 @@ from harness.catalogue import (
     Stepped,
     SteppedFlag,
 )
-from harness.dut import DeviceDescription, Dut, Replies, connect, open_dut, reopen_dut
+from harness.child import ChildWire
+from harness.devices import DeviceDescription, HostDevice, InprocDevice, SerialDevice, from_table, host_wire
+from harness.dut import Dut, Replies, connect, open_dut, reopen_dut
 from harness.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -39,9 +40,9 @@ from harness.errors import (
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.host_process import HostProcess
 from harness.link import FramedLink, Link
 from harness.wire import MemoryWire, VirtualClock
+from tests.harness.processes import children
 
 N = 400
 CHANGE_AT = 300
@@ -67,7 +68,7 @@ def feed(dut: Dut, first: int, end: int) -> Replies:
 
 
 def started(link: Link, **settings: Any) -> Dut:
-    dut = Dut(link, DeviceDescription(name="bob", kind="inproc", **settings))
+    dut = Dut(link, InprocDevice(name="bob", **settings))
     dut.handshake()
     dut.configure()
     dut.start()
@@ -108,7 +109,7 @@ def test_alarm_tells_its_sample(reference: Replies) -> None:
 @pytest.mark.parametrize("kind", ["host", "inproc"])
 @pytest.mark.parametrize("exchange", ["sample", "block"])
 def test_line_and_exchange_change_nothing(reference: Replies, kind: Any, exchange: Any) -> None:
-    with connect(DeviceDescription(name="bob", kind=kind, exchange=exchange)) as dut:
+    with connect(from_table({"name": "bob", "kind": kind, "exchange": exchange}, "bob")) as dut:
         dut.start()
         assert_same(feed(dut, 0, N), reference)
 
@@ -184,9 +185,7 @@ def test_device_is_opened_by_name(reference: Replies) -> None:
 
 
 def test_recorded_device_is_the_same_again() -> None:
-    description = DeviceDescription(
-        name="bob", kind="inproc", exchange="block", estimator=EstimatorConfig(nb=2, nk=1, arl0=1e7)
-    )
+    description = InprocDevice(name="bob", exchange="block", estimator=EstimatorConfig(nb=2, nk=1, arl0=1e7))
     with connect(description) as dut:
         dut.start()
         first, record = feed(dut, 0, N), dict(dut.description())
@@ -211,8 +210,9 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
     ("text", "complaint"),
     [
         ('kind = "hots"', "kind: must be one of 'host', 'inproc', 'serial', not 'hots'"),
-        ('kind = "serial"', "a url goes with the kind 'serial', and with no other"),
-        ('kind = "host"\nurl = "/dev/ttyS0"', "a url goes with the kind 'serial', and with no other"),
+        ('kind = "serial"', "the key 'url' is lacking"),
+        ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, exchange, timeout_s, estimator)"),
+        ("timeout_s = 1.0", "kind: must be one of 'host', 'inproc', 'serial', not None"),
         ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be more than 0 and at most 3600, not 0"),
         ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be 1 to 100000000, not 0"),
         ('kind = "inproc"\n[estimator]\nnab = 1', "estimator: unknown key 'nab'"),
@@ -227,7 +227,7 @@ def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str
 
 
 def test_stranger_is_refused_with_both_catalogues() -> None:
-    dut = Dut(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), InprocDevice(name="bob"))
     with pytest.raises(
         CatalogueMismatch, match=f"device bob: it speaks catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
     ):
@@ -243,7 +243,7 @@ def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> N
 
 
 def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
-    dut = Dut(FramedLink(MemoryWire(1)), DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob"))
     dut.handshake()
     with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
         dut.configure(EstimatorConfig(nb=7))
@@ -408,7 +408,7 @@ def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:
 
 def test_nobody_at_the_line_is_told(line: FaultyLink) -> None:
     line.to_device = lose
-    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(line, InprocDevice(name="bob"))
     with pytest.raises(
         LinkTimeout, match=r"^device bob: no Hello in answer to Identify within 2 s \(last message: none\)$"
     ):
@@ -433,7 +433,7 @@ def test_babbling_device_ends_at_the_deadline(line: FaultyLink, message: Message
     """Good messages without end, numbered as they should be or repeated, but never an answer."""
     ticks = iter(range(10_000))
     line.clock = lambda: next(ticks) / 100  # type: ignore[assignment]
-    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(line, InprocDevice(name="bob"))
     for numbered in (True, False):
         seq = iter(i % 256 if numbered else 7 for i in range(10_000))
         line.receive = lambda _timeout_s, seq=seq: message._replace(seq=next(seq))  # type: ignore[misc, method-assign]
@@ -473,7 +473,7 @@ def test_reset_after_the_last_sample_is_told_at_stop(line: FaultyLink) -> None:
 
 
 def test_value_that_is_applied_otherwise_is_refused(line: FaultyLink) -> None:
-    dut = Dut(line, DeviceDescription(name="bob", kind="inproc"))
+    dut = Dut(line, InprocDevice(name="bob"))
     dut.handshake()
     line.from_device = lambda message: [message._replace(value=9.5) if isinstance(message, Configured) else message]
     with pytest.raises(DeviceRefused, match="na = 2 was not applied: APPLIED, it has 9.5"):
@@ -488,54 +488,54 @@ def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
 
 
 @pytest.fixture
-def host() -> Iterator[tuple[Dut, HostProcess]]:
-    process = HostProcess()
-    dut = Dut(FramedLink(process), DeviceDescription(name="host", kind="host", timeout_s=0.1))
+def host() -> Iterator[tuple[Dut, int]]:
+    """A device that is a process, and its number."""
+    wire = host_wire()
+    dut = Dut(FramedLink(wire), HostDevice(name="host", timeout_s=0.1))
     dut.handshake()
     dut.configure()
     dut.start()
-    yield dut, process
+    yield dut, children(wire.child.tether_pid)[0]
     dut.close()
 
 
-def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[Dut, HostProcess]) -> None:
-    dut, process = host
+def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[Dut, int]) -> None:
+    dut, pid = host
     feed(dut, 0, 82)
-    os.kill(process.pid, signal.SIGKILL)
+    os.kill(pid, signal.SIGKILL)
     with pytest.raises(LinkClosed, match="^device host: the device process ended with status -9 after sample 81$"):
         feed(dut, 82, N)
 
 
-def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, HostProcess], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.host_process.END_TIMEOUT_S", 0.05)
-    dut, process = host
+def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, int]) -> None:
+    dut, pid = host
     feed(dut, 0, 82)
-    os.kill(process.pid, signal.SIGSTOP)
+    os.kill(pid, signal.SIGSTOP)
     with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 0.1 s \(last message: Stepped 81\)"):
         feed(dut, 82, N)
 
 
 def test_device_is_let_go_when_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    links: list[HostProcess] = []
+    wires: list[ChildWire] = []
 
-    def stranger() -> HostProcess:
-        links.append(HostProcess(["--catalogue-hash", "1"]))
-        return links[0]
+    def stranger(_description: DeviceDescription) -> Link:
+        wires.append(host_wire(["--catalogue-hash", "1"]))
+        return FramedLink(wires[0])
 
-    monkeypatch.setattr(dut_module, "HostProcess", stranger)
+    monkeypatch.setattr(HostDevice, "open", stranger)
     with pytest.raises(CatalogueMismatch):
         open_dut("host")
-    assert links[0]._process.returncode == 0
+    assert not Path(f"/proc/{wires[0].child.tether_pid}").exists()
 
 
 def test_silent_serial_line_is_told_with_its_baud_rate() -> None:
     """Loop back: what is heard is the call itself."""
-    description = DeviceDescription(name="bob", kind="serial", url="loop://", baud=9600, timeout_s=0.05)
+    description = SerialDevice(name="bob", url="loop://", baud=9600, timeout_s=0.05)
     with pytest.raises(LinkTimeout, match="no Hello .*; the line was opened at 9600 baud$"):
         connect(description)
 
 
 def test_description_is_plain_and_frozen() -> None:
-    description = DeviceDescription(name="bob", kind="inproc")
+    description = InprocDevice(name="bob")
     with pytest.raises(dataclasses.FrozenInstanceError):
         description.name = "eve"  # type: ignore[misc]

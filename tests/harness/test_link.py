@@ -1,16 +1,12 @@
-"""Links over real lines: pseudo-terminals, sockets, the device as a process."""
+"""Links over real lines: pseudo-terminals, sockets; and the program of the host port by itself."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import pty
-import select
-import signal
 import socket
-import stat
 import subprocess
-import sys
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,9 +25,9 @@ from harness.catalogue import (
     Stepped,
     pack,
 )
+from harness.devices import HOST_PROGRAM
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.host_process import PROGRAM, HostProcess
-from harness.link import FramedLink, Link
+from harness.link import FramedLink
 from harness.wire import MemoryWire, PortWire
 
 LONG_S = 20.0
@@ -189,106 +185,17 @@ def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path) -> No
         MemoryWire(1, library=tmp_path / "absent.so")
 
 
-# ---- HostProcess
-
-
-def hello(link: Link) -> Hello:
-    link.send([Identify(0)])
-    answer = link.receive(LONG_S)
-    assert isinstance(answer, Hello)
-    return answer
-
-
-def ends(pid: int, within_s: float = LONG_S) -> bool:
-    """Whether a process ends in time, or has ended."""
-    try:
-        fd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([fd], [], [], within_s)[0])
-    finally:
-        os.close(fd)
-
-
-def test_process_answers_and_is_gone_after_close() -> None:
-    link = FramedLink(process := HostProcess())
-    assert hello(link).catalogue_hash == CATALOGUE_HASH
-    link.close()
-    assert ends(process.pid, 0.0)
-    link.close()
-
-
-def test_ctrl_c_at_the_terminal_does_not_reach_the_process() -> None:
-    """It goes to all processes of a group."""
-    link = FramedLink(process := HostProcess())
-    assert os.getpgid(process.pid) != os.getpgid(0)
-    link.close()
-
-
-def test_process_that_hangs_is_gone_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.host_process.END_TIMEOUT_S", 0.05)
-    link = FramedLink(process := HostProcess())
-    os.kill(process.pid, signal.SIGSTOP)
-    link.close()
-    assert ends(process.pid, 0.0)
-
-
-def test_killed_process_is_told_with_its_status() -> None:
-    link = FramedLink(process := HostProcess())
-    os.kill(process.pid, signal.SIGKILL)
-    with pytest.raises(LinkClosed, match="^the device process ended with status -9$"):
-        link.receive(LONG_S)
-    with pytest.raises(LinkClosed, match="^the device process ended with status -9$"):
-        link.send([Identify(0)])
-    link.close()
-
-
-def test_process_that_pretends_another_catalogue_says_so() -> None:
-    link = FramedLink(HostProcess(["--catalogue-hash", "0xdeadbeef"]))
-    assert hello(link).catalogue_hash == 0xDEADBEEF
-    link.close()
-
-
-def test_absent_program_is_named_with_the_cure(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match=f"{tmp_path}/absent: No such file or directory; run `make setup`"):
-        HostProcess(program=tmp_path / "absent")
-
-
-def program(folder: Path, script: str) -> Path:
-    path = folder / "program"
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(stat.S_IRWXU)
-    return path
-
-
-def test_program_that_ends_at_once_is_told_with_its_status(tmp_path: Path) -> None:
-    with pytest.raises(LinkClosed, match="ended with status 5"):
-        HostProcess(program=program(tmp_path, "exit 5"))
-
-
-def test_program_that_says_nothing_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.host_process.START_TIMEOUT_S", 0.05)
-    with pytest.raises(LinkError, match="said nothing within"):
-        HostProcess(program=program(tmp_path, "read end"))
-
-
-def test_process_does_not_outlive_a_killed_parent() -> None:
-    parent = (
-        "import os, signal; from harness.host_process import HostProcess;"
-        " process = HostProcess(); print(process.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    out = subprocess.run([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, check=False)
-    assert out.returncode == -signal.SIGKILL
-    assert ends(int(out.stdout))
-
-
 # ---- the program by itself
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [PROGRAM, *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LONG_S, check=False
+        [HOST_PROGRAM, *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LONG_S,
+        check=False,
     )
 
 
@@ -327,7 +234,7 @@ def test_line_that_cannot_be_opened_is_named(path: str) -> None:
 
 
 def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(terminal: Terminal) -> None:
-    with subprocess.Popen([PROGRAM, terminal.path], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen([HOST_PROGRAM, terminal.path], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         os.write(terminal.far, frame.encode(pack(Identify(0))))
         received: list[bytes] = []
         decoder = frame.FrameDecoder()
@@ -343,7 +250,7 @@ def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(t
 def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
     """Work that is left over when the output has just been emptied must not wait for the next message."""
     burst, bursts = 11, 1500
-    with subprocess.Popen([PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([HOST_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         link = at_port(process.stdout.readline().strip())
         link.send([Control(0, Command.START, 0)])
@@ -364,7 +271,7 @@ def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
 
 def test_device_waits_for_a_harness_that_does_not_read() -> None:
     """A line that is full of answers delays, and loses nothing."""
-    with subprocess.Popen([PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([HOST_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         link = at_port(process.stdout.readline().strip())
         asked = 300  # their answers are 13 times as long: far more than a terminal holds

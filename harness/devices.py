@@ -1,0 +1,168 @@
+"""The kinds of devices: what each needs to be told, how the command line names it, and how it is reached.
+
+A kind is one class, in the registry ``KINDS``; nothing else knows what kinds there are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+from harness import config
+from harness.child import Child, ChildWire
+from harness.errors import ConfigurationError, LinkError
+from harness.estimator_config import EstimatorConfig
+from harness.link import FramedLink, Link
+from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire
+
+HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
+
+DEFAULT_TIMEOUT_S = 2.0
+LONGEST_TIMEOUT_S = 3600.0
+MOST_BAUD = 100_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceDescription:
+    """What every device is described by: a file of fixtures/devices, or as much as the command line says."""
+
+    kind: ClassVar[str]
+    name: str
+    exchange: Literal["sample", "block"] = "sample"
+    """Whether samples go one at a time or in blocks. The answers are the same; blocks are faster."""
+    timeout_s: float = DEFAULT_TIMEOUT_S
+    """For the answers to one message."""
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
+            raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
+
+    @classmethod
+    def named(cls, name: str, rest: str) -> Self:
+        """The device that is called ``name`` on the command line; ``rest`` is what follows the kind and a colon.
+
+        :raises ConfigurationError: ``rest`` makes no sense.
+        """
+        if rest:
+            raise ConfigurationError(f"{name}: a device of the kind {cls.kind} has no {rest!r}")
+        return cls(name=name)
+
+    def open(self) -> Link:
+        """Start it, or reach it.
+
+        :raises LinkError: it cannot be reached.
+        """
+        raise NotImplementedError
+
+    @property
+    def line(self) -> str:
+        """What to know about the line when nobody answers, if there is anything."""
+        return ""
+
+    @property
+    def elsewhere(self) -> str:
+        """As the command line names it, if it is not safe to open it on the word of a recording."""
+        return ""
+
+    def as_table(self) -> dict[str, Any]:
+        """In plain values, from which the same can be made."""
+        table = {"kind": self.kind, **dataclasses.asdict(self), "estimator": self.estimator.as_table()}
+        return {key: value for key, value in table.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostDevice(DeviceDescription):
+    """A process of this computer, on a pseudo-terminal."""
+
+    kind: ClassVar[str] = "host"
+
+    def open(self) -> Link:
+        return FramedLink(host_wire())
+
+
+def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> ChildWire:
+    """A new process of the host port.
+
+    :raises LinkError: it cannot be started, or does not say where it listens.
+    """
+    if not program.is_file():
+        raise LinkError(f"{program} is absent: run `make setup`")
+    child = Child([program, *arguments], "the device process")
+    try:
+        return ChildWire(child, PortWire(child.first_line(), name="pty"))
+    except BaseException:
+        child.end()
+        raise
+
+
+@dataclass(frozen=True, kw_only=True)
+class InprocDevice(DeviceDescription):
+    """The same C within this process."""
+
+    kind: ClassVar[str] = "inproc"
+
+    def open(self) -> Link:
+        return FramedLink(MemoryWire(boot_nonce=secrets.randbits(32)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SerialDevice(DeviceDescription):
+    """Whoever speaks at a serial port, or at any URL that pyserial can open."""
+
+    kind: ClassVar[str] = "serial"
+    url: str
+    baud: int = DEFAULT_BAUD
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+
+    @classmethod
+    def named(cls, name: str, rest: str) -> Self:
+        if not rest:
+            raise ConfigurationError(f"{name}: say where it is: {cls.kind}:/dev/ttyACM0, or any URL of pyserial")
+        return cls(name=name, url=rest)
+
+    def open(self) -> Link:
+        return FramedLink(PortWire(self.url, self.baud))
+
+    @property
+    def line(self) -> str:
+        return f"the line was opened at {self.baud} baud"
+
+    @property
+    def elsewhere(self) -> str:
+        return f"{self.kind}:{self.url}"
+
+
+KINDS: Mapping[str, type[DeviceDescription]] = {cls.kind: cls for cls in (HostDevice, InprocDevice, SerialDevice)}
+
+
+def describe(name: str) -> DeviceDescription:
+    """The device that ``name`` means: a shipped or own description, or a kind with what belongs to it after a colon.
+
+    :raises ConfigurationError: there is none, or it is wrong.
+    """
+    kind, _, rest = name.partition(":")
+    if kind in KINDS and name not in config.names("devices"):
+        return KINDS[kind].named(name, rest)
+    path = config.locate("devices", name)
+    return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
+
+
+def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:
+    """A description from plain values; ``where`` leads every error.
+
+    :raises ConfigurationError: they describe no device.
+    """
+    described = KINDS.get(str(table.get("kind")))
+    if described is None:
+        known = ", ".join(map(repr, KINDS))
+        raise ConfigurationError(f"{where}: kind: must be one of {known}, not {table.get('kind')!r}")
+    return config.build(described, {key: value for key, value in table.items() if key != "kind"}, where)
