@@ -55,12 +55,8 @@ format: $(PRODUCTS) ## lay out the Python sources
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
-fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
-	@mkdir -p $(BUILD)/fuzz/corpus
-	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
-	    -DEST_NC_MAX=2U -Iestimator_c/core estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c -o $(BUILD)/fuzz/fuzz_est
-	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
-	    then grep "^stat::" log; else tail -60 log; exit 1; fi
+fuzz: $(PRODUCTS) ## libFuzzer over core and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
+	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
 coverage: $(PRODUCTS) ## which lines and branches of the core its tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage

@@ -61,7 +61,7 @@ static uint64_t draw(line_t* const self) {
     return z ^ (z >> 31U);
 }
 
-static size_t below(line_t* const self, const size_t n) { return (size_t)(draw(self) % n); }
+static size_t  below(line_t* const self, const size_t n) { return (size_t)(draw(self) % n); }
 static uint8_t any_byte(line_t* const self) { return (uint8_t)(draw(self) >> 56U); }
 
 /// Any message; with many zeros, which are what COBS is about, in half of them.
