@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.dut import Dut, Replies
+from harness.dut import Dut, Replies, Stretch
 from harness.errors import DeviceError, LinkError, RigError
 from harness.rig import Block, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
@@ -104,9 +105,19 @@ class Bench:
         return collected.run(dataclasses.replace(conditions, overloads=lit), self.dut.parameters)
 
     def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
-        for block in blocks:
-            codes = block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT]
-            reply = self.dut.feed(block.first, *codes, missing_to_device(block.clipped))
-            collected.add(block, reply)
+        sent: deque[Block] = deque()
+
+        def stretches() -> Iterator[Stretch]:
+            for block in blocks:
+                sent.append(block)
+                yield (
+                    block.first,
+                    block.codes[:, _FORCE],
+                    block.codes[:, _DISPLACEMENT],
+                    missing_to_device(block.clipped),
+                )
+
+        for reply in self.dut.play(stretches()):
+            collected.add(sent.popleft(), reply)
             if self._progress is not None:
                 self._progress(collected.samples, samples)

@@ -22,6 +22,7 @@ from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 
 DEFAULT_TIMEOUT_S = 2.0
+DEFAULT_WINDOW = 8
 LONGEST_TIMEOUT_S = 3600.0
 MOST_BAUD = 100_000_000
 
@@ -32,8 +33,14 @@ class DeviceDescription:
 
     kind: ClassVar[str]
     name: str
-    exchange: Literal["sample", "block"] = "sample"
-    """Whether samples go one at a time or in blocks. The answers are the same; blocks are faster."""
+    exchange: Literal["sample", "block", "stream"] = "sample"
+    """Samples go one at a time, in blocks, or in blocks before the last one is answered. The answers are the same."""
+    window: int = DEFAULT_WINDOW
+    """For stream: the most blocks that may be unanswered, if the device can hold them."""
+    report_interval_n: int = 1
+    """The device reports its estimate after every so many samples; alarms always."""
+    most_lost_n: int = 0
+    """A run in which more samples were lost on the way to the device is INCONCLUSIVE."""
     timeout_s: float = DEFAULT_TIMEOUT_S
     """For the answers to one message."""
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
@@ -41,6 +48,9 @@ class DeviceDescription:
     def __post_init__(self) -> None:
         if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
             raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
+        for name, least, most in (("window", 1, 255), ("report_interval_n", 1, 65535), ("most_lost_n", 0, 2**31)):
+            if not least <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
