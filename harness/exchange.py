@@ -43,6 +43,9 @@ _RUN_MASK = (RUNS - 1) << RUN_SHIFT
 _INDEX = 65536
 """Sample indices are modulo this on the line."""
 
+_NO_INDEX = -1
+_NO_ELEMENT = -1
+
 Codes = tuple[int, int, bool]
 """Force, displacement, and whether they are missing."""
 
@@ -150,8 +153,8 @@ class Exchange:
         self._is_thinned = report_interval_n > 1
         self._is_there = is_there
         self._pace = pace
-        self._elements = (*range(parameters), Element.INNOVATION)
-        self._rows = _Rows(len(self._elements))
+        self._elements = (*range(parameters), int(Element.INNOVATION), _NO_ELEMENT)
+        self._rows = _Rows(parameters + 1)
         self._pending: deque[tuple[int, int]] = deque()
         """Of each message without all its answers: the first sample, and how many."""
         self._deadline_s = 0.0
@@ -160,6 +163,8 @@ class Exchange:
         """Of the elements that are due for a sample, the next."""
         self._answered = 0
         """The oldest sample without all its answers; all before are rows."""
+        self._wire_index = _NO_INDEX
+        """The same as the line has it, if there is one."""
         self._silences = 0
         self.next_index = 0
         self.taken = 0
@@ -210,7 +215,7 @@ class Exchange:
             raise self._placed(error) from error
         if not self._pending:
             self._deadline_s = deadline_s
-            self._answered = first
+            self._await(first)
         self._pending.append((first, len(samples)))
 
     def _message(self, first: int, samples: Sequence[Codes]) -> Message:
@@ -228,35 +233,38 @@ class Exchange:
 
     def _wait_for(self, due_s: float) -> None:
         """Take what comes until then."""
-        while self._talk.clock() < due_s:
-            message = self._receive(due_s)
-            if message is not None:
-                self._accept(message)
+        try:
+            while self._talk.clock() < due_s:
+                message = self._talk.receive(due_s)
+                if message is not None:
+                    self._accept(message)
+        except LinkClosed as error:
+            raise self._placed(error) from error
 
     def _collect(self, most: int) -> None:
         """Take what comes until at most so many messages are without all their answers."""
-        while len(self._pending) > most:
-            message = self._receive(self._deadline_s)
-            if message is None:
-                self._silence()
-            else:
-                self._accept(message)
-
-    def _receive(self, deadline_s: float) -> Message | None:
         try:
-            return self._talk.receive(deadline_s)
+            while len(self._pending) > most:
+                message = self._talk.receive(self._deadline_s)
+                if message is None:
+                    self._silence()
+                else:
+                    self._accept(message)
         except LinkClosed as error:
             raise self._placed(error) from error
 
     def _accept(self, message: Message) -> None:
         """An answer about the oldest sample, or about one whose predecessors were lost."""
-        wire_index = self._answered % _INDEX
-        if isinstance(message, Estimate) and message.sample_index == wire_index and self._is_due(message.element):
+        if (
+            isinstance(message, Estimate)
+            and message.sample_index == self._wire_index
+            and message.element == self._elements[self._at]
+        ):
             self._rows.values.append(message.value)
             self._at += 1
-        elif isinstance(message, Stepped) and message.sample_index == wire_index and self._ends(message):
+        elif isinstance(message, Stepped) and message.sample_index == self._wire_index and self._ends(message):
             self._step(message)
-        elif isinstance(message, Alarm) and message.sample_index == wire_index and self._pending:
+        elif isinstance(message, Alarm) and message.sample_index == self._wire_index:
             self._rows.alarms.append(RaisedAlarm(self._answered, message.trigger, message.statistic))
         elif lost := self._predecessors(message):
             self._lose(lost)
@@ -264,32 +272,37 @@ class Exchange:
         else:
             raise self._wrong(message)
 
-    def _is_due(self, element: int) -> bool:
-        return self._at < len(self._elements) and element == self._elements[self._at] and bool(self._pending)
-
     def _ends(self, message: Stepped) -> bool:
         """Whether it is the last word about a sample of this run."""
-        is_whole = self._at == len(self._elements) or (self._is_thinned and self._at == 0)
-        return is_whole and message.flags & _RUN_MASK == self._run and bool(self._pending)
+        is_whole = self._elements[self._at] == _NO_ELEMENT or (self._is_thinned and self._at == 0)
+        return is_whole and message.flags & _RUN_MASK == self._run
 
     def _step(self, message: Stepped) -> None:
         flags = message.flags & _DEVICE_FLAGS
         if self._at:
             self._rows.finish(flags, message.statistic)
+            self._at = 0
         else:
             self._rows.repeat(flags | UNREPORTED, message.statistic)
-        self._at = 0
-        self._answered += 1
         first, n = self._pending[0]
-        if self._answered == first + n:
+        if self._answered + 1 < first + n:
+            self._await(self._answered + 1)
+        else:
             self._pass_on()
+
+    def _await(self, index: int) -> None:
+        self._answered = index
+        self._wire_index = index % _INDEX
 
     def _pass_on(self) -> None:
         """The oldest message is done with; the next one is the oldest."""
-        self._pending.popleft()
+        first, n = self._pending.popleft()
         self._deadline_s = self._talk.clock() + self._talk.timeout_s
         if self._pending:
-            self._answered = self._pending[0][0]
+            self._await(self._pending[0][0])
+        else:
+            self._answered = first + n
+            self._wire_index = _NO_INDEX
 
     def _predecessors(self, message: Message) -> int:
         """How many messages were lost if the answer is to the one after them; 0 if it is not."""
@@ -316,8 +329,6 @@ class Exchange:
         )
         try:
             self._is_there()
-        except LinkClosed as error:
-            raise self._placed(error) from error
         except LinkTimeout as error:
             raise LinkTimeout(f"{heard}; it answers nothing else either") from error
         if self._at:
