@@ -339,9 +339,8 @@ class Exchange:
         self._lose(len(self._pending))
 
     def _wrong(self, message: Message) -> DeviceError:
-        wanted = (
-            f"Estimate of {Element(self._elements[self._at]).name}" if self._at < len(self._elements) else "Stepped"
-        )
+        due = self._elements[self._at]
+        wanted = "Stepped" if due == _NO_ELEMENT else f"Estimate of {Element(due).name}"
         return DeviceError(f"device {self._talk.name}: {wanted} for sample {self._answered} was due, {message} came")
 
     def _placed(self, error: LinkError) -> LinkClosed:
