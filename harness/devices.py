@@ -6,7 +6,10 @@ A kind is one class, in the registry ``KINDS``; nothing else knows what kinds th
 from __future__ import annotations
 
 import dataclasses
+import os
 import secrets
+import shutil
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +20,13 @@ from harness.child import Child, ChildWire
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
 from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire
+from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
+FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
+
+QEMU = "qemu-system-arm"
+_NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
 
 DEFAULT_TIMEOUT_S = 2.0
 DEFAULT_WINDOW = 8
@@ -121,6 +128,67 @@ class InprocDevice(DeviceDescription):
 
 
 @dataclass(frozen=True, kw_only=True)
+class QemuDevice(DeviceDescription):
+    """Cortex-M firmware on a board that QEMU emulates."""
+
+    core: ClassVar[str]
+    machine: ClassVar[str]
+    firmware: str | None = None
+    """An ELF file; by default the project's own, which `make firmware` builds."""
+
+    @classmethod
+    def named(cls, name: str, rest: str) -> Self:
+        return cls(name=name, firmware=rest or None)
+
+    def open(self) -> Link:
+        qemu = shutil.which(QEMU)
+        if qemu is None:
+            raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
+        ours, theirs = socket.socketpair()
+        with theirs:
+            line = theirs.fileno()
+            command: list[str | Path] = [qemu, "-machine", self.machine, "-kernel", self._image(), *_NO_SCREEN]
+            command += ["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"]
+            # What the firmware may ask of its debugger: who it is, which differs after every boot.
+            arguments = f"arg=analogrig,arg={secrets.randbits(32):08x}"
+            command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
+            child = Child(command, f"QEMU ({self.machine})", inherited=[line])
+        return FramedLink(ChildWire(child, DescriptorWire(ours.detach(), "qemu")))
+
+    @property
+    def elsewhere(self) -> str:
+        """Firmware may ask its debugger for any file of this computer."""
+        return f"{self.kind}:{self.firmware}" if self.firmware else ""
+
+    def _image(self) -> Path:
+        """:raises LinkError: it is not there."""
+        folder = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
+        path = Path(self.firmware) if self.firmware else folder / f"analogrig-{self.core}.elf"
+        if not path.is_file():
+            cure = "" if self.firmware else ": run `make firmware`, or say where it is in ANALOGRIG_FIRMWARE"
+            raise LinkError(f"there is no firmware {path}{cure}")
+        return path.absolute()
+
+
+class QemuM3(QemuDevice):
+    """Cortex-M3, without a floating-point unit."""
+
+    kind, core, machine = "qemu-m3", "m3", "mps2-an385"
+
+
+class QemuM4(QemuDevice):
+    """Cortex-M4F."""
+
+    kind, core, machine = "qemu-m4", "m4", "mps2-an386"
+
+
+class QemuM7(QemuDevice):
+    """Cortex-M7."""
+
+    kind, core, machine = "qemu-m7", "m7", "mps2-an500"
+
+
+@dataclass(frozen=True, kw_only=True)
 class SerialDevice(DeviceDescription):
     """Whoever speaks at a serial port, or at any URL that pyserial can open."""
 
@@ -151,7 +219,9 @@ class SerialDevice(DeviceDescription):
         return f"{self.kind}:{self.url}"
 
 
-KINDS: Mapping[str, type[DeviceDescription]] = {cls.kind: cls for cls in (HostDevice, InprocDevice, SerialDevice)}
+KINDS: Mapping[str, type[DeviceDescription]] = {
+    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice)
+}
 
 
 def describe(name: str) -> DeviceDescription:
