@@ -20,7 +20,8 @@ from harness.child import Child, ChildWire
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
 from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire
+from harness.timed_wire import TimedWire
+from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire, Wire
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
@@ -29,7 +30,7 @@ QEMU = "qemu-system-arm"
 _NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
 
 DEFAULT_TIMEOUT_S = 2.0
-DEFAULT_WINDOW = 8
+DEFAULT_WINDOW = 32
 LONGEST_TIMEOUT_S = 3600.0
 MOST_BAUD = 100_000_000
 
@@ -46,6 +47,8 @@ class DeviceDescription:
     """For stream: the most blocks that may be unanswered, if the device can hold them."""
     report_interval_n: int = 1
     """The device reports its estimate after every so many samples; alarms always."""
+    baud: int | None = None
+    """Bits per second of the line. Where there is no real line, the time that such a one would take is reported."""
     most_lost_n: int = 0
     """A run in which more samples were lost on the way to the device is INCONCLUSIVE."""
     timeout_s: float = DEFAULT_TIMEOUT_S
@@ -55,6 +58,8 @@ class DeviceDescription:
     def __post_init__(self) -> None:
         if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
             raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
+        if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
         for name, least, most in (("window", 1, 255), ("report_interval_n", 1, 65535), ("most_lost_n", 0, 2**31)):
             if not least <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
@@ -74,6 +79,11 @@ class DeviceDescription:
 
         :raises LinkError: it cannot be reached.
         """
+        wire = self.wire()
+        return FramedLink(wire if self.baud is None else TimedWire(wire, self.baud))
+
+    def wire(self) -> Wire:
+        """As ``open``, for a device that is reached by bytes."""
         raise NotImplementedError
 
     @property
@@ -98,8 +108,8 @@ class HostDevice(DeviceDescription):
 
     kind: ClassVar[str] = "host"
 
-    def open(self) -> Link:
-        return FramedLink(host_wire())
+    def wire(self) -> Wire:
+        return host_wire()
 
 
 def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> ChildWire:
@@ -123,8 +133,8 @@ class InprocDevice(DeviceDescription):
 
     kind: ClassVar[str] = "inproc"
 
-    def open(self) -> Link:
-        return FramedLink(MemoryWire(boot_nonce=secrets.randbits(32)))
+    def wire(self) -> Wire:
+        return MemoryWire(boot_nonce=secrets.randbits(32))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +150,7 @@ class QemuDevice(DeviceDescription):
     def named(cls, name: str, rest: str) -> Self:
         return cls(name=name, firmware=rest or None)
 
-    def open(self) -> Link:
+    def wire(self) -> Wire:
         qemu = shutil.which(QEMU)
         if qemu is None:
             raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
@@ -153,7 +163,7 @@ class QemuDevice(DeviceDescription):
             arguments = f"arg=analogrig,arg={secrets.randbits(32):08x}"
             command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
             child = Child(command, f"QEMU ({self.machine})", inherited=[line])
-        return FramedLink(ChildWire(child, DescriptorWire(ours.detach(), "qemu")))
+        return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
 
     @property
     def elsewhere(self) -> str:
@@ -194,12 +204,7 @@ class SerialDevice(DeviceDescription):
 
     kind: ClassVar[str] = "serial"
     url: str
-    baud: int = DEFAULT_BAUD
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.baud <= MOST_BAUD:
-            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+    baud: int | None = DEFAULT_BAUD
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
@@ -207,8 +212,8 @@ class SerialDevice(DeviceDescription):
             raise ConfigurationError(f"{name}: say where it is: {cls.kind}:/dev/ttyACM0, or any URL of pyserial")
         return cls(name=name, url=rest)
 
-    def open(self) -> Link:
-        return FramedLink(PortWire(self.url, self.baud))
+    def wire(self) -> Wire:
+        return PortWire(self.url, self.baud or DEFAULT_BAUD)
 
     @property
     def line(self) -> str:

@@ -50,7 +50,7 @@ from harness.errors import (
 from harness.estimator_config import EstimatorConfig
 from harness.exchange import Exchange, Packing, RaisedAlarm, Replies
 from harness.link import Link
-from harness.pace import Pace
+from harness.pace import Pace, check_line
 
 _HELLO_AGAIN_S = 0.25
 """A board that resets when its port is opened does not hear the first call."""
@@ -88,6 +88,7 @@ class Dut:
         """Id of the last run: samples that the line has kept since an earlier connection have hardly the next one."""
         self._exchange: Exchange | None = None
         self._counted: Mapping[str, int] = {}
+        self._line_s = 0.0
 
     @property
     def name(self) -> str:
@@ -96,6 +97,11 @@ class Dut:
     @property
     def link_name(self) -> str:
         return self._talk.link.name
+
+    @property
+    def line_s(self) -> float:
+        """How long a line of the described speed would have taken for the samples until now; 0.0 if none is described."""
+        return self._talk.link.line_s - self._line_s
 
     @property
     def parameters(self) -> int:
@@ -155,6 +161,14 @@ class Dut:
                     f" {_word(Result, answer.result)}, it has {answer.value:g}"
                 )
 
+    def pace(self, period_s: float) -> Pace:
+        """For a run with a sample every ``period_s``, on the clock of the line.
+
+        :raises ConfigurationError: that does not fit the line.
+        """
+        check_line(self._description, period_s)
+        return Pace(self._talk.clock, period_s)
+
     def start(self, pace: Pace | None = None) -> None:
         """Begin a run; its first sample has the index 0. With a ``pace`` none is sent before it is due.
 
@@ -172,6 +186,7 @@ class Dut:
             is_there=self._is_there,
             pace=pace,
         )
+        self._line_s = self._talk.link.line_s
 
     def stop(self) -> dict[str, int]:
         """End the run and return the device's counters by name, as far as they have counted in this run.
@@ -302,17 +317,19 @@ class Dut:
         return self._exchange
 
 
-def open_dut(name: str) -> Dut:
+def open_dut(name: str, **changes: Any) -> Dut:
     """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
+
+    ``changes`` are fields of its description that shall be otherwise; None: as described.
 
     :raises ConfigurationError: there is none, or it is wrong.
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    return connect(describe(name))
+    return connect(_changed(describe(name), changes))
 
 
-def reopen_dut(description: Mapping[str, Any]) -> Dut:
+def reopen_dut(description: Mapping[str, Any], **changes: Any) -> Dut:
     """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
 
     What a file names is not opened on its word alone: a device elsewhere must be named again.
@@ -323,7 +340,15 @@ def reopen_dut(description: Mapping[str, Any]) -> Dut:
         raise ConfigurationError(
             f"the recorded device was {recorded.elsewhere}: say --dut {recorded.elsewhere}, or another"
         )
-    return connect(recorded)
+    return connect(_changed(recorded, changes))
+
+
+def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
+    """:raises ConfigurationError: a value is out of range."""
+    try:
+        return dataclasses.replace(description, **{key: value for key, value in changes.items() if value is not None})
+    except ValueError as error:
+        raise ConfigurationError(f"device {description.name}: {error}") from error
 
 
 def connect(description: DeviceDescription) -> Dut:

@@ -207,7 +207,9 @@ class Exchange:
     def _send(self, first: int, samples: Sequence[Codes]) -> None:
         if self._pace is not None:
             self._wait_for(self._pace.due_s(first + len(samples)))
-            self._pace.sending(first + len(samples), len(samples), is_full=len(self._pending) >= self._packing.window)
+            window = self._packing.window
+            is_full = len(self._pending) >= window
+            self._pace.sending(first + len(samples), window * self._packing.per_message, is_full=is_full)
         self._collect(self._packing.window - 1)
         try:
             deadline_s = self._talk.send(self._message(first, samples))

@@ -112,6 +112,10 @@ class Conditions:
     """Why the run is not valid; empty if it is."""
     overloads: Mapping[str, int] = field(default_factory=dict)
     """Of each amplifier whose overload lamp lit, the first sample that was taken with the lamp lit."""
+    real_time: float = 0.0
+    """By how much the machine's time was stretched to be that of the clock on the wall; 0: lock-step, in no time."""
+    line_s: float = 0.0
+    """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
 
     @property
     def sample_period_problem_s(self) -> float:

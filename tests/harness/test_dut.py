@@ -271,6 +271,7 @@ class FaultyLink:
 
     name = "faulty"
     dropped = 0
+    line_s = 0.0
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
@@ -593,11 +594,11 @@ def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, int]) -> None:
 def test_device_is_let_go_when_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     wires: list[ChildWire] = []
 
-    def stranger(_description: DeviceDescription) -> Link:
+    def stranger(_description: DeviceDescription) -> ChildWire:
         wires.append(host_wire(["--catalogue-hash", "1"]))
-        return FramedLink(wires[0])
+        return wires[0]
 
-    monkeypatch.setattr(HostDevice, "open", stranger)
+    monkeypatch.setattr(HostDevice, "wire", stranger)
     with pytest.raises(CatalogueMismatch):
         open_dut("host")
     assert not Path(f"/proc/{wires[0].child.tether_pid}").exists()
