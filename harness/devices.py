@@ -6,7 +6,10 @@ A kind is one class, in the registry ``KINDS``; nothing else knows what kinds th
 from __future__ import annotations
 
 import dataclasses
+import os
 import secrets
+import shutil
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,11 +20,17 @@ from harness.child import Child, ChildWire
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
 from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, MemoryWire, PortWire
+from harness.timed_wire import TimedWire
+from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire, Wire
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
+FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
+
+QEMU = "qemu-system-arm"
+_NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
 
 DEFAULT_TIMEOUT_S = 2.0
+DEFAULT_WINDOW = 32
 LONGEST_TIMEOUT_S = 3600.0
 MOST_BAUD = 100_000_000
 
@@ -32,8 +41,16 @@ class DeviceDescription:
 
     kind: ClassVar[str]
     name: str
-    exchange: Literal["sample", "block"] = "sample"
-    """Whether samples go one at a time or in blocks. The answers are the same; blocks are faster."""
+    exchange: Literal["sample", "block", "stream"] = "sample"
+    """Samples go one at a time, in blocks, or in blocks before the last one is answered. The answers are the same."""
+    window: int = DEFAULT_WINDOW
+    """For stream: the most blocks that may be unanswered, if the device can hold them."""
+    report_interval_n: int = 1
+    """The device reports its estimate after every so many samples; alarms always."""
+    baud: int | None = None
+    """Bits per second of the line. Where there is no real line, the time that such a one would take is reported."""
+    most_lost_n: int = 0
+    """A run in which more samples were lost on the way to the device is INCONCLUSIVE."""
     timeout_s: float = DEFAULT_TIMEOUT_S
     """For the answers to one message."""
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
@@ -41,6 +58,11 @@ class DeviceDescription:
     def __post_init__(self) -> None:
         if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
             raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
+        if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+        for name, least, most in (("window", 1, 255), ("report_interval_n", 1, 65535), ("most_lost_n", 0, 2**31)):
+            if not least <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
@@ -57,6 +79,11 @@ class DeviceDescription:
 
         :raises LinkError: it cannot be reached.
         """
+        wire = self.wire()
+        return FramedLink(wire if self.baud is None else TimedWire(wire, self.baud))
+
+    def wire(self) -> Wire:
+        """As ``open``, for a device that is reached by bytes."""
         raise NotImplementedError
 
     @property
@@ -81,8 +108,8 @@ class HostDevice(DeviceDescription):
 
     kind: ClassVar[str] = "host"
 
-    def open(self) -> Link:
-        return FramedLink(host_wire())
+    def wire(self) -> Wire:
+        return host_wire()
 
 
 def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> ChildWire:
@@ -106,8 +133,69 @@ class InprocDevice(DeviceDescription):
 
     kind: ClassVar[str] = "inproc"
 
-    def open(self) -> Link:
-        return FramedLink(MemoryWire(boot_nonce=secrets.randbits(32)))
+    def wire(self) -> Wire:
+        return MemoryWire(boot_nonce=secrets.randbits(32))
+
+
+@dataclass(frozen=True, kw_only=True)
+class QemuDevice(DeviceDescription):
+    """Cortex-M firmware on a board that QEMU emulates."""
+
+    core: ClassVar[str]
+    machine: ClassVar[str]
+    firmware: str | None = None
+    """An ELF file; by default the project's own, which `make firmware` builds."""
+
+    @classmethod
+    def named(cls, name: str, rest: str) -> Self:
+        return cls(name=name, firmware=rest or None)
+
+    def wire(self) -> Wire:
+        qemu = shutil.which(QEMU)
+        if qemu is None:
+            raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
+        ours, theirs = socket.socketpair()
+        with theirs:
+            line = theirs.fileno()
+            command: list[str | Path] = [qemu, "-machine", self.machine, "-kernel", self._image(), *_NO_SCREEN]
+            command += ["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"]
+            # What the firmware may ask of its debugger: who it is, which differs after every boot.
+            arguments = f"arg=analogrig,arg={secrets.randbits(32):08x}"
+            command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
+            child = Child(command, f"QEMU ({self.machine})", inherited=[line])
+        return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+
+    @property
+    def elsewhere(self) -> str:
+        """Firmware may ask its debugger for any file of this computer."""
+        return f"{self.kind}:{self.firmware}" if self.firmware else ""
+
+    def _image(self) -> Path:
+        """:raises LinkError: it is not there."""
+        folder = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
+        path = Path(self.firmware) if self.firmware else folder / f"analogrig-{self.core}.elf"
+        if not path.is_file():
+            cure = "" if self.firmware else ": run `make firmware`, or say where it is in ANALOGRIG_FIRMWARE"
+            raise LinkError(f"there is no firmware {path}{cure}")
+        return path.absolute()
+
+
+class QemuM3(QemuDevice):
+    """Cortex-M3, without a floating-point unit."""
+
+    kind, core, machine = "qemu-m3", "m3", "mps2-an385"
+
+
+class QemuM4(QemuDevice):
+    """Cortex-M4F."""
+
+    kind, core, machine = "qemu-m4", "m4", "mps2-an386"
+
+
+class QemuM7(QemuDevice):
+    """Cortex-M7."""
+
+    kind, core, machine = "qemu-m7", "m7", "mps2-an500"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,12 +204,7 @@ class SerialDevice(DeviceDescription):
 
     kind: ClassVar[str] = "serial"
     url: str
-    baud: int = DEFAULT_BAUD
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.baud <= MOST_BAUD:
-            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+    baud: int | None = DEFAULT_BAUD
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
@@ -129,8 +212,8 @@ class SerialDevice(DeviceDescription):
             raise ConfigurationError(f"{name}: say where it is: {cls.kind}:/dev/ttyACM0, or any URL of pyserial")
         return cls(name=name, url=rest)
 
-    def open(self) -> Link:
-        return FramedLink(PortWire(self.url, self.baud))
+    def wire(self) -> Wire:
+        return PortWire(self.url, self.baud or DEFAULT_BAUD)
 
     @property
     def line(self) -> str:
@@ -141,7 +224,9 @@ class SerialDevice(DeviceDescription):
         return f"{self.kind}:{self.url}"
 
 
-KINDS: Mapping[str, type[DeviceDescription]] = {cls.kind: cls for cls in (HostDevice, InprocDevice, SerialDevice)}
+KINDS: Mapping[str, type[DeviceDescription]] = {
+    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice)
+}
 
 
 def describe(name: str) -> DeviceDescription:

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from harness import frame
 from harness.catalogue import Message, pack, unpack
+from harness.timed_wire import TimedWire
 from harness.wire import Clock, Wire
 
 
@@ -25,6 +26,10 @@ class Link(Protocol):
     @property
     def dropped(self) -> int:
         """How many frames from the device were no good."""
+
+    @property
+    def line_s(self) -> float:
+        """How long a line of the described speed would have taken until now [s]; 0.0 if none is described."""
 
     def send(self, messages: Iterable[Message]) -> None:
         """Send the messages, in one go where the line can.
@@ -56,6 +61,10 @@ class FramedLink:
     @property
     def dropped(self) -> int:
         return self._decoder.dropped
+
+    @property
+    def line_s(self) -> float:
+        return self.wire.line_s if isinstance(self.wire, TimedWire) else 0.0
 
     def send(self, messages: Iterable[Message]) -> None:
         self.wire.write(b"".join([frame.encode(pack(message)) for message in messages]))

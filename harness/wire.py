@@ -23,6 +23,8 @@ WRITE_TIMEOUT_S = 2.0
 LIBRARY = Path(__file__).with_name("_device.so")
 
 _READ_BYTES = 65_536
+_ALWAYS_ROOM = 255
+"""Blocks that may wait in the input of a device that works while it is told."""
 
 Clock = Callable[[], float]
 """Seconds from any beginning, never backwards."""
@@ -195,6 +197,7 @@ class _Identity(ctypes.Structure):
     _fields_ = (
         ("catalogue_hash", ctypes.c_uint32),
         ("boot_nonce", ctypes.c_uint32),
+        ("input_blocks", ctypes.c_uint8),
         ("firmware_id", ctypes.c_uint8),
     )
 
@@ -234,7 +237,9 @@ class MemoryWire:
     def boot(self, boot_nonce: int) -> None:
         """As if it had been switched off and on: it begins anew, and what it was saying is lost."""
         self._answers = b""
-        self._init(self._device, ctypes.byref(_Identity(self._catalogue_hash, boot_nonce, FirmwareId.LIBRARY)))
+        self._init(
+            self._device, ctypes.byref(_Identity(self._catalogue_hash, boot_nonce, _ALWAYS_ROOM, FirmwareId.LIBRARY))
+        )
 
     def write(self, sent: bytes) -> None:
         while True:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from harness.catalogue import (
     Identify,
     Message,
     Sample,
+    SampleBlock,
     Stepped,
     SteppedFlag,
 )
@@ -41,6 +42,7 @@ from harness.errors import (
 )
 from harness.estimator_config import EstimatorConfig
 from harness.link import FramedLink, Link
+from harness.run import LOST
 from harness.wire import MemoryWire, VirtualClock
 from tests.harness.processes import children
 
@@ -107,14 +109,14 @@ def test_alarm_tells_its_sample(reference: Replies) -> None:
 
 
 @pytest.mark.parametrize("kind", ["host", "inproc"])
-@pytest.mark.parametrize("exchange", ["sample", "block"])
+@pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
 def test_line_and_exchange_change_nothing(reference: Replies, kind: Any, exchange: Any) -> None:
     with connect(from_table({"name": "bob", "kind": kind, "exchange": exchange}, "bob")) as dut:
         dut.start()
         assert_same(feed(dut, 0, N), reference)
 
 
-@pytest.mark.parametrize("exchange", ["sample", "block"])
+@pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
 def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) -> None:
     dut = started(FramedLink(MemoryWire(1)), exchange=exchange)
     bounds = [0, 1, 1, 14, 29, 100, 257, N]
@@ -211,7 +213,7 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
     [
         ('kind = "hots"', "kind: must be one of 'host', 'inproc', 'serial', not 'hots'"),
         ('kind = "serial"', "the key 'url' is lacking"),
-        ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, exchange, timeout_s, estimator)"),
+        ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, exchange, "),
         ("timeout_s = 1.0", "kind: must be one of 'host', 'inproc', 'serial', not None"),
         ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be more than 0 and at most 3600, not 0"),
         ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be 1 to 100000000, not 0"),
@@ -269,6 +271,7 @@ class FaultyLink:
 
     name = "faulty"
     dropped = 0
+    line_s = 0.0
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
@@ -324,36 +327,109 @@ def repeat(message: Message) -> list[Message]:
     return [message, message]
 
 
-def test_lost_sample_is_told_and_the_device_found_alive(line: FaultyLink) -> None:
+def with_missing(lost: Iterable[int]) -> Replies:
+    """What a device says on a good line if it is told that these samples are missing."""
+    missing = MISSING.copy()
+    missing[list(lost)] = True
+    return started(FramedLink(MemoryWire(1))).feed(0, FORCE, DISPLACEMENT, missing)
+
+
+def assert_same_but_for_the_loss(replies: Replies, lost: Sequence[int]) -> None:
+    assert np.flatnonzero(replies.flags & LOST).tolist() == list(lost)
+    assert_same(dataclasses.replace(replies, flags=replies.flags & ~np.uint8(LOST)), with_missing(lost))
+
+
+EXCHANGES = {"sample": (Sample, [84]), "block": (SampleBlock, range(84, 98)), "stream": (SampleBlock, range(84, 98))}
+"""Of each kind of exchange the messages, and the samples of the one that begins with sample 84."""
+
+
+@pytest.mark.parametrize("exchange", EXCHANGES)
+def test_lost_samples_are_missing_to_the_device_and_marked(line: FaultyLink, exchange: str) -> None:
+    kind, samples = EXCHANGES[exchange]
+    dut = started(line, exchange=exchange)
+    line.to_device = about(kind, 84, lose)
+    assert_same_but_for_the_loss(feed(dut, 0, N), list(samples))
+    assert dut.stop()["samples_lost"] == len(samples)
+
+
+@pytest.mark.parametrize("exchange", EXCHANGES)
+def test_first_and_last_samples_may_be_lost_too(line: FaultyLink, exchange: str) -> None:
+    kind, samples = EXCHANGES[exchange]
+    last = N - 1 if kind is Sample else N - N % 14
+    dut = started(line, exchange=exchange)
+    line.to_device = lambda message: [] if getattr(message, "sample_index", None) in (0, last) else [message]
+    assert_same_but_for_the_loss(feed(dut, 0, N), [*range(len(samples)), *range(last, N)])
+
+
+def test_loss_in_a_stream_costs_no_time(line: FaultyLink) -> None:
+    """The answers to the next message tell of it."""
+    dut = started(line, exchange="stream")
+    line.to_device = about(SampleBlock, 84, lose)
+    before_s = line.clock()
+    feed(dut, 0, N)
+    assert line.clock() == before_s
+
+
+def test_loss_in_lock_step_costs_one_time_out(line: FaultyLink) -> None:
     dut = started(line)
-    line.to_device = about(Sample, 81, lose)
-    with pytest.raises(LinkTimeout) as caught:
+    line.to_device = about(Sample, 84, lose)
+    before_s = line.clock()
+    feed(dut, 0, N)
+    assert line.clock() == pytest.approx(before_s + 2.0)
+
+
+def test_line_that_loses_all_samples_is_given_up(line: FaultyLink) -> None:
+    dut = started(line)
+    line.to_device = lambda message: [] if isinstance(message, Sample) else [message]
+    with pytest.raises(LinkTimeout, match="it is alive, but messages to it were lost 11 times in this run"):
         feed(dut, 0, N)
-    assert str(caught.value) == (
-        "device bob: no estimate for sample 81 within 2 s (last message: Stepped 80);"
-        " it is alive and has dropped 0 damaged frames"
-    )
+    assert line.clock() == pytest.approx(2.0 * 11)
 
 
-def test_damaged_sample_is_told_with_the_devices_count(line: FaultyLink) -> None:
+def test_damaged_sample_is_counted_by_the_device(line: FaultyLink) -> None:
     def damage(message: Message) -> list[Message]:  # noqa: ARG001 - it is replaced by noise
         line.write(b"\0noise\0")
         return []
 
     dut = started(line)
     line.to_device = about(Sample, 81, damage)
-    with pytest.raises(LinkTimeout, match="it is alive and has dropped 1 damaged frames"):
+    assert_same_but_for_the_loss(feed(dut, 0, N), [81])
+    counters = dut.stop()
+    assert (counters["frames_dropped"], counters["samples_lost"]) == (1, 1)
+
+
+def test_counters_are_those_of_the_run(line: FaultyLink) -> None:
+    dut = started(line)
+    line.to_device = about(Sample, 81, lose)
+    feed(dut, 0, N)
+    assert dut.stop()["samples_lost"] == 1
+    dut.start()
+    feed(dut, 0, N)
+    assert dut.stop()["samples_lost"] == 0
+
+
+def test_sample_that_comes_after_it_was_given_up_ends_the_run(line: FaultyLink) -> None:
+    """The device has entered it, which was not to be."""
+    kept: list[Message] = []
+
+    def hold_back(message: Message) -> list[Message]:
+        if isinstance(message, Sample) and message.sample_index == 81:
+            kept.append(message)
+            return []
+        return [kept.pop(), message] if isinstance(message, Sample) and kept else [message]
+
+    dut = started(line)
+    line.to_device = hold_back
+    with pytest.raises(DeviceError, match=r"Estimate of THETA_0 for sample 82 was due, Estimate\(.*sample_index=81"):
         feed(dut, 0, N)
 
 
-@pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81")])
+@pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81 and Hello")])
 def test_lost_answer_is_told(line: FaultyLink, kind: type, after: str) -> None:
     dut = started(line)
     line.from_device = about(kind, 81, lose)
-    with pytest.raises((LinkError, DeviceError)) as caught:
+    with pytest.raises(LinkError, match=f"1 messages were lost between {after}"):
         feed(dut, 0, N)
-    assert type(caught.value) is (LinkTimeout if kind is Stepped else LinkError)
-    assert after in str(caught.value)
 
 
 def test_lost_answer_in_a_block_is_told(line: FaultyLink) -> None:
@@ -518,11 +594,11 @@ def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, int]) -> None:
 def test_device_is_let_go_when_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     wires: list[ChildWire] = []
 
-    def stranger(_description: DeviceDescription) -> Link:
+    def stranger(_description: DeviceDescription) -> ChildWire:
         wires.append(host_wire(["--catalogue-hash", "1"]))
-        return FramedLink(wires[0])
+        return wires[0]
 
-    monkeypatch.setattr(HostDevice, "open", stranger)
+    monkeypatch.setattr(HostDevice, "wire", stranger)
     with pytest.raises(CatalogueMismatch):
         open_dut("host")
     assert not Path(f"/proc/{wires[0].child.tether_pid}").exists()
