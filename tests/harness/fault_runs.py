@@ -22,6 +22,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.excitation import Excitation
 from harness.bench import Bench
 from harness.catalogue import Command, Configure, Control, Message, Sample, SampleBlock, SteppedFlag, unpack
 from harness.devices import InprocDevice
@@ -97,7 +98,7 @@ class SignalsRig:
         """Nothing is held."""
 
 
-SCENARIO = Scenario(name="faults", samples=N)
+SCENARIO = Scenario(samples=N, excitation=Excitation(shape="square", low_v=0.0, high_v=1.0, frequency_hz=200.0), name="faults")
 
 
 @dataclass(frozen=True)
