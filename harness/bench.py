@@ -136,8 +136,12 @@ class Bench:
         """The pace of the samples, and what to send."""
         if self._real_time is None:
             return None, performance.blocks
-        pace = self.dut.pace(performance.sample_period_s * self._real_time)
+        pace = self.pace(performance.sample_period_s * self._real_time)
         return pace, list(performance.blocks)
+
+    def pace(self, period_s: float) -> Pace:
+        """Of a run in real time; counts its overruns."""
+        return self.dut.pace(period_s)
 
     def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
         sent: deque[Block] = deque()

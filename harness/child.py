@@ -6,6 +6,7 @@ it by SIGKILL, and ends the device.
 
 from __future__ import annotations
 
+import re
 import select
 import subprocess
 from collections.abc import Sequence
@@ -19,6 +20,9 @@ TETHER = Path(__file__).parent / "bin" / "analogrig-tether"
 START_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0
 """Longer than the tether waits before it kills."""
+
+_COMPLAINT = re.compile(r"[a-z][\w./-]*: ")
+"""As programs begin it, with their name: QEMU adds all the registers of the processor."""
 
 
 class Child:
@@ -62,15 +66,16 @@ class Child:
         return line
 
     def obituary(self) -> str:
-        """How it ended, with the last line that it said on standard error."""
+        """How it ended, with its last complaint, or whatever it said last."""
         try:
             status = self._process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             return f"{self._what} closed its line"
         if self._process.stderr is not None and not self._process.stderr.closed:
             self._last_words += self._process.stderr.read().decode(errors="replace")
-        last = self._last_words.strip().rpartition("\n")[2]
-        return f"{self._what} ended with status {status}{f': {last}' if last else ''}"
+        lines = self._last_words.strip().splitlines()
+        told = [line for line in lines if _COMPLAINT.match(line)] or lines
+        return f"{self._what} ended with status {status}{f': {told[-1]}' if told else ''}"
 
     def end(self) -> None:
         """The end of the tether's input is the end of both. May be called twice."""

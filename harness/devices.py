@@ -154,16 +154,16 @@ class QemuDevice(DeviceDescription):
         qemu = shutil.which(QEMU)
         if qemu is None:
             raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
+        # What the firmware may ask of its debugger: who it is, which differs after every boot.
+        arguments = f"arg=analogrig,arg={secrets.randbits(32):08x}"
+        command: list[str | Path] = [qemu, "-machine", self.machine, "-kernel", self._image(), *_NO_SCREEN]
+        command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
         ours, theirs = socket.socketpair()
-        with theirs:
+        with ours, theirs:
             line = theirs.fileno()
-            command: list[str | Path] = [qemu, "-machine", self.machine, "-kernel", self._image(), *_NO_SCREEN]
             command += ["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"]
-            # What the firmware may ask of its debugger: who it is, which differs after every boot.
-            arguments = f"arg=analogrig,arg={secrets.randbits(32):08x}"
-            command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
             child = Child(command, f"QEMU ({self.machine})", inherited=[line])
-        return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+            return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
 
     @property
     def elsewhere(self) -> str:

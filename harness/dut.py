@@ -100,7 +100,7 @@ class Dut:
 
     @property
     def line_s(self) -> float:
-        """How long a line of the described speed would have taken for the samples until now; 0.0 if none is described."""
+        """How long a line of the described speed would have taken for the samples; 0.0: none is described."""
         return self._talk.link.line_s - self._line_s
 
     @property

@@ -23,6 +23,8 @@ WRITE_TIMEOUT_S = 2.0
 LIBRARY = Path(__file__).with_name("_device.so")
 
 _READ_BYTES = 65_536
+_POLL_S = 1e-3
+"""The resolution of poll(); a message of samples in real time lasts less."""
 _ALWAYS_ROOM = 255
 """Blocks that may wait in the input of a device that works while it is told."""
 
@@ -61,7 +63,7 @@ class Wire(Protocol):
         """
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, at least one byte unless the time is over.
+        """What has come, at least one byte unless the time is over, or nearly over.
 
         :raises LinkClosed: the other end is gone.
         """
@@ -108,8 +110,12 @@ class DescriptorWire:
 
     def read(self, timeout_s: float) -> bytes:
         try:
-            if not self._readable.poll(math.ceil(timeout_s * 1000.0)):
-                return b""
+            if not self._readable.poll(int(timeout_s * 1000.0)):
+                if timeout_s >= _POLL_S:
+                    return b""  # the rest of the time is for the next call
+                time.sleep(timeout_s)
+                if not self._readable.poll(0):
+                    return b""
             received = os.read(self._fd, _READ_BYTES)
         except OSError as error:
             raise LinkClosed(f"{self.name}: {_reason(error)}") from error
