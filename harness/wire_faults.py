@@ -233,7 +233,7 @@ class FaultyWire:
             kind = self._due_kind(direction, lane.frames)
             lane.frames += 1
             passed = self._changed(direction, each)
-            if kind is None:
+            if kind is None or not passed:
                 lane.put(passed, self.clock())
             elif kind in _SPOILT:
                 lane.put(_SPOILT[kind](passed, self._rng), self.clock())

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from emulator.excitation import Excitation
 from harness.bench import Bench
-from harness.catalogue import Command, Configure, Control, Message, Sample, SampleBlock, SteppedFlag, unpack
+from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag, unpack
 from harness.devices import InprocDevice
 from harness.dut import Dut, Replies
 from harness.errors import AnalogrigError
@@ -46,8 +46,8 @@ LONGEST_RUN_S = 60.0
 MOST_WAITING = 20_000
 """Messages, or bytes, that may be kept anywhere on the way."""
 
-ESTIMATOR = EstimatorConfig(nb=2, nk=1, forgetting=0.97, p0=1000.0, refresh_n=10, warm_up_n=20, edge_codes=32.0)
-"""Not the default in anything that matters, so that a device which has lost its configuration is found out."""
+ESTIMATOR = EstimatorConfig(forgetting=0.97, p0=1000.0, refresh_n=10, warm_up_n=20, edge_codes=32.0)
+"""Not the default, and yet as many parameters: a device that has lost its configuration looks like any other."""
 
 STEPS = ("handshake", "configuration", "start", "samples", "stop")
 
@@ -98,7 +98,9 @@ class SignalsRig:
         """Nothing is held."""
 
 
-SCENARIO = Scenario(samples=N, excitation=Excitation(shape="square", low_v=0.0, high_v=1.0, frequency_hz=200.0), name="faults")
+SCENARIO = Scenario(
+    samples=N, excitation=Excitation(shape="square", low_v=0.0, high_v=1.0, frequency_hz=200.0), name="faults"
+)
 
 
 @dataclass(frozen=True)
