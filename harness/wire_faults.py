@@ -27,6 +27,7 @@ DIRECTIONS: tuple[Direction, ...] = ("to", "from")
 
 LONGEST_DELAY_S = 3.0
 MOST_FRAMES_LATE = 40
+MOST_FRAMES_OUT = 600
 _BABBLE_BYTES = 1024
 _STRANGERS_HASH = CATALOGUE_HASH ^ 0x5A5A5A5A
 
@@ -135,6 +136,8 @@ class _Lane:
     stalled_s: float = 0.0
     """Until then nothing comes."""
     babbles: bool = False
+    lost_n: int = 0
+    """So many frames more are lost."""
 
     def split(self, sent: bytes) -> list[bytes]:
         """The frames that are complete."""
@@ -232,7 +235,7 @@ class FaultyWire:
                 break  # of a device that has been reset meanwhile
             kind = self._due_kind(direction, lane.frames)
             lane.frames += 1
-            passed = self._changed(direction, each)
+            passed = self._changed(lane, each)
             if kind is None or not passed:
                 lane.put(passed, self.clock())
             elif kind in _SPOILT:
@@ -247,13 +250,19 @@ class FaultyWire:
             return kind
         return next((kind for kind, rate in self._rates.items() if self._rng.random() < rate), None)
 
-    def _changed(self, direction: Direction, sent: bytes) -> bytes:
+    def _changed(self, lane: _Lane, sent: bytes) -> bytes:
         """By what lasts."""
         if self._is_silent:
             return b""
+        if lane.lost_n:
+            lane.lost_n -= 1
+            return b""
         if self._is_garbled:
             return self._rng.randbytes(self._rng.randint(1, 2 * len(sent)))
-        return _strange(direction, sent) if self._is_stranger else sent
+        return _strange(sent) if self._is_stranger else sent
+
+    def _lose_many(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002 - it is lost
+        lane.lost_n = int(MOST_FRAMES_OUT ** self._rng.random())
 
     def _reorder(self, lane: _Lane, sent: bytes) -> None:
         lane.held.append((1 + self._rng.randint(1, 3), sent))
@@ -270,7 +279,7 @@ class FaultyWire:
         lane.put(sent, self.clock())
         lane.babbles = True
 
-    def _disconnect(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002 - it is lost
+    def _disconnect(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
         self._is_closed = True
 
     def _hang(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
@@ -293,6 +302,7 @@ class FaultyWire:
             lane.put(sent, self.clock())
 
     HAPPENS: ClassVar[Mapping[str, Callable[[FaultyWire, _Lane, bytes], None]]] = {
+        "outage": _lose_many,
         "reorder": _reorder,
         "repeat": _repeat,
         "delay": _delay,
@@ -305,15 +315,17 @@ class FaultyWire:
     }
 
 
-def _strange(direction: Direction, sent: bytes) -> bytes:
+def _strange(sent: bytes) -> bytes:
     """As if the device had been built from another catalogue."""
     packets = frame.FrameDecoder().feed(sent)
     message = unpack(packets[0]) if packets else None
     if message is None:
         return sent
-    if direction == "from" and isinstance(message, Hello):
+    if isinstance(message, Hello):
         message = message._replace(catalogue_hash=_STRANGERS_HASH)
     return frame.encode(pack(message), _STRANGERS_HASH)
 
 
+PASSING = (*_SPOILT, "outage", "reorder", "repeat", "delay")
+"""The kinds after which the line is as it was."""
 KINDS = (*_SPOILT, *FaultyWire.HAPPENS)

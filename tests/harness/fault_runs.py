@@ -36,10 +36,13 @@ from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
 from harness.wire import MemoryWire, VirtualClock, Wire
-from harness.wire_faults import DIRECTIONS, KINDS, Direction, FaultyWire, WireFault, WireFaults
+from harness.wire_faults import DIRECTIONS, KINDS, PASSING, Direction, FaultyWire, WireFault, WireFaults
 
 N = 60
+MOST_N = 480
 CHANGE_AT = 40
+RIG_BLOCK = 112
+"""A whole number of messages."""
 TIMEOUT_S = 2.0
 LONGEST_RUN_S = 60.0
 """Of virtual time, whatever happens: ten silences of two seconds each, delays, and the talk before and after."""
@@ -55,16 +58,16 @@ ExchangeKind = Literal["sample", "block", "stream"]
 
 
 def signals() -> NDArray[np.uint16]:
-    """(N, 4) codes of a second-order system whose gain grows at CHANGE_AT; velocity and net force are zero."""
+    """(MOST_N, 4) codes of a second-order system whose gain grows at CHANGE_AT; velocity and net force are zero."""
     rng = np.random.default_rng(7)
-    codes = np.zeros((N, len(CHANNELS)))
-    u = np.where((np.arange(N) // 8) % 2, 3900.0, 150.0)
-    y = np.zeros(N)
-    for k in range(2, N):
+    codes = np.zeros((MOST_N, len(CHANNELS)))
+    u = np.where((np.arange(MOST_N) // 8) % 2, 3900.0, 150.0)
+    y = np.zeros(MOST_N)
+    for k in range(2, MOST_N):
         gain = 1.0 if k < CHANGE_AT else 1.4
         y[k] = 1.5 * y[k - 1] - 0.54 * y[k - 2] + gain * (0.01 * u[k - 1] + 0.02 * u[k - 2])
     codes[:, CHANNELS.index("force")] = u
-    codes[:, CHANNELS.index("displacement")] = np.clip(np.round(y + rng.normal(size=N)), 0, 4095)
+    codes[:, CHANNELS.index("displacement")] = np.clip(np.round(y + rng.normal(size=MOST_N)), 0, 4095)
     return codes.astype(np.uint16)
 
 
@@ -82,8 +85,8 @@ class SignalsRig:
         return Performance(5e-5, 200.0, channels, (), self._blocks(scenario.samples))
 
     def _blocks(self, n: int) -> Iterator[Block]:
-        for first in range(0, n, 50):
-            codes = CODES[first : min(n, first + 50)]
+        for first in range(0, n, RIG_BLOCK):
+            codes = CODES[first : min(n, first + RIG_BLOCK)]
             yield Block(first, codes.astype(np.float64), codes, np.zeros(codes.shape, bool))
 
     def description(self) -> Mapping[str, Any]:
@@ -98,9 +101,8 @@ class SignalsRig:
         """Nothing is held."""
 
 
-SCENARIO = Scenario(
-    samples=N, excitation=Excitation(shape="square", low_v=0.0, high_v=1.0, frequency_hz=200.0), name="faults"
-)
+EXCITATION = Excitation(low_v=0.0, high_v=1.0, frequency_hz=200.0)
+"""Of no account: the rig plays CODES."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,8 @@ class Case:
     exchange: ExchangeKind = "sample"
     first_seq: int = 0
     """Of the harness's messages; the device's wrap around several times in any run."""
-    most_lost_n: int = N
+    samples: int = N
+    most_lost_n: int = MOST_N
 
 
 @dataclass
@@ -127,7 +130,7 @@ class Played:
     frames: Mapping[Direction, int] = field(default_factory=dict)
 
 
-def play(case: Case, rig: SignalsRig | None = None) -> Played:
+def play(case: Case) -> Played:
     """Play it, and raise AssertionError if it broke a promise.
 
     :raises AssertionError: a wrong estimate counts as valid, or it took too long or too much.
@@ -143,7 +146,7 @@ def play(case: Case, rig: SignalsRig | None = None) -> Played:
         most_lost_n=case.most_lost_n,
         estimator=ESTIMATOR,
     )
-    played = _play(link, description, case.first_seq, rig or SignalsRig())
+    played = _play(link, description, case)
     played.took_s, played.frames = clock(), wire.frames
     assert clock() < LONGEST_RUN_S, f"{case}: it took {clock():.1f} s"
     waiting = len(link._messages) + len(link._decoder._begun) + sum(len(lane.queue) for lane in wire._lanes.values())
@@ -153,13 +156,14 @@ def play(case: Case, rig: SignalsRig | None = None) -> Played:
     return played
 
 
-def _play(link: FramedLink, description: InprocDevice, first_seq: int, rig: SignalsRig) -> Played:
+def _play(link: FramedLink, description: InprocDevice, case: Case) -> Played:
     dut = Dut(link, description)
-    dut._talk._seq = first_seq
+    dut._talk._seq = case.first_seq
+    scenario = Scenario(samples=case.samples, excitation=EXCITATION, name="faults")
     try:
         dut.handshake()
         dut.configure()
-        run = Bench(rig, dut).play(SCENARIO, seed=0)
+        run = Bench(SignalsRig(), dut).play(scenario, seed=0)
     except AnalogrigError as error:
         return Played(type(error).__name__, str(error))
     verdict = judge(run)
@@ -169,20 +173,20 @@ def _play(link: FramedLink, description: InprocDevice, first_seq: int, rig: Sign
 
 
 @functools.lru_cache(maxsize=4096)
-def reference(lost: tuple[int, ...]) -> Replies:
+def reference(samples: int, lost: tuple[int, ...]) -> Replies:
     """What a device says without any fault, which is told that these samples are missing."""
-    missing = np.zeros(N, bool)
+    missing = np.zeros(samples, bool)
     missing[list(lost)] = True
     dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob", exchange="block", estimator=ESTIMATOR))
     dut.handshake()
     dut.configure()
     dut.start()
-    return dut.feed(0, FORCE, DISPLACEMENT, missing)
+    return dut.feed(0, FORCE[:samples], DISPLACEMENT[:samples], missing)
 
 
 def _check_estimates(run: Run, case: Case) -> None:
     """A run that counts as valid has the estimates, to the bit, of one without faults."""
-    expected = reference(tuple(np.flatnonzero(run.lost).tolist()))
+    expected = reference(case.samples, tuple(np.flatnonzero(run.lost).tolist()))
     known = ~run.lost
     assert np.array_equal(run.theta.view(np.uint32), expected.theta.view(np.uint32)), f"{case}: another theta"
     for name in ("innovation", "statistic"):
@@ -222,7 +226,7 @@ def steps(exchange: ExchangeKind) -> dict[Direction, list[str]]:
     """Of a run without faults, to which of STEPS each frame belongs."""
     tap = _Tap(MemoryWire(1))
     description = InprocDevice(name="bob", exchange=exchange, estimator=ESTIMATOR)
-    played = _play(FramedLink(tap), description, 0, SignalsRig())
+    played = _play(FramedLink(tap), description, Case(WireFaults(), exchange))
     assert played.outcome == "as without"
     sent = _messages(tap.passed["to"])
     out: dict[Direction, list[str]] = {"to": [], "from": []}
@@ -271,16 +275,22 @@ def by_chance(seed: int) -> Case:
     rng = Random(seed)
     exchange: ExchangeKind = rng.choice(("sample", "block", "stream"))
     frames = {direction: len(names) for direction, names in steps(exchange).items()}
+    in_samples = {
+        direction: [i for i, name in enumerate(names) if name == "samples"]
+        for direction, names in steps(exchange).items()
+    }
     at: list[WireFault] = []
     rates: dict[str, float] = {}
     if rng.random() < 0.8:
         for _ in range(rng.choice((1, 1, 2, 3, 4))):
             direction = rng.choice(DIRECTIONS)
-            at.append(WireFault(rng.choice(KINDS), direction, rng.randrange(frames[direction])))
+            kind = rng.choice(KINDS if rng.random() < 0.3 else PASSING)
+            number = rng.choice(in_samples[direction]) if rng.random() < 0.7 else rng.randrange(frames[direction])
+            at.append(WireFault(kind, direction, number))
     else:
-        rates = {rng.choice(KINDS[:9]): 10 ** rng.uniform(-4.0, -1.0) for _ in range(rng.randint(1, 3))}
+        rates = {rng.choice(PASSING): 10 ** rng.uniform(-4.0, -2.0) for _ in range(rng.randint(1, 3))}
     first_seq = rng.choice((0, 250, rng.randrange(256)))
-    return Case(WireFaults(tuple(at), rates, seed), exchange, first_seq, rng.choice((0, 3, N)))
+    return Case(WireFaults(tuple(at), rates, seed), exchange, first_seq, most_lost_n=rng.choice((0, 3, N)))
 
 
 def outcomes(seeds: range) -> Counter[str]:
