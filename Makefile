@@ -8,6 +8,8 @@ JOBS ?= 2
 ARGS ?=
 PYTEST_ARGS ?=
 FUZZ_S ?= 60
+FAULTS_N ?= 100000
+FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
@@ -25,7 +27,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench cost coverage bit-exact analyze fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench cost coverage bit-exact analyze fuzz faults wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -57,6 +59,9 @@ bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" go
 
 fuzz: $(PRODUCTS) ## libFuzzer over core and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
+
+faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
+	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
 
 coverage: $(PRODUCTS) ## which lines and branches of the core its tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage
