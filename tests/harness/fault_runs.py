@@ -12,7 +12,7 @@ import itertools
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from random import Random
@@ -35,7 +35,7 @@ from harness.rig import Block, Performance
 from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
-from harness.wire import MemoryWire, VirtualClock, Wire
+from harness.wire import MemoryWire, Wire
 from harness.wire_faults import DIRECTIONS, KINDS, PASSING, Direction, FaultyWire, WireFault, WireFaults
 
 N = 60
@@ -55,6 +55,7 @@ ESTIMATOR = EstimatorConfig(forgetting=0.97, p0=1000.0, refresh_n=10, warm_up_n=
 STEPS = ("handshake", "configuration", "start", "samples", "stop")
 
 ExchangeKind = Literal["sample", "block", "stream"]
+EXCHANGES: tuple[ExchangeKind, ...] = ("sample", "block", "stream")
 
 
 def signals() -> NDArray[np.uint16]:
@@ -130,25 +131,26 @@ class Played:
     frames: Mapping[Direction, int] = field(default_factory=dict)
 
 
-def play(case: Case) -> Played:
-    """Play it, and raise AssertionError if it broke a promise.
+def play(case: Case, open_wire: Callable[[], Wire] | None = None, timeout_s: float = TIMEOUT_S) -> Played:
+    """Play it, by default with a device in this process and in virtual time.
 
     :raises AssertionError: a wrong estimate counts as valid, or it took too long or too much.
     """
-    clock = VirtualClock()
     nonces = itertools.count(1)
-    wire = FaultyWire(lambda: MemoryWire(next(nonces), clock=clock), case.faults)
+    wire = FaultyWire(open_wire or (lambda: MemoryWire(next(nonces))), case.faults)
+    clock, started_s = wire.clock, wire.clock()
     link = FramedLink(wire)
     description = InprocDevice(
         name="bob",
         exchange=case.exchange,
-        timeout_s=TIMEOUT_S,
+        timeout_s=timeout_s,
         most_lost_n=case.most_lost_n,
         estimator=ESTIMATOR,
     )
     played = _play(link, description, case)
-    played.took_s, played.frames = clock(), wire.frames
-    assert clock() < LONGEST_RUN_S, f"{case}: it took {clock():.1f} s"
+    link.close()
+    played.took_s, played.frames = clock() - started_s, wire.frames
+    assert played.took_s < LONGEST_RUN_S, f"{case}: it took {played.took_s:.1f} s"
     waiting = len(link._messages) + len(link._decoder._begun) + sum(len(lane.queue) for lane in wire._lanes.values())
     assert waiting < MOST_WAITING, f"{case}: {waiting} wait"
     if played.run is not None and played.outcome in {"as without", "lost"}:
@@ -273,7 +275,7 @@ def everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Iterator[t
 def by_chance(seed: int) -> Case:
     """One to four faults anywhere, or a line that is bad all the time."""
     rng = Random(seed)
-    exchange: ExchangeKind = rng.choice(("sample", "block", "stream"))
+    exchange: ExchangeKind = rng.choice(EXCHANGES)
     frames = {direction: len(names) for direction, names in steps(exchange).items()}
     in_samples = {
         direction: [i for i, name in enumerate(names) if name == "samples"]
