@@ -93,10 +93,10 @@ add:    lsls    r2, r0, #1
         lsrs    r2, r2, #24
         cmp     r2, #254
         bhs     add_rare                // the sum may overflow, or a is no number
-        subs    r3, r2, r3
+        subs    r7, r2, r3
         lsls    r5, r1, #8
         orrs    r5, r5, r4
-        lsrs    r5, r5, r3              // the mantissa of b in units of that of a; what is lost is less than a unit
+        lsrs    r5, r5, r7              // the mantissa of b in units of that of a; what is lost is less than a unit
         lsls    r6, r0, #8
         orrs    r6, r6, r4
         lsrs    r2, r0, #23
@@ -107,24 +107,25 @@ add:    lsls    r2, r0, #1
 one_off:
         lsls    r3, r3, #1              // the leading one goes
 2:      lsls    r5, r3, #24
-        beq     half                    // what is lost might decide
+        beq     4f
 compose_sum:
         compose
         leave
 3:      adds    r2, r2, #1              // the leading one went with the carry
         b       2b
-
-half:   lsls    r5, r3, #23             // is it a half, or nothing?
+4:      lsls    r5, r3, #23             // is it a half that is lost, or nothing of note?
         bpl     compose_sum
-add_again:
-        eors    r1, r1, r0              // b again
-add_rare:
-        b       add_any
+        cmp     r7, #8
+        bhi     add_again               // even less may be lost beside it
+        compose
+        movs    r1, #1                  // exactly a half: to even
+        bics    r0, r0, r1
+        leave
 
 subtract:
         subs    r3, r6, r5
         bmi     one_off
-        beq     cancelled
+        beq     equal
         uxtb    r5, r2
         cmp     r5, #25
         blo     add_again               // the difference may be subnormal
@@ -135,15 +136,19 @@ subtract:
         bne     2f
         subs    r2, r2, #8
         lsls    r3, r3, #8
-        b       1b
-2:      cmp     r3, #0
-        bmi     one_off
-        subs    r2, r2, #1
+        bpl     1b
+        b       one_off
+2:      subs    r2, r2, #1
         lsls    r3, r3, #1
-        b       2b
-cancelled:
-        movs    r0, #0
+        bpl     2b
+        b       one_off
+equal:  movs    r0, #0
         leave
+
+add_again:
+        eors    r1, r1, r0              // b again
+add_rare:
+        b       add_any
 
 // ---- a * b
 
