@@ -42,11 +42,6 @@ def truncated(a: Floats, kind: type[np.integer]) -> Words:
     return np.clip(whole, limits.min, limits.max).astype(kind).view(np.uint32)
 
 
-def flags(a: Floats, b: Floats) -> Words:
-    """2 Z + C of a comparison: C unless a < b, alone if one is no number."""
-    return np.where(a == b, 3, np.where(a < b, 0, 1)).astype(np.uint32)
-
-
 ARITHMETIC: dict[str, Callable[[Floats, Floats], Floats]] = {
     "fadd": lambda a, b: a + b,
     "fsub": lambda a, b: a - b,
@@ -61,9 +56,6 @@ OTHERS: dict[str, Callable[[Floats, Floats], Words]] = {
     "fcmpge": lambda a, b: (a >= b).astype(np.uint32),
     "fcmpgt": lambda a, b: (a > b).astype(np.uint32),
     "fcmpun": lambda a, b: (np.isnan(a) | np.isnan(b)).astype(np.uint32),
-    "cfcmpeq": flags,
-    "cfcmple": flags,
-    "cfrcmple": lambda a, b: flags(b, a),
     "i2f": lambda a, _: words(a.view(np.int32).astype(np.float32)),
     "ui2f": lambda a, _: words(a.view(np.uint32).astype(np.float32)),
     "f2iz": lambda a, _: truncated(a, np.int32),

@@ -38,11 +38,16 @@
         lsls    \to, \to, #31
 .endm
 
-/// r0 = the float of sign and exponent r2 and fraction r3, rounded half up: the lowest bit that is kept no longer counts what is lost.
-.macro  compose
+/// r0 = the float of sign and exponent r2 and the bits r3, of which some are lost; a half is rounded up.
+.macro  compose lost
         lsls    r2, r2, #23
-        lsrs    r0, r3, #9              // the carry is the highest bit that is lost
+        lsrs    r0, r3, #\lost          // the carry is the highest bit that is lost
         adcs    r0, r0, r2              // may carry into the exponent, as it should
+.endm
+
+.macro  make_even
+        movs    r1, #1
+        bics    r0, r0, r1
 .endm
 
 /// To \rare unless |a| and |b| are of a moderate size: the exponent of a in 64..191 and that of b in 86..170, so that neither the
@@ -109,7 +114,7 @@ one_off:
 2:      lsls    r5, r3, #24
         beq     4f
 compose_sum:
-        compose
+        compose 9
         leave
 3:      adds    r2, r2, #1              // the leading one went with the carry
         b       2b
@@ -117,9 +122,8 @@ compose_sum:
         bpl     compose_sum
         cmp     r7, #8
         bhi     add_again               // even less may be lost beside it
-        compose
-        movs    r1, #1                  // exactly a half: to even
-        bics    r0, r0, r1
+        compose 9
+        make_even                       // exactly a half
         leave
 
 subtract:
@@ -172,16 +176,19 @@ routine __aeabi_fmul
         adds    r6, r6, r7
         lsrs    r6, r6, #8
         muls    r3, r5, r3
-        subs    r2, r2, #126            // leaves the carry set, for one more in r3:
+        subs    r2, r2, #128            // leaves the carry set, for one more in r3:
         adcs    r3, r3, r6              // r3 - 1 <= a b / 2^16 < r3 + 1
-        lsls    r6, r3, #26
+        bmi     1f
+        lsls    r6, r3, #26             // 7 bits are lost. Those below the highest ...
         lsrs    r6, r6, #27
-        beq     2f                      // of the 7 or 8 bits that are lost, those below the highest are 0 or 1: too close to a half
-        lsls    r3, r3, #1              // the leading one goes
-        bcs     1f
-        lsls    r3, r3, #1
-        subs    r2, r2, #1
-1:      compose
+        beq     2f                      // ... are 0 or 1: too close to a half
+        compose 7
+        leave
+1:      lsls    r6, r3, #25             // the same with 8 bits
+        lsrs    r6, r6, #26
+        beq     2f
+        adds    r2, r2, #1
+        compose 8
         leave
 
 2:      muls    r0, r1, r0              // the lower 23 bits of a b, whatever signs and exponents are above the mantissas
@@ -189,20 +196,19 @@ routine __aeabi_fmul
         subs    r1, r1, r3
         lsls    r1, r1, #25
         asrs    r1, r1, #25
-        adds    r3, r3, r1              // exact: the integer part of a b / 2^16 ...
-        lsls    r1, r0, #16             // ... and the rest
-        lsls    r3, r3, #1
-        bcs     3f
+        adds    r2, r2, #1
+        adds    r3, r3, r1              // exact: the integer part of a b / 2^16
+        bmi     3f
         lsls    r3, r3, #1
         subs    r2, r2, #1
-3:      lsls    r5, r3, #23
-        compose
+3:      lsls    r5, r3, #24
+        lsls    r1, r0, #16             // the rest of it
+        compose 8
         cmp     r1, #0
         bne     4f
         cmp     r5, r4
         bne     4f
-        movs    r1, #1                  // exactly a half: to even
-        bics    r0, r0, r1
+        make_even                       // exactly a half
 4:      leave
 
 mul_rare:
@@ -496,8 +502,7 @@ pack:   cmp     r2, #255
         adcs    r0, r0, r2
         cmp     r5, r4
         bne     3f
-        movs    r1, #1                  // exactly a half: to even
-        bics    r0, r0, r1
+        make_even                       // exactly a half
 3:      leave
         .ltorg
 
@@ -506,99 +511,100 @@ pack:   cmp     r2, #255
         .section .text.float_comparison, "ax", %progbits
         .p2align 1
 
-/// Sets the flags as for unsigned integers in the order of a and b: Z is set if they are equal, C clear if a < b; C alone is set if
-/// one is no number. Clobbers r0 to r3.
-compare:
-        movs    r2, r0
-        orrs    r2, r2, r1
-        movs    r3, #255
-        lsls    r3, r3, #23             // infinity
-        cmp     r2, r3
-        bhi     1f
-        cmp     r0, r1                  // neither is negative or no number
-        bx      lr
-1:      lsls    r3, r3, #1
-        lsls    r2, r0, #1
-        cmp     r2, r3
-        bhi     4f
-        lsls    r2, r1, #1
-        cmp     r2, r3
-        bhi     4f
-        lsls    r3, r3, #7              // the sign bit
-        cmp     r0, #0
-        bmi     2f
-        orrs    r0, r0, r3              // numbers without a sign, in the order of the floats: |a| above, ...
-        b       3f
-2:      subs    r0, r3, r0
-        adds    r0, r0, r3              // ... and as far below
-3:      cmp     r1, #0
-        bmi     5f
-        orrs    r1, r1, r3
-        cmp     r0, r1
-        bx      lr
-5:      subs    r1, r3, r1
-        adds    r1, r1, r3
-        cmp     r0, r1
-4:      bx      lr                      // C alone, if from above
-
 .macro  exchange
         movs    r2, r0
         movs    r0, r1
         movs    r1, r2
 .endm
 
-/// r0 = 1 if the condition holds after compare, and 0 if not.
-.macro  whether condition
-        push    {r4, lr}
-        bl      compare
-        b\condition yes
-        movs    r0, #0
-        pop     {r4, pc}
+.macro  return value
+        movs    r0, #\value
+        bx      lr
+.endm
+
+/// r0 = 1 if a < b, or a = b and \equal is 1; else, and if one is no number, 0. As bit patterns, floats of one sign have the order of
+/// their magnitudes; that of greater magnitude is the one that may be no number.
+.macro  order equal, unless_below, unless_above
+        movs    r2, r0
+        eors    r2, r2, r1
+        bmi     3f
+        cmp     r0, #0
+        bmi     2f
+        cmp     r0, r1
+        \unless_below 1f
+        movs    r2, #255
+        lsls    r2, r2, #23             // infinity
+        cmp     r1, r2
+        bhi     1f
+        return  1
+1:      return  0
+2:      cmp     r0, r1                  // both are negative
+        \unless_above 1b
+        movs    r2, #1
+        lsls    r2, r2, #31
+        asrs    r2, r2, #8              // -infinity
+        cmp     r0, r2
+        bhi     1b
+        return  1
+3:      movs    r2, #\equal
+        b       signs_differ
 .endm
 
 routine __aeabi_fcmpgt
         exchange
 routine __aeabi_fcmplt
-        whether lo
+        order   0, bhs, bls
 
 routine __aeabi_fcmpge
         exchange
 routine __aeabi_fcmple
-        whether ls
+        order   1, bhi, blo
+
+/// Returns r2 if both are zero, and otherwise as above.
+signs_differ:
+        lsrs    r3, r0, #31             // is a negative? then it is below b
+        lsls    r0, r0, #1
+        lsls    r1, r1, #1
+        bne     1f
+        cmp     r0, #0
+        beq     2f
+1:      movs    r2, #255
+        lsls    r2, r2, #24
+        cmp     r0, r2
+        bhi     3f
+        cmp     r1, r2
+        bhi     3f
+        movs    r2, r3
+2:      movs    r0, r2
+        bx      lr
+3:      return  0
 
 routine __aeabi_fcmpeq
-        whether eq
-
-yes:    movs    r0, #1
-        pop     {r4, pc}
+        cmp     r0, r1
+        beq     1f
+        orrs    r0, r0, r1
+        lsls    r0, r0, #1
+        beq     2f                      // both are zero
+        return  0
+1:      lsls    r0, r0, #1
+        movs    r1, #255
+        lsls    r1, r1, #24
+        cmp     r0, r1
+        bls     2f
+        return  0
+2:      return  1
 
 routine __aeabi_fcmpun
-        movs    r3, #255
-        lsls    r3, r3, #24
+        movs    r2, #255
+        lsls    r2, r2, #24
         lsls    r0, r0, #1
-        cmp     r0, r3
+        cmp     r0, r2
         bhi     1f
         lsls    r1, r1, #1
-        cmp     r1, r3
+        cmp     r1, r2
         bhi     1f
-        movs    r0, #0
-        bx      lr
-1:      movs    r0, #1
-        bx      lr
-
-// These answer in the flags, and leave all registers as they were.
-
-routine __aeabi_cfrcmple
-        push    {r0-r3, lr}
-        exchange
-        bl      compare
-        pop     {r0-r3, pc}
-
-routine __aeabi_cfcmpeq
-routine __aeabi_cfcmple
-        push    {r0-r3, lr}
-        bl      compare
-        pop     {r0-r3, pc}
+        return  0
+1:      return  1
 
 // ---- integers
 
@@ -641,8 +647,7 @@ routine __aeabi_i2f
         lsls    r3, r3, #1
         bne     5f
         bcc     5f
-        movs    r1, #1                  // exactly a half: to even
-        bics    r0, r0, r1
+        make_even                       // exactly a half
 5:      bx      lr
 
 // Towards zero. Beyond the range of integers: its end. Of no number: 0.
