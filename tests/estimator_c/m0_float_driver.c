@@ -1,5 +1,5 @@
-/* Runs one routine of estimator_c/ports/cortex_m0/float.S, for the tests: its name is the argument; reads pairs of words,
-   the operands, and writes a word for each pair. */
+/* Runs one routine of estimator_c/ports/cortex_m0/float.S, for the tests: its name is the argument; reads pairs of
+   words, the operands, and writes a word for each pair. */
 
 #include <stdint.h>
 #include <stdio.h>

@@ -1,15 +1,15 @@
-/// Arithmetic of float for processors without it and without a long multiplication (ARMv6-M: Cortex-M0, M0+, M1): the
-/// single-precision helpers of Arm's run-time ABI (RTABI32, 4.1.2 and 4.1.4), to be linked ahead of the compiler's library.
+/// Arithmetic of float for processors that have neither that nor a long multiplication (ARMv6-M: Cortex-M0, M0+, M1):
+/// the single-precision helpers of Arm's run-time ABI (RTABI32, 4.1.2 and 4.1.4), to be linked ahead of libgcc.
 ///
 /// The results are those of IEEE 754 binary32 to the bit: rounded to nearest, ties to even, with subnormal numbers,
-/// infinities and signed zeros. Each NaN is 0x7FC00000, or an operand. No flags, no traps, no state, no memory but the stack (20 bytes).
+/// infinities and signed zeros. A NaN is 0x7FC00000, or an operand that is one. No flags, no traps, no state, no memory
+/// but the stack (20 bytes); may be interrupted anywhere, and called from interrupts.
 ///
-/// Each operation first tries a short way, for numbers of a moderate size whose result is not close to a rounding boundary; what it
-/// cannot decide goes to the code called _rare, which is exact for all numbers.
+/// Each operation first tries a short way, for normal numbers of moderate size whose result is not close to a rounding
+/// boundary; it takes 25 to 65 instructions. The rest goes to code that is exact for all numbers, and longer.
 ///
-/// Names: a and b are the operands (r0, r1); s and e the sign and the biased exponent; "sign and exponent" is the number
-/// 256 s + e, the top nine bits of a float. A *fraction* has 32 bits to the right of the point, its leading one left out: 23 of
-/// them are kept, 9 are rounded away. A *mantissa* has its leading one in bit 31, so that 24 bits are kept and 8 are rounded away.
+/// The operands are a (r0) and b (r1). "Sign and exponent" are the top nine bits of a float, as a number. A mantissa
+/// has its leading one in bit 31, if not said otherwise, so that 8 bits of it are rounded away.
 
         .syntax unified
         .cpu    cortex-m0
@@ -38,7 +38,8 @@
         lsls    \to, \to, #31
 .endm
 
-/// r0 = the float of sign and exponent r2 and the bits r3, of which some are lost; a half is rounded up.
+/// r0 = the float of sign and exponent r2 and mantissa r3, of which the lowest bits are lost; a half is rounded up.
+/// Where the leading one is still there, it adds 1 to the exponent.
 .macro  compose lost
         lsls    r2, r2, #23
         lsrs    r0, r3, #\lost          // the carry is the highest bit that is lost
@@ -50,15 +51,15 @@
         bics    r0, r0, r1
 .endm
 
-/// To \rare unless |a| and |b| are of a moderate size: the exponent of a in 64..191 and that of b in 86..170, so that neither the
-/// product nor the quotient can overflow or be subnormal.
+/// To \rare unless |a| and |b| are of moderate size: the exponent of a in 64..191 and that of b in 85..170, so that
+/// neither the product nor the quotient can overflow or be subnormal.
 .macro  moderate rare
         lsls    r2, r0, #1
         adds    r2, r2, r2              // overflows if the exponent's two top bits differ
         bvc     \rare
         lsls    r2, r1, #1
         lsrs    r3, r2, #1
-        adds    r2, r2, r3              // 1.5 e is in 128..255 if e is in 86..170, and else less, or less after the carry
+        adds    r2, r2, r3              // 1.5 times the exponent: 128..255 there, less below, and again less above
         bpl     \rare
 .endm
 
@@ -136,7 +137,7 @@ subtract:
         subs    r2, r2, #1
         lsls    r3, r3, #1
         bmi     one_off
-1:      lsrs    r5, r3, #24             // two places or more: the exponents differ by one at most, and nothing was lost
+1:      lsrs    r5, r3, #24             // two places or more: the exponents differ by one at most, nothing was lost
         bne     2f
         subs    r2, r2, #8
         lsls    r3, r3, #8
@@ -191,7 +192,7 @@ routine __aeabi_fmul
         compose 8
         leave
 
-2:      muls    r0, r1, r0              // the lower 23 bits of a b, whatever signs and exponents are above the mantissas
+2:      muls    r0, r1, r0              // the lower 23 bits of a b, whatever is above the mantissas
         lsrs    r1, r0, #16
         subs    r1, r1, r3
         lsls    r1, r1, #25
@@ -256,21 +257,21 @@ routine __aeabi_fdiv
         lsls    r3, r3, #9
         subs    r3, r3, r5
         .rept   2
-        movs    r6, r3                  // ... and two steps of Newton's method, r <- r (2 - x r), low by 1 in 2^13 at most
+        movs    r6, r3                  // ... and two steps of Newton's method, r <- r (2 - x r), low by 2^-13 at most
         muls    r6, r5, r6
         negs    r6, r6
         lsrs    r6, r6, #16
         muls    r3, r6, r3
         lsrs    r3, r3, #15
         .endr
-        lsrs    r5, r0, #9              // a / b to 12 bits after the point, low by 2 at most
+        lsrs    r5, r0, #9              // a / b to 12 bits after the point, low by less than 2.01
         muls    r5, r3, r5
         lsrs    r5, r5, #18
         movs    r6, r5
         muls    r6, r1, r6
         lsls    r0, r0, #12
         subs    r0, r0, r6              // the remainder, in which the upper bits cancelled
-        lsls    r5, r5, #12             // and 12 bits more
+        lsls    r5, r5, #12             // and 12 bits more, low by 2 at most
         lsrs    r6, r0, #9
         muls    r6, r3, r6
         lsrs    r6, r6, #18
@@ -280,7 +281,7 @@ routine __aeabi_fdiv
         subs    r0, r0, r6
         cmp     r0, r1
         bhs     3f
-2:      lsls    r2, r2, #23             // 25 bits of the quotient; it is never half way between two floats, since a has only 24
+2:      lsls    r2, r2, #23             // never half way between two floats, since a has 24 bits and this 25
         lsrs    r0, r5, #1
         adcs    r0, r0, r2
         leave
@@ -466,7 +467,7 @@ normalize:
         subs    r2, r2, #1
         b       normalize
 
-/// Shifts the mantissa r3 right by r0, not negative; the lowest bit also stands for all that is lost. Clobbers r0 and r6.
+/// Shifts r3 right by r0, not negative; its lowest bit then stands for all that is lost, too. Clobbers r0 and r6.
 shift_right:
         cmp     r0, #31
         bls     1f
@@ -487,7 +488,7 @@ pack_with_rest:
         sbcs    r5, r5, r6              // 1 unless it was zero
         orrs    r3, r3, r5
 
-/// Returns the float of mantissa r3, whose lowest bit also stands for all below it, exponent r2, of any size, and sign r7.
+/// Returns the float of sign r7, exponent r2, of any size, and mantissa r3, whose lowest bit stands for all below, too.
 pack:   cmp     r2, #255
         bge     infinite
         subs    r2, r2, #1              // the leading one will count
@@ -522,8 +523,8 @@ pack:   cmp     r2, #255
         bx      lr
 .endm
 
-/// r0 = 1 if a < b, or a = b and \equal is 1; else, and if one is no number, 0. As bit patterns, floats of one sign have the order of
-/// their magnitudes; that of greater magnitude is the one that may be no number.
+/// r0 = 1 if a < b, or a = b and \equal is 1; else, and if one is no number, 0. Of two floats of one sign, that of
+/// greater magnitude is the greater bit pattern; if it is a number, both are.
 .macro  order equal, unless_below, unless_above
         movs    r2, r0
         eors    r2, r2, r1
