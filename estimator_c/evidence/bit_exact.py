@@ -16,6 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from estimator_c.evidence.cost import FLOAT_ROUTINES
+
 __all__ = ["BUILDS", "QUICK", "Build", "main", "missing_tools", "outcome"]
 
 HERE = Path(__file__).parent
@@ -31,16 +33,18 @@ LEVELS = ("-O0", "-O1", "-O2", "-O3")
 
 @dataclass(frozen=True)
 class Target:
-    """A processor that programs are made for, what runs them here, and Debian's package of their C library."""
+    """A processor to make programs for, what runs them here, Debian's package of its C library, and sources of ours."""
 
     name: str
     compiler: str
     emulator: str
     libc: str
+    library: tuple[str, ...] = ()
 
 
 FOREIGN = (
     Target("ARM, soft float", "arm-linux-gnueabi-gcc", "qemu-arm", "libc6-dev-armel-cross"),
+    Target("Cortex-M0's float", "arm-linux-gnueabi-gcc", "qemu-arm", "libc6-dev-armel-cross", (str(FLOAT_ROUTINES),)),
     Target("ARM, hard float", "arm-linux-gnueabihf-gcc", "qemu-arm", "libc6-dev-armhf-cross"),
     Target("aarch64", "aarch64-linux-gnu-gcc", "qemu-aarch64", "libc6-dev-arm64-cross"),
     Target("riscv64", "riscv64-linux-gnu-gcc", "qemu-riscv64", "libc6-dev-riscv64-cross"),
@@ -68,7 +72,7 @@ def _builds() -> Iterator[Build]:
     for compiler, flags in itertools.product(("gcc", "clang"), here):
         yield Build(f"this machine, {compiler} {' '.join(flags)}", (compiler, *flags))
     for target, level in itertools.product(FOREIGN, LEVELS):
-        yield Build(f"{target.name}, gcc {level}", (target.compiler, level), (target.emulator,))
+        yield Build(f"{target.name}, gcc {level}", (target.compiler, level, *target.library), (target.emulator,))
 
 
 BUILDS = tuple(_builds())

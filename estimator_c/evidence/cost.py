@@ -21,6 +21,7 @@ __all__ = ["Cost", "costs", "count_steps", "link", "main", "missing_tools"]
 
 HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
+FLOAT_ROUTINES = HERE.parent / "ports" / "cortex_m0" / "float.S"
 RESULTS = Path("build/cost.json")
 
 COMPILER = "arm-none-eabi-gcc"
@@ -39,16 +40,17 @@ EVEN = 1.2
 
 @dataclass(frozen=True)
 class Processor:
-    """One that code is made for, and the board of QEMU that runs it."""
+    """One that code is made for, the board of QEMU that runs it, and what it needs beside the compiler's library."""
 
     name: str
     flags: tuple[str, ...]
     machine: str
+    library: tuple[Path, ...] = ()
 
 
 M4F = Processor("M4F", ("-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"), "mps2-an386")
 M3 = Processor("M3", ("-mcpu=cortex-m3",), "mps2-an385")
-M0 = Processor("M0", ("-mcpu=cortex-m0",), "mps2-an385")
+M0 = Processor("M0", ("-mcpu=cortex-m0",), "mps2-an385", (FLOAT_ROUTINES,))
 """QEMU has no board of this kind with an M0, whose instructions are some of an M3's."""
 
 
@@ -254,7 +256,7 @@ class Bench:
     def _steps(
         self, name: str, processor: Processor, sources: Sequence[Path], flags: Sequence[str], step: str
     ) -> Steps:
-        image = link(self._folder / "image.elf", sources, ("-O2", *processor.flags, *flags))
+        image = link(self._folder / "image.elf", [*sources, *processor.library], ("-O2", *processor.flags, *flags))
         return Steps(name, count_steps(image, processor.machine, step))
 
     def text_bytes(self, *flags: str) -> int:

@@ -69,8 +69,7 @@ BEYOND = {
     "M4F, n = 6, edges may slip, worst": "1.65 times the typical step: a doubt about an edge",
     "M4F, n = 6, edges may slip, fixed, worst": "1.68 times the typical step: a doubt about an edge",
     "M3, n = 4, edges locked, worst": "1.23 times the typical step: C is taken from A",
-    "M0, n = 4, edges locked": "14,600 instructions; the textbook's U-D alone takes 10,800 with libgcc's soft float",
-    "M0, n = 4, edges locked, worst": "1.205 times the typical step",
+    "M0, n = 4, edges locked, worst": "1.22 times the typical step: the same",
     "M4F, code of the core at -Os, everything": "4898 B",
     "M4F, code of the core at -Os, trigger alone": "2608 B",
 }
