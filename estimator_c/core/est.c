@@ -36,6 +36,10 @@
 #define REFRESH_STRIDE 0.05F
 #define REFRESH_DOUBT 100.0F
 
+/// The estimate remembers some 1 / (1 - forgetting) samples. After so many times that without an edge, what it says of A comes from
+/// the noise, which any A = C fits: C would follow it anywhere.
+#define REFRESH_MEMORIES 2.0F
+
 /// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
 /// counts as no more, so that a change of the plant is not taken for noise; of Gaussian noise that keeps NOISE_KEPT.
 #define NOISE_RATE 0.005F
@@ -225,7 +229,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
         count(&self->counters.stuck);
         return EST_REFUSED;
     }
-    if (EST_WITH_WATCH || EST_WITH_EDGES) {
+    if (EST_WITH_WATCH || EST_WITH_EDGES || EST_WITH_ADAPTATION) {
         count(&self->edges.since_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
@@ -318,13 +322,17 @@ static void refresh_prefilter(est_t* const self) {
     }
 }
 
+static bool remembers_edge(const est_t* const self) {
+    return ((1.0F - self->config->forgetting) * (float)self->edges.since_n) < REFRESH_MEMORIES;
+}
+
 /// Not while edges are in doubt: theta may have followed what did not happen.
 EST_INLINE void approach_refresh(est_t* const self) {
     self->refresh_in--;
     if (self->refresh_in > 0U) {
         return;
     }
-    if (self->edges.age_n > 0U) {
+    if ((self->edges.age_n > 0U) || !remembers_edge(self)) {
         self->refresh_in = 1U;
     } else {
         self->refresh_in = self->config->refresh_n;
