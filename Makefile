@@ -14,8 +14,8 @@ STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pe
 BIN := $(VENV)/bin
 
 PRODUCTS := harness/_catalogue.py emulator/_engine.so harness/_device.so harness/bin/analogrig-device \
-            harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
-NATIVE_SOURCES := $(wildcard emulator/*.[ch] estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+            harness/bin/analogrig-tether harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
+NATIVE_SOURCES := $(wildcard emulator/*.[ch] harness/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 

@@ -28,6 +28,11 @@ FORMAT_VERSION = 1
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """Order of the columns of ``Run.codes`` and ``Run.clipped``."""
 
+LOST = 0x20
+"""In the flags of a sample, beside SteppedFlag: it was lost on the way to the device, for which it is missing."""
+UNREPORTED = 0x40
+"""... the device was asked not to report every estimate, and this one is that of the row before."""
+
 _ARRAYS: dict[str, tuple[str, int]] = {
     "codes": ("uint16", 2),
     "clipped": ("bool", 2),
@@ -107,6 +112,10 @@ class Conditions:
     """Why the run is not valid; empty if it is."""
     overloads: Mapping[str, int] = field(default_factory=dict)
     """Of each amplifier whose overload lamp lit, the first sample that was taken with the lamp lit."""
+    real_time: float = 0.0
+    """By how much the machine's time was stretched to be that of the clock on the wall; 0: lock-step, in no time."""
+    line_s: float = 0.0
+    """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -130,7 +139,7 @@ class Run:
     statistic: NDArray[np.float32]
     """(n,): the trigger's statistic."""
     flags: NDArray[np.uint8]
-    """(n,): the device's flags (missing, refused, restarted)."""
+    """(n,): SteppedFlag of the device, LOST, UNREPORTED."""
     alarm_index: NDArray[np.int64]
     """(a,): sample index of each alarm."""
     alarm_kind: NDArray[np.uint8]
@@ -144,6 +153,11 @@ class Run:
     def missing(self) -> NDArray[np.bool_]:
         """(n,): the device was told that this sample is missing."""
         return missing_to_device(self.clipped)
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(n,): this sample was lost on the way to the device."""
+        return np.asarray((self.flags & LOST) != 0)
 
     def channel(self, name: str) -> NDArray[np.float64]:
         """One channel in its physical unit, (n,) float64."""

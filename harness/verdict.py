@@ -233,17 +233,27 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
-    reasons += [
-        f"the device {what} {run.conditions.counters[counter]} samples"
-        for counter, what in (("refused", "refused"), ("samples_lost", "never saw"))
-        if run.conditions.counters.get(counter)
-    ]
+    if run.conditions.counters.get("refused"):
+        reasons.append(f"the device refused {run.conditions.counters['refused']} samples")
+    reasons += _losses(run)
     missing = int(run.missing.sum())
     if run.samples and missing > expect.max_missing_fraction * run.samples:
         reasons.append(
             f"{missing} of {run.samples} samples were clipped and missing for the device,"
             f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
         )
+    return reasons
+
+
+def _losses(run: Run) -> list[str]:
+    """Samples that never came to the device: more than its description allows, or not those that the harness knows."""
+    most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
+    reasons = [f"{lost} samples were lost on the way to the device, more than {most}"] if lost > most else []
+    heard = np.flatnonzero(~run.lost)
+    known = int(run.lost[: heard[-1]].sum()) if len(heard) else 0  # of those after the last one heard it cannot know
+    missed = run.conditions.counters.get("samples_lost", known)
+    if missed != known:
+        reasons.append(f"the device never saw {missed} samples, where {known} are known to be lost")
     return reasons
 
 

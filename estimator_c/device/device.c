@@ -12,10 +12,11 @@
 #error "the mask of missing samples has 16 bits"
 #endif
 
+#define RUN_MAX 7U      ///< of the run ids, which have three bits
 #define PAYLOAD_MAX 8U  ///< of an answer; all fit classic CAN
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
-#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE
+#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE
 
 /// Where the answers of one step of work go.
 typedef struct {
@@ -47,10 +48,11 @@ static void put_hello(device_t* const self, answer_t* const answer, const uint8_
 }
 
 static void put_firmware(device_t* const self, answer_t* const answer, const uint8_t answers) {
-    const struct analogrig_firmware_t message = { .seq         = self->seq,
-                                                  .firmware_id = self->identity.firmware_id,
-                                                  .answers     = answers,
-                                                  .boot_nonce  = self->identity.boot_nonce };
+    const struct analogrig_firmware_t message = { .seq          = self->seq,
+                                                  .firmware_id  = self->identity.firmware_id,
+                                                  .answers      = answers,
+                                                  .input_blocks = self->identity.input_blocks,
+                                                  .boot_nonce   = self->identity.boot_nonce };
     uint8_t                           payload[PAYLOAD_MAX];
     (void)analogrig_firmware_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_FIRMWARE_FRAME_ID, payload);
@@ -82,6 +84,7 @@ static void put_stepped(device_t* const self, answer_t* const answer, const est_
                                                  .restarted    = restarted ? 1U : 0U,
                                                  .gathering    = (step->status == EST_GATHERING) ? 1U : 0U,
                                                  .idle         = step->idle ? 1U : 0U,
+                                                 .run          = self->run,
                                                  .sample_index = self->next_index,
                                                  .statistic    = step->statistic };
     uint8_t                          payload[PAYLOAD_MAX];
@@ -133,11 +136,23 @@ enter_sample(device_t* const self, answer_t* const answer, const uint16_t index,
     self->next_index++;
 }
 
+/// Counts samples that cannot be entered.
+static bool accepts_samples(device_t* const self, const uint8_t run, const uint8_t samples) {
+    if (!self->running || (samples < 1U) || (samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
+        add(&self->counters.messages_refused, 1U);
+        return false;
+    }
+    if (run != self->run) {
+        add(&self->counters.samples_of_other_runs, samples);
+        return false;
+    }
+    return true;
+}
+
 static void on_sample(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
     struct analogrig_sample_t message;
     (void)analogrig_sample_unpack(&message, payload, ANALOGRIG_SAMPLE_LENGTH);
-    if (!self->running) {
-        add(&self->counters.messages_refused, 1U);
+    if (!accepts_samples(self, message.run, 1U)) {
         return;
     }
     const est_sample_t sample = { .u     = (float)message.force,
@@ -149,8 +164,7 @@ static void on_sample(device_t* const self, answer_t* const answer, const uint8_
 static void on_sample_block(device_t* const self, const uint8_t* const payload) {
     struct analogrig_sample_block_t block;
     (void)analogrig_sample_block_unpack(&block, payload, ANALOGRIG_SAMPLE_BLOCK_LENGTH);
-    if (!self->running || (block.samples < 1U) || (block.samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
-        add(&self->counters.messages_refused, 1U);
+    if (!accepts_samples(self, block.run, block.samples)) {
         return;
     }
     self->job         = DEVICE_STEPPING;
@@ -224,15 +238,16 @@ static void reset(device_t* const self) {
     (void)est_init(&self->estimator, &self->config);
 }
 
-static uint8_t start(device_t* const self, const uint32_t first_index) {
+static uint8_t start(device_t* const self, const uint32_t run) {
     if (self->running) {
         return ANALOGRIG_CONTROLLED_RESULT_RUNNING_CHOICE;
     }
-    if ((first_index > UINT16_MAX) || !est_init(&self->estimator, &self->config)) {
+    if ((run > RUN_MAX) || !est_init(&self->estimator, &self->config)) {
         return ANALOGRIG_CONTROLLED_RESULT_OUT_OF_RANGE_CHOICE;
     }
     self->running      = true;
-    self->next_index   = (uint16_t)first_index;
+    self->run          = (uint8_t)run;
+    self->next_index   = 0U;
     self->unreported_n = 0U;
     return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
 }
@@ -323,6 +338,10 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
         return self->counters.samples_lost;
     case ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE:
         return self->counters.samples_ignored;
+    case ANALOGRIG_STATUS_COUNTER_SAMPLES_OF_OTHER_RUNS_CHOICE:
+        return self->counters.samples_of_other_runs;
+    case ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE:
+        return self->counters.receive_overruns;
     default:
         return 0U;
     }

@@ -40,16 +40,19 @@ extern "C" {
 typedef struct {
     uint32_t catalogue_hash;  ///< ANALOGRIG_CATALOGUE_HASH; another one makes the device a stranger, for tests
     uint32_t boot_nonce;      ///< another number after every boot
+    uint8_t  input_blocks;    ///< so many SampleBlocks may wait in the port's input; at least 1
     uint8_t  firmware_id;     ///< ANALOGRIG_FIRMWARE_FIRMWARE_ID_..._CHOICE
 } device_identity_t;
 
 /// Counters since device_init() or RESET. They saturate, they do not wrap.
 typedef struct {
-    uint32_t sequence_gaps;      ///< messages whose sequence number was not the one after the last
-    uint32_t messages_repeated;  ///< messages with the sequence number of the last; ignored
-    uint32_t messages_refused;   ///< good frames that made no sense here or now, such as samples before START
-    uint32_t samples_lost;       ///< skipped indices
-    uint32_t samples_ignored;    ///< samples that came again or late
+    uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
+    uint32_t messages_repeated;      ///< messages with the sequence number of the last; ignored
+    uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
+    uint32_t samples_lost;           ///< skipped indices
+    uint32_t samples_ignored;        ///< samples that came again or late
+    uint32_t samples_of_other_runs;  ///< which the line has kept; ignored
+    uint32_t receive_overruns;       ///< bytes that the port could not take, as it told
 } device_counters_t;
 
 /// What is left to do of the last message. Private.
@@ -68,6 +71,7 @@ typedef struct {
     est_t             estimator;
     est_counters_t    stopped;  ///< the estimator's counters when it was stopped; it may have been overwritten since
     bool              running;
+    uint8_t           run;  ///< of START
     uint16_t          next_index;
     uint16_t          report_interval_n;
     uint16_t          unreported_n;  ///< samples since the last report

@@ -92,7 +92,7 @@ def test_hash_does_not_see_comments(generate: ModuleType) -> None:
         ("BO_ 48 Identify: 8 HARNESS\n SG_ Seq", "BO_ 48 Identify: 8 HARNESS\n SG_ Number", "byte 0 is not Seq"),
         ("SG_ Force : 32|16@1+", "SG_ Force : 33|15@1+", "no plain little-endian field"),
         ("SG_ Force : 32|16@1+ (1,0)", "SG_ Force : 32|16@1+ (0.5,0)", "no plain little-endian field"),
-        ("SG_ Idle : 12|1@1+", "SG_ Idle : 12|2@1+", "neither a flag nor a whole byte"),
+        ("SG_ Idle : 12|1@1+ (1,0)", "SG_ Idle : 12|1@1+ (2,0)", "Idle does not lie in one byte as a plain number"),
         ('VAL_ 53 Command 1 "START"', 'VAL_ 53 Command 1 "GO"', "another value table"),
     ],
 )

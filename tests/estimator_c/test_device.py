@@ -18,6 +18,8 @@ from harness import frame
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
+    RUN_SHIFT,
+    RUNS,
     Alarm,
     Command,
     Configure,
@@ -42,7 +44,8 @@ from harness.catalogue import (
     Trigger,
     pack,
 )
-from harness.link import LIBRARY, MemoryLink
+from harness.link import FramedLink
+from harness.wire import LIBRARY, MemoryWire
 from tests.estimator_c.est_driver import Estimator
 
 M = TypeVar("M", bound=Message)
@@ -54,7 +57,7 @@ class Device:
     """A device and the numbering of what it is told."""
 
     def __init__(self, catalogue_hash: int = CATALOGUE_HASH) -> None:
-        self.link = MemoryLink(NONCE, catalogue_hash=catalogue_hash)
+        self.link = FramedLink(MemoryWire(NONCE, catalogue_hash=catalogue_hash))
         self.seq = 0
 
     def tell(self, message: Message) -> list[Message]:
@@ -133,7 +136,7 @@ def test_identify_is_answered_by_catalogue_and_firmware() -> None:
     device.seq = 77
     assert device.tell(Identify(0)) == [
         Hello(0, 6, 77, CATALOGUE_HASH),
-        Firmware(1, FirmwareId.LIBRARY, 77, NONCE),
+        Firmware(1, FirmwareId.LIBRARY, 77, 255, NONCE),
     ]
 
 
@@ -290,13 +293,30 @@ def test_huge_gap_costs_bounded_time_and_gives_the_same_estimate(device: Device)
 
 
 def test_index_wraps_around(device: Device) -> None:
-    u, y = codes(BLOCK_SAMPLES * 20)
+    u, y = codes(200)
+    for index in (32767, 65435):
+        device.sample(index, u[0], y[0])
+    lost = device.counters()[Counter.SAMPLES_LOST]
     first = 65536 - 100
-    device.control(Command.STOP)
-    assert device.control(Command.START, first) == Result.APPLIED
     answers = [m for k in range(200) for m in device.sample(first + k, u[k], y[k])]
     assert [m.sample_index for m in of(Stepped, answers)] == [(first + k) % 65536 for k in range(200)]
-    assert device.counters()[Counter.SAMPLES_LOST] == 0
+    assert device.counters()[Counter.SAMPLES_LOST] == lost == 65436 - 2
+
+
+@pytest.mark.parametrize("in_blocks", [False, True])
+def test_samples_of_another_run_are_not_taken(in_blocks: bool) -> None:  # noqa: FBT001 - a parameter of pytest
+    """As when the line has kept some of a run that was broken off."""
+    device = Device()
+    assert device.control(Command.START, 5) == Result.APPLIED
+    for run in range(RUNS):
+        nothing = (0,) * (2 * BLOCK_SAMPLES)
+        bits = run << RUN_SHIFT
+        message = SampleBlock(0, bits | 3, 0, 0, nothing) if in_blocks else Sample(0, bits, 0, 1, 1)
+        stepped = of(Stepped, device.tell(message))
+        assert len(stepped) == (0 if run != 5 else 3 if in_blocks else 1)
+        assert {answer.flags >> RUN_SHIFT for answer in stepped} <= {5}
+    assert device.counters()[Counter.SAMPLES_OF_OTHER_RUNS] == 7 * (3 if in_blocks else 1)
+    assert device.counters()[Counter.MESSAGES_REFUSED] == 0
 
 
 # ---- configuration
@@ -437,7 +457,7 @@ def test_reset_is_as_good_as_new(device: Device) -> None:
     device.control(Command.REPORT_INTERVAL, 5)
     device.control(Command.START)
     device.sample(0, 1, 1)
-    device.link.send_bytes(b"\0garbage\0")
+    device.link.wire.write(b"\0garbage\0")
     assert device.control(Command.RESET) == Result.APPLIED
     assert set(device.counters().values()) == {0}
     assert current(device, Key.P0) == 10.0
@@ -461,7 +481,7 @@ def test_impossible_commands_are_refused(idle: Device) -> None:
     assert idle.control(99) == Result.UNKNOWN
     assert idle.control(Command.REPORT_INTERVAL, 0) == Result.OUT_OF_RANGE
     assert idle.control(Command.REPORT_INTERVAL, 65536) == Result.OUT_OF_RANGE
-    assert idle.control(Command.START, 65536) == Result.OUT_OF_RANGE
+    assert idle.control(Command.START, RUNS) == Result.OUT_OF_RANGE
 
 
 def test_messages_of_devices_are_refused(idle: Device) -> None:
@@ -484,7 +504,7 @@ def test_lost_message_is_a_gap_in_the_sequence(device: Device) -> None:
 def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
     damaged = bytearray(frame.encode(pack(Sample(device.seq % 256, 0, 0, 1, 2))))
     damaged[6] ^= 0x10
-    device.link.send_bytes(bytes(damaged))
+    device.link.wire.write(bytes(damaged))
     assert device.heard() == []
     assert device.counters()[Counter.FRAMES_DROPPED] == 1
 
@@ -492,7 +512,7 @@ def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
 def test_noise_is_never_answered_and_never_stops_it(device: Device) -> None:
     rng = random.Random(3)
     for _ in range(100):
-        device.link.send_bytes(rng.randbytes(1000))
+        device.link.wire.write(rng.randbytes(1000))
     assert device.heard() == []
     assert len(device.sample(0, 1, 2)) == 8
     assert device.counters()[Counter.FRAMES_DROPPED] > 100

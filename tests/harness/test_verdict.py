@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from harness.plant import Plant
+from harness.run import LOST
 from harness.verdict import as_json, judge
 from tests.harness.runs import ESTIMATOR, made_run
 
@@ -92,6 +94,31 @@ def test_run_that_was_not_valid_is_inconclusive_however_good_it_looks(changes: d
     assert verdict.outcome == "inconclusive"
     assert not verdict.valid
     assert reason in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("lost", "most", "counted", "reasons"),
+    [
+        ([30, 31], 2, 2, ()),
+        ([30, 799], 2, 1, ()),
+        ([30, 31], 1, 2, ("2 samples were lost on the way to the device, more than 1",)),
+        ([], 0, 3, ("the device never saw 3 samples, where 0 are known to be lost",)),
+        ([30], 5, 0, ("the device never saw 0 samples, where 1 are known to be lost",)),
+    ],
+    ids=["allowed", "last", "too many", "unknown", "untrue"],
+)
+def test_lost_samples_are_counted_against_what_is_allowed(
+    lost: list[int], most: int, counted: int, reasons: tuple[str, ...]
+) -> None:
+    """The device cannot know of what was lost after the last sample that it heard."""
+    run = made_run(LOADED, CHANGE, alarms=[404])
+    run.flags[lost] |= LOST
+    conditions = dataclasses.replace(
+        run.conditions, dut={**run.conditions.dut, "most_lost_n": most}, counters={"samples_lost": counted}
+    )
+    verdict = judge(dataclasses.replace(run, conditions=conditions))
+    assert verdict.reasons == reasons
+    assert verdict.outcome == ("inconclusive" if reasons else "passed")
 
 
 def test_tweak_after_the_end_of_a_short_run_is_not_judged() -> None:
