@@ -127,10 +127,10 @@ static bool believe(est_believed_t* const self, const est_config_t* const config
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
 static const est_kept_t* kept(const est_isolation_t* const self, const uint32_t ago) {
-    return &self->kept[((uint32_t)self->newest + EST_ISOLATION_KEPT_N - ago) % EST_ISOLATION_KEPT_N];
+    return &self->kept[((self->newest + EST_ISOLATION_KEPT_N) - ago) % EST_ISOLATION_KEPT_N];
 }
 
-static uint8_t one_more(const uint8_t n) { return (uint8_t)((n < UINT8_MAX) ? (n + 1U) : n); }
+static uint8_t one_more(const uint8_t n) { return (n < UINT8_MAX) ? (uint8_t)(n + 1U) : n; }
 
 static void keep(est_isolation_t* const self, const est_sample_t sample, const float innovation) {
     self->newest             = (uint8_t)((self->newest + 1U) % EST_ISOLATION_KEPT_N);
@@ -150,8 +150,7 @@ static float pushed(const est_isolation_t* const self, const uint32_t ago, const
     }
     float out = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
-        const uint32_t lag = (uint32_t)i + config->nk;
-        out += (lag <= age_n) ? (b[i] * kept(self, ago + lag)->u) : 0.0F;
+        out += b[i] * kept(self, ago + i + config->nk)->u;  // at most two samples back: est_isolation_init()
     }
     return out;
 }
@@ -217,7 +216,7 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, c
 /// An element of the normal equations once the push is eliminated; i >= j.
 static float element(const est_onset_t* const self, const uint8_t i, const uint8_t j) {
     const float* const push = &self->matrix[6];
-    return self->matrix[((i * (i + 1U)) / 2U) + j] - (push[i] * push[j] / (push[PUSH] + UNKNOWN));
+    return self->matrix[((i * (i + 1U)) / 2U) + j] - ((push[i] * push[j]) / (push[PUSH] + UNKNOWN));
 }
 
 /// Of the pair i > j, whose number is i + j - 1.
@@ -232,7 +231,7 @@ static void judge_pair(est_fit_t* const fit, const est_onset_t* const onset, con
         if (both > fit->pair[pair]) {
             const float ii       = element(onset, i, i) + UNKNOWN;
             fit->pair[pair]      = both;
-            fit->certainty[pair] = (ii > jj) ? (left * jj / ii) : left;
+            fit->certainty[pair] = (ii > jj) ? ((left * jj) / ii) : left;
         }
     }
 }
@@ -346,7 +345,8 @@ static uint8_t before(const uint8_t quiet_n, const uint8_t i, const uint8_t earl
     const uint32_t spacing_n = spacing(quiet_n);
     const uint32_t later_n   = spacing_n * i;
     const uint32_t n         = quiet_n + (spacing_n * (EST_ISOLATION_ONSETS_N / 2U));
-    const uint32_t wanted_n  = (n > (later_n + LATEST_N)) ? (n - later_n) : LATEST_N;
+    const uint32_t latest_n  = later_n + LATEST_N;
+    const uint32_t wanted_n  = ((n > latest_n) ? n : latest_n) - later_n;
     return (uint8_t)((wanted_n < earliest_n) ? wanted_n : earliest_n);
 }
 

@@ -167,3 +167,27 @@ void driver_isolate(size_t t, size_t n, const double* u, const double* y, const 
         }
     }
 }
+
+/* What est_isolation makes of n steps that are given, the estimate being theta all the time; `slices` calls of
+   est_isolation_work() after each. worked, (n,): how many of them left more to do. found, (3,): class, extent, samples. */
+void driver_diagnose(size_t n, const double* theta, const double* u, const double* y, const double* statistic,
+                     const unsigned char* status, const unsigned char* alarm, int slices, int* worked, double* found) {
+    static est_isolation_t isolation;
+    est_init(&self, &config);
+    for (uint8_t i = 0; i < est_theta_count(&self); i++) {
+        self.theta[i] = (float)theta[i];
+    }
+    est_isolation_init(&isolation, &config);
+    for (size_t k = 0; k < n; k++) {
+        const est_step_t step = { .status = (est_status_t)status[k], .statistic = (float)statistic[k], .alarm = alarm[k] != 0 };
+        est_isolation_enter(&isolation, &self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true }, step);
+        worked[k] = 0;
+        for (int i = 0; i < slices; i++) {
+            worked[k] += est_isolation_work(&isolation) ? 1 : 0;
+        }
+    }
+    const est_diagnosis_t now = est_isolation_diagnosis(&isolation);
+    found[0] = (double)now.change;
+    found[1] = now.extent;
+    found[2] = now.samples_n;
+}
