@@ -192,12 +192,12 @@ class Estimator:
         """
         n = len(steps)
         u = 1000.0 * (np.arange(n) // 25 % 2)
-        a = [np.ascontiguousarray(x, np.float64) for x in (theta, u, np.zeros(n), steps[:, 0])]
+        numbers = [np.ascontiguousarray(x, np.float64) for x in (theta, u, np.zeros(n), steps[:, 0])]
         flags = [np.ascontiguousarray(steps[:, i], np.uint8) for i in (1, 2)]
         worked, found = np.zeros(n, np.intc), np.zeros(3)
-        pointers = [ctypes.c_void_p(x.ctypes.data) for x in (*a, *flags)]
-        ends = [ctypes.c_void_p(x.ctypes.data) for x in (worked, found)]
-        self._c.driver_diagnose(ctypes.c_size_t(n), *pointers, slices, *ends)
+        inputs = [ctypes.c_void_p(x.ctypes.data) for x in numbers] + [ctypes.c_void_p(x.ctypes.data) for x in flags]
+        ends = (ctypes.c_void_p(worked.ctypes.data), ctypes.c_void_p(found.ctypes.data))
+        self._c.driver_diagnose(ctypes.c_size_t(n), *inputs, slices, *ends)
         return Diagnosed(worked, CHANGES[int(found[0])], float(found[1]), int(found[2]))
 
 

@@ -1,4 +1,4 @@
-"""What static checkers say of core and isolation: nothing but the deviations from MISRA C:2012 that MISRA.md explains."""
+"""What static checkers say of core and isolation: the deviations from MISRA C:2012 in MISRA.md, and no others."""
 
 from __future__ import annotations
 
