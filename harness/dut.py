@@ -30,6 +30,7 @@ from harness.catalogue import (
     Control,
     Controlled,
     Counter,
+    Diagnosis,
     Element,
     Estimate,
     Firmware,
@@ -91,6 +92,20 @@ class RaisedAlarm:
     statistic: float
 
 
+@dataclass(frozen=True)
+class StatedDiagnosis:
+    """What the device says has changed."""
+
+    index: int
+    """The sample after which it was said; this and ``onset`` are counted from the start, not modulo anything."""
+    change: int
+    """As Change of the catalogue."""
+    onset: int
+    """The likeliest sample of the change; that of the alarm if several parameters have changed."""
+    extent: float
+    """Of the parameter, new over old; 1 if several have changed."""
+
+
 @dataclass(frozen=True, eq=False)
 class Replies:
     """What the device said to n samples; p parameters."""
@@ -104,6 +119,7 @@ class Replies:
     flags: NDArray[np.uint8]
     """(n,): SteppedFlag."""
     alarms: tuple[RaisedAlarm, ...]
+    diagnoses: tuple[StatedDiagnosis, ...]
 
 
 @dataclass(frozen=True)
@@ -223,6 +239,10 @@ class Dut:
                     f" {_word(Result, answer.result)}, it has {answer.value:g}"
                 )
 
+    def set_force_zero(self, code: float) -> None:
+        """Tell the device which code of the force is none; errors as ``configure``."""
+        self.configure(dataclasses.replace(self._description.estimator, force_zero=code))
+
     def start(self) -> None:
         """Begin a run; its first sample has the index 0.
 
@@ -326,7 +346,7 @@ class Dut:
         return SampleBlock(seq, len(samples), first % _INDEX, mask, tuple(codes))
 
     def _collect(self, index: int, deadline_s: float, collected: _Collected) -> bool:
-        """All answers to one sample: an alarm or none, theta, the innovation, Stepped. False: they came too late."""
+        """All answers to one sample: alarm and diagnosis if any, theta, the innovation, Stepped. False: too late."""
         wire_index = index % _INDEX
         elements = iter(collected.elements)
         due = next(elements, None)
@@ -340,6 +360,9 @@ class Dut:
                 return True
             elif isinstance(message, Alarm) and message.sample_index == wire_index:
                 collected.alarms.append(RaisedAlarm(index, message.trigger, message.statistic))
+            elif isinstance(message, Diagnosis):
+                onset = index - (index - message.onset_index) % _INDEX
+                collected.diagnoses.append(StatedDiagnosis(index, message.change, onset, message.extent))
             else:
                 wanted = "Stepped" if due is None else f"Estimate of {_word(Element, due)}"
                 raise DeviceError(f"device {self.name}: {wanted} for sample {index} was due, {message} came")
@@ -375,6 +398,7 @@ class _Collected:
     statistics: list[float] = field(default_factory=list)
     flags: list[int] = field(default_factory=list)
     alarms: list[RaisedAlarm] = field(default_factory=list)
+    diagnoses: list[StatedDiagnosis] = field(default_factory=list)
 
     def replies(self) -> Replies:
         values = np.array(self.values, dtype=np.float32).reshape(len(self.flags), len(self.elements))
@@ -384,6 +408,7 @@ class _Collected:
             statistic=np.array(self.statistics, dtype=np.float32),
             flags=np.array(self.flags, dtype=np.uint8),
             alarms=tuple(self.alarms),
+            diagnoses=tuple(self.diagnoses),
         )
 
 

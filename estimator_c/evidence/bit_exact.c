@@ -219,7 +219,7 @@ static bool run_isolation(record_t* const self, uint32_t number) {
     }
     est_t           estimator;
     est_isolation_t isolation;
-    if (!est_init(&estimator, &config) || !est_isolation_init(&isolation, &config)) {
+    if (!est_init(&estimator, &config) || !est_isolation_init(&isolation, &config, 0.0F)) {
         return false;
     }
     for (uint32_t k = 0U; k < ISOLATION_STEPS_N; k++) {

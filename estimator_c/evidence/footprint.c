@@ -28,7 +28,7 @@ OUTSIDE void reset(void) {
     sink = est_invariants_hold(&estimator) ? 1.0F : 0.0F;
 #endif
 #ifdef FOOTPRINT_ISOLATES
-    (void)est_isolation_init(&isolation, &config);
+    (void)est_isolation_init(&isolation, &config, 0.0F);
     est_isolation_enter(&isolation, &estimator, sample, step);
     (void)est_isolation_work(&isolation);
     sink = est_isolation_diagnosis(&isolation).extent;

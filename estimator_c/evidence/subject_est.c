@@ -31,7 +31,7 @@ SUBJECT void subject_begin(void) {
 #endif
     (void)est_init(&estimator, &config);  // a refusal leaves nothing to count, and subject_judge() says so
 #ifdef SUBJECT_ISOLATES
-    (void)est_isolation_init(&isolation, &config);
+    (void)est_isolation_init(&isolation, &config, 0.0F);
 #endif
 }
 

@@ -111,7 +111,7 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     }
     expect(est_config_valid(&config) && est_invariants_hold(&estimator));
     est_isolation_t isolation;
-    const bool      isolates = est_isolation_init(&isolation, &config);
+    const bool      isolates = est_isolation_init(&isolation, &config, (float)byte(&input));
     const uint8_t   slices   = (uint8_t)(byte(&input) % 32U);
     while (input.n > 0U) {
         const uint8_t repeats = (uint8_t)(1U + (byte(&input) % 32U));

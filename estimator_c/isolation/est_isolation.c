@@ -92,7 +92,7 @@ static void from_moments(float* const out, const float sum, const float first, c
 /// What theta says of the plant. The poles of A are exp(-p/2 +- w) with p = B T / M and p^2/4 - w^2 = q = K T^2 / M. The
 /// plant answers 1, t and t^2, as deflections by a force, with 1, t - D, and t^2 - 2 D t + 2 (D^2 - 1/q), where D = B / K
 /// is its lag: the coefficients follow that make the sampled answers the same. False iff it is no plant.
-static bool believe(est_believed_t* const self, const est_config_t* const config) {
+static bool believe(est_believed_t* const self, const est_config_t* const config, const float force_zero) {
     const float a1  = self->theta[0];
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
@@ -116,11 +116,12 @@ static bool believe(est_believed_t* const self, const est_config_t* const config
     self->hold         = sum - ((sum * (lag_n - 0.5F)) + first);
     from_moments(self->spring, sum, drag_n + first, second + (2.0F * ((lag_n * (first + drag_n)) - (sum / q))));
     from_moments(self->damper, 0.0F, -drag_n, -2.0F * lag_n * (first + drag_n));
-    self->rest    = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
-    self->gain    = 0.0F;
+    self->gain = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
         self->gain += self->theta[2U + i] / sum;
     }
+    const float offset = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
+    self->rest         = offset + (self->gain * force_zero);
     return true;
 }
 
@@ -138,6 +139,9 @@ static void keep(est_isolation_t* const self, const est_sample_t sample, const f
     self->known_n            = (uint8_t)((self->known_n < EST_ISOLATION_KEPT_N) ? (self->known_n + 1U) : self->known_n);
 }
 
+/// Measured u, counted from where F = 0.
+static float force(const est_isolation_t* const self, const uint32_t ago) { return kept(self, ago)->u - self->force_zero; }
+
 /// The force on the plant in the past sample, times what it does to y, since an onset `age_n` samples ago. An edge of u may
 /// come anywhere within the interval, as the b's tell: b_0, if nk is 0, is the share of the new level.
 static float pushed(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n) {
@@ -146,11 +150,11 @@ static float pushed(const est_isolation_t* const self, const uint32_t ago, const
     if (age_n == 1U) {
         const float direct = (config->nk == 0U) ? b[0] : 0.0F;
         const float whole  = self->believed.gain * self->believed.hold;
-        return (direct * kept(self, ago)->u) + ((whole - direct) * kept(self, ago + 1U)->u);
+        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));
     }
     float out = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
-        out += b[i] * kept(self, ago + i + config->nk)->u;  // at most two samples back: est_isolation_init()
+        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: est_isolation_init()
     }
     return out;
 }
@@ -358,7 +362,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     stop(self);
     self->since_n   = 0U;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
-    if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config)) {
+    if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config, self->force_zero)) {
         return;
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
@@ -374,9 +378,9 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     self->residual[1]    = kept(self, self->waiting_n + 1U)->innovation;
 }
 
-bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config) {
+bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
     EST_ASSERT((self != 0) && (config != 0));
-    *self           = (est_isolation_t){ .config = config };
+    *self           = (est_isolation_t){ .config = config, .force_zero = force_zero };
     self->quiet_n   = NEVER;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     return (config->na == 2U) && ((config->nb + config->nk) <= 3U) && (config->trigger.kind == EST_TRIGGER_CUSUM);

@@ -1,7 +1,7 @@
 /// est_isolation: after an alarm of est.h, which of mass, damping and stiffness has changed, by how much, and since when
 /// (thesis 6.2.1.2, left open there).
 ///
-/// The plant is M x'' + B x' + K x = F, with u = 0 where F = 0. It serves any estimator with na = 2, whatever nk, nb and
+/// The plant is M x'' + B x' + K x = F. It serves any estimator with na = 2, whatever nk, nb and
 /// offset: neither T nor M, B, K need be known. estimator_c/README.md derives it.
 ///
 /// Optional: est.c does not know of it, and what is not called is not linked. The caller owns the state. Two contexts of
@@ -91,6 +91,7 @@ typedef struct {
 /// The fields are private; read est_isolation_diagnosis().
 typedef struct {
     const est_config_t* config;
+    float           force_zero;  ///< u where F = 0 [codes]
     float           noise_variance;
     uint8_t         newest;     ///< in kept
     uint8_t         known_n;    ///< in kept, without a gap
@@ -108,10 +109,11 @@ typedef struct {
     est_kept_t      kept[EST_ISOLATION_KEPT_N];
 } est_isolation_t;
 
-/// Ready for the first sample of an estimator with this configuration, which is kept as est_init() keeps it.
+/// Ready for the first sample of an estimator with this configuration, which is kept as est_init() keeps it. `force_zero` is
+/// u where F = 0 [codes]: what the spring carries is counted from there.
 /// False iff na is not 2 or the trigger is not the cumulative sum: the plant is then not one of mass, damper and spring, or
 /// nothing tells when it was last well. The state is then unusable. Cost: constant. May be called from an interrupt.
-bool est_isolation_init(est_isolation_t* self, const est_config_t* config);
+bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// To be called after every est_step(), with what went in and came out. Cost: some 170 instructions on a Cortex-M4F, at the
 /// alarm 2,800 (make cost). May be called from an interrupt. A gap before the diagnosis leaves it undecided.

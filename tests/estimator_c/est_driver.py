@@ -173,15 +173,19 @@ class Estimator:
         start: NDArray[np.int64],
         valid: ArrayLike | None = None,
         slices: int = 1000,
+        force_zero: float = 0.0,
     ) -> Isolated:
-        """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,)."""
+        """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,).
+
+        :param force_zero: u where the force is zero.
+        """
         runs, samples = u.shape
         found = np.zeros((runs, 8))
         valid_ = np.ascontiguousarray(np.ones((runs, samples)) if valid is None else valid, dtype=np.uint8)
         inputs = (np.ascontiguousarray(u), np.ascontiguousarray(y), valid_, np.ascontiguousarray(start, np.int64))
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in inputs]
         counts = (ctypes.c_size_t(runs), ctypes.c_size_t(samples))
-        self._c.driver_isolate(*counts, *pointers, slices, ctypes.c_void_p(found.ctypes.data))
+        self._c.driver_isolate(*counts, *pointers, slices, ctypes.c_double(force_zero), ctypes.c_void_p(found.ctypes.data))
         alarm, at, change, extent, refined, onset, least, most = found.T
         return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
 
