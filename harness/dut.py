@@ -24,6 +24,7 @@ from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     Alarm,
+    Change,
     Command,
     Configure,
     Configured,
@@ -360,7 +361,7 @@ class Dut:
                 return True
             elif isinstance(message, Alarm) and message.sample_index == wire_index:
                 collected.alarms.append(RaisedAlarm(index, message.trigger, message.statistic))
-            elif isinstance(message, Diagnosis):
+            elif isinstance(message, Diagnosis) and message.change in _SAID:
                 onset = index - (index - message.onset_index) % _INDEX
                 collected.diagnoses.append(StatedDiagnosis(index, message.change, onset, message.extent))
             else:
@@ -383,6 +384,8 @@ class Dut:
             return LinkTimeout(f"{heard}; it answers nothing else either")
         return LinkTimeout(f"{heard}; it is alive and has dropped {dropped} damaged frames")
 
+
+_SAID = frozenset(Change) - {Change.UNDECIDED}
 
 _Codes = tuple[int, int, bool]
 """Force, displacement, and whether they are missing."""

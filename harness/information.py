@@ -31,7 +31,7 @@ LN_CERTAIN = math.log(20.0)
 ISOLATION_HORIZON_N = 300
 """A change that cannot be told from others within so many samples counts as one that never can."""
 
-_RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 111))
+_RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 221))
 """Magnitudes of a rival; the best is interpolated."""
 
 

@@ -230,7 +230,7 @@ class Run:
             "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
             "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
-            and set(self.diagnosis_change.tolist()) <= set(Change),
+            and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
             "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),

@@ -185,7 +185,9 @@ class Estimator:
         inputs = (np.ascontiguousarray(u), np.ascontiguousarray(y), valid_, np.ascontiguousarray(start, np.int64))
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in inputs]
         counts = (ctypes.c_size_t(runs), ctypes.c_size_t(samples))
-        self._c.driver_isolate(*counts, *pointers, slices, ctypes.c_double(force_zero), ctypes.c_void_p(found.ctypes.data))
+        self._c.driver_isolate(
+            *counts, *pointers, slices, ctypes.c_double(force_zero), ctypes.c_void_p(found.ctypes.data)
+        )
         alarm, at, change, extent, refined, onset, least, most = found.T
         return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
 
