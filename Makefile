@@ -55,14 +55,15 @@ format: $(PRODUCTS) ## lay out the Python sources
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
-fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
+fuzz: ## libFuzzer over core and isolation, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
 	@mkdir -p $(BUILD)/fuzz/corpus
 	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
-	    -DEST_NC_MAX=2U -Iestimator_c/core estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c -o $(BUILD)/fuzz/fuzz_est
+	    -DEST_NC_MAX=2U -Iestimator_c/core -Iestimator_c/isolation estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c \
+	    estimator_c/isolation/*.c -o $(BUILD)/fuzz/fuzz_est
 	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
 	    then grep "^stat::" log; else tail -60 log; exit 1; fi
 
-coverage: $(PRODUCTS) ## which lines and branches of the core its tests go through
+coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage
 
 cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json
@@ -71,7 +72,7 @@ cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and buil
 bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every compiler and on every target
 	@$(BIN)/python -m estimator_c.evidence.bit_exact
 
-analyze: $(PRODUCTS) ## static checkers over the core: gcc -fanalyzer, cppcheck with MISRA; see estimator_c/MISRA.md
+analyze: $(PRODUCTS) ## static checkers over core and isolation: gcc -fanalyzer, cppcheck with MISRA; see estimator_c/MISRA.md
 	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist

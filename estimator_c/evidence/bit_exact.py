@@ -22,10 +22,11 @@ __all__ = ["BUILDS", "QUICK", "Build", "main", "missing_tools", "outcome"]
 
 HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
+ISOLATION = HERE.parent / "isolation"
 
 FLAGS = (
     *("-std=c99", "-static", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
-    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{CORE}"),
+    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{CORE}", f"-I{ISOLATION}"),
 )
 EXACT = "-ffp-contract=off"
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
@@ -92,7 +93,7 @@ def outcome(build: Build, *, contraction: str = EXACT) -> str:
     """What the program prints when it is built in this way."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "bit_exact")
-        sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c"))]
+        sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
         run([*build.command, *FLAGS, contraction, *sources, "-o", program])
         return run([*build.runner, program])
 

@@ -87,5 +87,12 @@ def test_cost_is_within_its_limit(name: str, costs: Mapping[str, cost.Cost]) -> 
     assert limit is not None and costs[name].value <= limit
 
 
+def test_isolation_costs_what_its_header_says(costs: Mapping[str, cost.Cost]) -> None:
+    assert costs["M4F, isolation, a sample entered"].value <= 170
+    assert costs["M4F, isolation, a sample entered, worst"].value <= 2900
+    assert costs["M4F, isolation, a slice of work"].value <= 700
+    assert costs["M4F, isolation, a slice of work, worst"].value <= 1100
+
+
 def test_no_limit_goes_untested(costs: Mapping[str, cost.Cost]) -> None:
     assert {name for name, figure in costs.items() if figure.limit is not None} == set(LIMITED)
