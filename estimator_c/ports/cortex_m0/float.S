@@ -467,12 +467,10 @@ normalize:
         subs    r2, r2, #1
         b       normalize
 
-/// Shifts r3 right by r0, not negative; its lowest bit then stands for all that is lost, too. Clobbers r0 and r6.
+/// Shifts r3 right by r0, in 0..255; its lowest bit then stands for all that is lost, too. (Beyond 32 places that bit
+/// is lost as well, which makes no difference to a rounded result.) Clobbers r0 and r6.
 shift_right:
-        cmp     r0, #31
-        bls     1f
-        movs    r0, #31                 // beyond, there is no more to lose
-1:      movs    r6, r3
+        movs    r6, r3
         lsrs    r3, r3, r0
         negs    r0, r0
         adds    r0, r0, #32
@@ -677,9 +675,7 @@ routine __aeabi_f2iz
         bx      lr
 
 routine __aeabi_f2uiz
-        asrs    r3, r0, #31
-        bne     no_integer              // negative
-        lsrs    r2, r0, #23
+        lsrs    r2, r0, #23             // sign and exponent
         negs    r2, r2
         adds    r2, r2, #127 + 31
         bmi     1f
@@ -691,8 +687,9 @@ routine __aeabi_f2uiz
 1:      movs    r2, #255
         lsls    r2, r2, #23
         cmp     r0, r2
-        bhi     no_integer
-        mvns    r0, r3
+        bhi     no_integer              // negative, or no number
+        movs    r0, #0
+        mvns    r0, r0
         bx      lr
 no_integer:
         movs    r0, #0
