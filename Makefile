@@ -72,7 +72,7 @@ cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and buil
 bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every compiler and on every target
 	@$(BIN)/python -m estimator_c.evidence.bit_exact
 
-analyze: $(PRODUCTS) ## static checkers over core and isolation: gcc -fanalyzer, cppcheck with MISRA; see estimator_c/MISRA.md
+analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer, cppcheck with MISRA, clang-tidy
 	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist

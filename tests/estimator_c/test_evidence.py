@@ -35,6 +35,20 @@ def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_pa
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("part", ["core", "isolation", "device"])
+def test_clang_tidy_finds_nothing(part: str) -> None:
+    """The checks are those of estimator_c/.clang-tidy."""
+    require("clang-tidy", "clang-tidy")
+    generated = ESTIMATOR.parent / "build" / "generated"
+    folders = [ESTIMATOR / name for name in ("core", "isolation", "device")]
+    options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, generated))]
+    sources = map(str, sorted((ESTIMATOR / part).glob("*.c")))
+    done = subprocess.run(
+        ["clang-tidy", "--quiet", *sources, "--", *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
+
+
 def deviations(text: str) -> set[str]:
     """The rules in the headings of MISRA.md, as cppcheck names them."""
     return {f"misra-c2012-{rule}" for rule in re.findall(r"^## D\d+: rule (\d+\.\d+)", text, re.MULTILINE)}
