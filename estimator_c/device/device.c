@@ -4,8 +4,12 @@
 #include "settings.h"
 
 #ifndef DEVICE_ASSERT
+#ifdef NDEBUG  // a freestanding compiler has no assert.h
+#define DEVICE_ASSERT(x) ((void)0)
+#else
 #include <assert.h>
 #define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
 #endif
 
 #if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
@@ -476,6 +480,11 @@ device_run(device_t* const self, const uint8_t* const in, const size_t in_n, uin
         progress.given += answer.n;
     }
     return progress;
+}
+
+void device_overrun(device_t* const self, const uint32_t lost_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.receive_overruns, lost_n);
 }
 
 bool device_is_busy(const device_t* const self) {

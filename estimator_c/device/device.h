@@ -110,6 +110,9 @@ void device_init(device_t* self, const device_identity_t* identity);
 /// for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
 device_progress_t device_run(device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
+/// So many bytes came that the port could not keep. The harness can ask for their sum.
+void device_overrun(device_t* self, uint32_t lost_n);
+
 /// Whether answers to input already taken are still to come.
 bool device_is_busy(const device_t* self);
 
