@@ -49,7 +49,7 @@ setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every oth
 run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="--seed 7" goes to analogrig run
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
-test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
+test: check firmware ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 check: lint strict ## linters, types, and the C with every warning an error
