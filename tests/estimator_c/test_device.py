@@ -244,6 +244,13 @@ def test_change_is_diagnosed_once(device: Device, change: isolation.Change, name
     assert abs(said.onset_index - CHANGED_AT) <= 8
 
 
+def test_onset_lies_before_the_alarm(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    answers = [message for k in range(len(u)) for message in device.sample(k, u[k], y[k])]
+    ((alarm, *_), (said,)) = of(Alarm, answers), of(Diagnosis, answers)
+    assert said.onset_index < alarm.sample_index
+
+
 def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
     u, y = changed_codes({"K": 0.8})
     first = 65536 - CHANGED_AT - 2
@@ -256,8 +263,8 @@ def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
 def test_zero_of_the_force_is_taken_from_the_configuration(idle: Device) -> None:
     idle.configure(Key.FORCE_ZERO, 1000.0)
     idle.control(Command.START)
-    ((_, said),) = diagnosed(idle, *changed_codes({"M": 0.8}, zero=1000))
-    assert said.change == Change.MASS
+    ((_, said),) = diagnosed(idle, *changed_codes({"K": 0.8}, zero=1000))
+    assert said.change == Change.STIFFNESS
     assert said.extent == pytest.approx(0.8, rel=0.03)
 
 
