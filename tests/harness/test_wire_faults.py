@@ -16,18 +16,14 @@ from harness.wire import VirtualClock
 from harness.wire_faults import DIRECTIONS, KINDS, Direction, FaultyWire, WireFault, WireFaults
 from tests.harness.fault_runs import (
     EXCHANGES,
-    STEPS,
     Case,
     ExchangeKind,
-    by_chance,
-    everywhere,
+    documented,
+    outcomes_by_chance,
+    outcomes_everywhere,
     play,
     steps,
 )
-
-README = Path(__file__).parents[2] / "harness" / "README.md"
-OUTCOMES = {"same": "as without", "LOST": "lost", "INCONCLUSIVE": "inconclusive"}
-"""As README.md has them, and fault_runs.py."""
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 
@@ -183,37 +179,19 @@ def test_device_file_may_ask_for_faults(tmp_path: Path) -> None:
 # ---- what becomes of a run
 
 
-def documented() -> dict[tuple[str, Direction], dict[str, set[str]]]:
-    """The table of README.md: by kind and direction, for each of STEPS, what may come of it."""
-    table: dict[tuple[str, Direction], dict[str, set[str]]] = {}
-    for row in re.findall(r"^\| (`[a-z`, -]+`) (to|from|both) \|(.*)\|$", README.read_text(), re.MULTILINE):
-        kinds, ways, cells = row
-        outcomes = [{OUTCOMES.get(word, word) for word in re.findall(r"\w+", cell)} for cell in cells.split("|")]
-        for kind in re.findall(r"[a-z-]+", kinds):
-            for direction in DIRECTIONS if ways == "both" else (ways,):
-                table[kind, direction] = dict(zip(STEPS, outcomes, strict=True))
-    return table
-
-
-DOCUMENTED = documented()
-
-
 def test_every_fault_is_documented() -> None:
-    assert {*DOCUMENTED} == {(kind, direction) for kind in KINDS for direction in DIRECTIONS}
+    assert {*documented()} == {(kind, direction) for kind in KINDS for direction in DIRECTIONS}
 
 
 @pytest.mark.parametrize("exchange", EXCHANGES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_fault_at_every_step_leads_to_what_is_documented(kind: str, exchange: ExchangeKind) -> None:
-    for step, direction, case in everywhere(kind, exchange, stride=12):
-        played = play(case)
-        assert played.outcome in DOCUMENTED[kind, direction][step], f"{step}: {case}: {played.why}"
+    assert outcomes_everywhere(kind, exchange, stride=12).total() > 20
 
 
 @pytest.mark.parametrize("first", range(0, 3000, 500))
 def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
-    for seed in range(first, first + 500):
-        play(by_chance(seed))  # it asserts
+    assert outcomes_by_chance(range(first, first + 500)).total() == 500
 
 
 @pytest.mark.parametrize("first", [1 + 8 * 56, 1 + 8 * 224])
@@ -239,4 +217,4 @@ def test_fault_leads_to_the_same_over_a_real_line(device: str, fault: WireFault)
     description = describe(device)
     played = play(Case(WireFaults((fault,))), description.wire, timeout_s=0.5)
     step = steps("sample")[fault.direction][fault.frame]
-    assert played.outcome in DOCUMENTED[fault.kind, fault.direction][step], played.why
+    assert played.outcome in documented()[fault.kind, fault.direction][step], played.why
