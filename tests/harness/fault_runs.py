@@ -1,6 +1,6 @@
 """Runs over a line with faults, in one process and in virtual time, each held against what may have come of it.
 
-`make faults` plays every fault at every frame, and FAULTS_N runs with faults drawn from a seed; `make test` some of both.
+`make faults` plays every fault at every frame, and FAULTS_N runs with faults from a seed; `make test` some of both.
 """
 
 # ruff: noqa: S311 - the faults are drawn from a seed; they are no secret
