@@ -14,8 +14,8 @@ STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pe
 BIN := $(VENV)/bin
 
 PRODUCTS := harness/_catalogue.py emulator/_engine.so harness/_device.so harness/bin/analogrig-device \
-            harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
-NATIVE_SOURCES := $(wildcard emulator/*.[ch] estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+            harness/bin/analogrig-tether harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
+NATIVE_SOURCES := $(wildcard emulator/*.[ch] harness/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
@@ -55,14 +55,15 @@ format: $(PRODUCTS) ## lay out the Python sources
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
-fuzz: ## libFuzzer over the core, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
+fuzz: ## libFuzzer over core and isolation, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
 	@mkdir -p $(BUILD)/fuzz/corpus
 	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
-	    -DEST_NC_MAX=2U -Iestimator_c/core estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c -o $(BUILD)/fuzz/fuzz_est
+	    -DEST_NC_MAX=2U -Iestimator_c/core -Iestimator_c/isolation estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c \
+	    estimator_c/isolation/*.c -o $(BUILD)/fuzz/fuzz_est
 	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
 	    then grep "^stat::" log; else tail -60 log; exit 1; fi
 
-coverage: $(PRODUCTS) ## which lines and branches of the core its tests go through
+coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage
 
 cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json

@@ -28,24 +28,26 @@ CATALOGUE = Path("harness/_catalogue.py")
 ENGINE = Path("emulator/_engine.so")
 DEVICE = Path("harness/_device.so")
 HOST = Path("harness/bin/analogrig-device")
+TETHER = Path("harness/bin/analogrig-tether")
 UPLOT = {
     Path("harness/report/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/report/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
-PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, *UPLOT)
+PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/*.c",)
-DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
+DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c",)
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
+TETHER_SOURCES = ("harness/tether.c",)
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 OTHER_SOURCES = (
     "emulator/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/*/*.h",
-    "estimator_c/isolation/*",
+    "estimator_c/isolation/*.h",
     "estimator_c/catalogue/*",
     *FIXTURES,
 )
@@ -55,7 +57,7 @@ OTHER_SOURCES = (
 ROOM = ("-DEST_NC_MAX=2U",)
 BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
 SHARED = ("-shared", "-fPIC")
-POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals; the port alone may know an operating system
+POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals, processes; no part of the device but its port may know them
 
 
 class BuildProducts(Command):
@@ -92,10 +94,12 @@ class BuildProducts(Command):
             (destination / product).parent.mkdir(parents=True, exist_ok=True)
         generate_codecs(generated, destination / CATALOGUE)
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
-        include = (*ROOM, *(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated)))
+        folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "device")), generated)
+        include = (*ROOM, *(f"-I{path}" for path in folders))
         compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
         compile_c(destination / DEVICE, (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
         compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))
+        compile_c(destination / TETHER, sources(TETHER_SOURCES), POSIX)
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)
         if not in_tree:
@@ -106,10 +110,8 @@ class BuildProducts(Command):
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
-        return [
-            str(path)
-            for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *HOST_SOURCES, *LIBRARY_SOURCES, *OTHER_SOURCES))
-        ]
+        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES)
+        return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *programs, *OTHER_SOURCES))]
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 from harness._catalogue import (
     CATALOGUE_HASH,
     LAYOUTS,
+    Change,
     Command,
     Counter,
     Element,
@@ -29,13 +30,17 @@ __all__ = [
     "BLOCK_SAMPLES",
     "CATALOGUE_HASH",
     "LAYOUTS",
+    "RUNS",
+    "RUN_SHIFT",
     "Alarm",
+    "Change",
     "Command",
     "Configure",
     "Configured",
     "Control",
     "Controlled",
     "Counter",
+    "Diagnosis",
     "Element",
     "Estimate",
     "Firmware",
@@ -59,6 +64,11 @@ __all__ = [
 BLOCK_SAMPLES = 14
 """The most samples of one SampleBlock."""
 
+RUN_SHIFT, _RUN_BITS = LAYOUTS["Stepped"].bits["run"]
+"""Samples and what answers them carry the id of their run in their flags, from this bit on."""
+RUNS = 1 << _RUN_BITS
+"""Run ids are modulo this."""
+
 
 class Identify(NamedTuple):
     """Harness: asks who is there."""
@@ -81,6 +91,8 @@ class Firmware(NamedTuple):
     seq: int
     firmware_id: int
     answers: int
+    input_blocks: int
+    """So many SampleBlocks may wait in its input."""
     boot_nonce: int
 
 
@@ -125,6 +137,7 @@ class Sample(NamedTuple):
 
     seq: int
     flags: int
+    """SampleFlag, and the run id."""
     sample_index: int
     force: int
     displacement: int
@@ -134,7 +147,8 @@ class SampleBlock(NamedTuple):
     """Harness: up to BLOCK_SAMPLES consecutive pairs of codes."""
 
     seq: int
-    samples: int
+    flags: int
+    """How many samples, and the run id."""
     sample_index: int
     missing: int
     """Bit i: sample i."""
@@ -156,6 +170,7 @@ class Stepped(NamedTuple):
 
     seq: int
     flags: int
+    """SteppedFlag, and the run id."""
     sample_index: int
     statistic: float
 
@@ -167,6 +182,16 @@ class Alarm(NamedTuple):
     trigger: int
     sample_index: int
     statistic: float
+
+
+class Diagnosis(NamedTuple):
+    """Device: what has changed."""
+
+    seq: int
+    change: int
+    onset_index: int
+    extent: float
+    """New over old."""
 
 
 class Status(NamedTuple):
@@ -191,6 +216,7 @@ Message: TypeAlias = (
     | Estimate
     | Stepped
     | Alarm
+    | Diagnosis
     | Status
 )
 
@@ -224,6 +250,8 @@ def unpack(packet: bytes) -> Message | None:
 
 def _packing(message_type: Any) -> _Packing:
     layout = LAYOUTS[message_type.__name__]
+    if layout.bits.get("run", (RUN_SHIFT, _RUN_BITS)) != (RUN_SHIFT, _RUN_BITS):
+        raise TypeError(f"{message_type.__name__} has the run id elsewhere than Stepped")
     if message_type is SampleBlock:
         return _block_packing(layout)
     if message_type._fields != layout.fields:

@@ -191,10 +191,40 @@ def _seed(text: str) -> int:
     raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
 
 
+def _factor(text: str) -> float:
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if 1e-3 <= factor <= 1e6:
+        return factor
+    raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
+
+
 def _add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
     shown = "$ANALOGRIG_DUT or host" if default is not None else "that of the recording"
     command.add_argument(
-        "--dut", default=default, metavar="NAME", help=f"shipped name, .toml file, or serial:URL (default: {shown})"
+        "--dut",
+        default=default,
+        metavar="NAME",
+        help=f"shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], or serial:URL (default: {shown})",
+    )
+    command.add_argument(
+        "--exchange",
+        choices=("sample", "block", "stream"),
+        help="how samples go to the device, instead of as described",
+    )
+    command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
+    command.add_argument(
+        "--report-interval", type=int, metavar="N", help="the device reports its estimate every N samples"
+    )
+    command.add_argument(
+        "--real-time",
+        type=_factor,
+        nargs="?",
+        const=1.0,
+        metavar="FACTOR",
+        help="samples go out as the machine takes them, or FACTOR times slower; a stream, unless --exchange is given",
     )
 
 
@@ -216,7 +246,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with open_rig(arguments.rig) as rig:
         scenario, seed = _what_to_play(rig, arguments)
         _prepare(arguments.out, rig)
-        with open_dut(arguments.dut) as dut:
+        with open_dut(arguments.dut, **_changes(arguments)) as dut:
             return _play(rig, dut, scenario, seed, arguments)
 
 
@@ -226,8 +256,20 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     with RecordingRig.open(arguments.file) as rig:
         _prepare(arguments.out, rig)
-        with open_dut(arguments.dut) if arguments.dut else reopen_dut(rig.run.conditions.dut) as dut:
+        changes = _changes(arguments)
+        named = arguments.dut
+        with open_dut(named, **changes) if named else reopen_dut(rig.run.conditions.dut, **changes) as dut:
             return _play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments)
+
+
+def _changes(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says about the device beyond its name."""
+    in_real_time = "stream" if arguments.real_time is not None else None
+    return {
+        "exchange": arguments.exchange or in_real_time,
+        "baud": arguments.baud,
+        "report_interval_n": arguments.report_interval,
+    }
 
 
 def _what_to_play(rig: Rig, arguments: argparse.Namespace) -> tuple[Scenario, int]:
@@ -274,7 +316,7 @@ def _play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse
     from harness.summary import summary
     from harness.verdict import judge
 
-    run = Bench(rig, dut, progress=_progress_line()).play(scenario, seed)
+    run = Bench(rig, dut, _progress_line(), real_time=arguments.real_time).play(scenario, seed)
     verdict = judge(run)
     if arguments.json:
         _print(json.dumps(_as_json(run, verdict, arguments.out)))
@@ -300,6 +342,8 @@ def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
         "rig": conditions.rig["name"],
         "dut": dict(conditions.dut),
         "link": conditions.link,
+        "line_s": conditions.line_s,
+        "real_time": conditions.real_time,
         "seed": conditions.seed,
         "samples": run.samples,
         "counters": dict(conditions.counters),

@@ -6,15 +6,17 @@ each answer says which message it answers.
 
 from __future__ import annotations
 
-import time
 from typing import TypeVar
 
 from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status
-from harness.errors import LinkError, LinkTimeout
-from harness.link import Clock, Link
+from harness.errors import DeviceError, LinkError, LinkTimeout
+from harness.link import Link
 
 _SEQ = 256
 """Sequence numbers are modulo this."""
+
+LATEST = 32
+"""A message is one that comes again, and not one after a loss, if its number is at most so far behind."""
 
 Answer = TypeVar("Answer", Hello, Firmware, Controlled, Configured, Status)
 
@@ -22,12 +24,12 @@ Answer = TypeVar("Answer", Hello, Firmware, Controlled, Configured, Status)
 class Conversation:
     """What the harness and one device say to each other. Errors lead with the device's name."""
 
-    def __init__(self, link: Link, name: str, timeout_s: float, clock: Clock = time.monotonic) -> None:
+    def __init__(self, link: Link, name: str, timeout_s: float) -> None:
         """Over ``link``, with the device ``name``; ``timeout_s`` is for all the answers to one message."""
         self.link = link
         self.name = name
         self.timeout_s = timeout_s
-        self.clock = clock
+        self.clock = link.clock
         self._seq = 0
         self._expected: int | None = None
         self._last: Message | None = None
@@ -56,21 +58,23 @@ class Conversation:
         return self.clock() + self.timeout_s
 
     def receive(self, deadline_s: float) -> Message | None:
-        """The next message of the device, or None if none comes in time. One that is repeated is passed over.
+        """The next message of the device, or None if none comes in time. One that comes again is passed over.
 
         :raises LinkError: messages before it were lost, or the line failed.
         """
         while (left_s := deadline_s - self.clock()) >= 0.0:  # also when messages never cease
-            message = self._from_link(left_s)
+            try:
+                message = self.link.receive(left_s)
+            except LinkError as error:
+                raise self._named(error) from error
             if message is None:
                 return None
-            expected = self._expected
-            self._expected = (message.seq + 1) % _SEQ
-            if expected is None or message.seq == expected:
+            if self._expected is None or message.seq == self._expected:
+                self._expected = (message.seq + 1) % _SEQ
                 self._last = message
                 return message
-            if message.seq != (expected - 1) % _SEQ:
-                lost = (message.seq - expected) % _SEQ
+            if (self._expected - message.seq) % _SEQ > LATEST:
+                lost = (message.seq - self._expected) % _SEQ
                 raise LinkError(
                     f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
                     f" ({self.link.dropped} frames were damaged)"
@@ -84,10 +88,13 @@ class Conversation:
         """
         return self.answer(request, kind, self.send(request))
 
-    def answer(self, request: Message, kind: type[Answer], deadline_s: float) -> Answer:
+    def answer(
+        self, request: Message, kind: type[Answer], deadline_s: float, *, only: tuple[type[Message], ...] | None = None
+    ) -> Answer:
         """The next answer to ``request``. What an earlier run that ended badly has left in the line is passed over.
 
         :raises LinkTimeout: none came in time.
+        :raises DeviceError: a message of another type than those of ``only`` came first.
         """
         while True:
             message = self.receive(deadline_s)
@@ -98,12 +105,8 @@ class Conversation:
                 )
             if isinstance(message, kind) and message.answers == request.seq:
                 return message
-
-    def _from_link(self, timeout_s: float) -> Message | None:
-        try:
-            return self.link.receive(timeout_s)
-        except LinkError as error:
-            raise self._named(error) from error
+            if only is not None and not isinstance(message, only):
+                raise DeviceError(f"device {self.name}: {_brief(message)} came too late")
 
     def _named(self, error: LinkError) -> LinkError:
         return type(error)(f"device {self.name}: {error}")

@@ -1,7 +1,7 @@
-"""The device under test: handshake, configuration, samples in and estimates out, and how each kind is opened.
+"""The device under test: handshake, configuration, samples in and estimates out.
 
-The device never speaks without being asked, so every exchange is a question and its answers. It is lock-step: nothing
-is sent before the answers to the last message are complete, and what is not as it should be is an error, never a guess.
+The device never speaks without being asked, so every exchange is a question and its answers, and what is not as it
+should be is an error, never a guess.
 """
 
 from __future__ import annotations
@@ -10,62 +10,50 @@ import dataclasses
 import enum
 import secrets
 import struct
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import config
 from harness.catalogue import (
-    BLOCK_SAMPLES,
     CATALOGUE_HASH,
-    Alarm,
+    RUNS,
     Command,
     Configure,
     Configured,
     Control,
     Controlled,
     Counter,
-    Element,
-    Estimate,
     Firmware,
     FirmwareId,
     Hello,
     Identify,
     Message,
     Result,
-    Sample,
-    SampleBlock,
-    SampleFlag,
     Status,
-    Stepped,
 )
 from harness.conversation import Conversation
+from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import (
     CatalogueMismatch,
     ConfigurationError,
     DeviceError,
     DeviceRefused,
     LinkClosed,
+    LinkError,
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.host_process import HostProcess
-from harness.link import DEFAULT_BAUD, Clock, Link, MemoryLink, SerialLink
-
-DEFAULT_TIMEOUT_S = 2.0
-LONGEST_TIMEOUT_S = 3600.0
-MOST_BAUD = 100_000_000
+from harness.exchange import Exchange, Packing, RaisedAlarm, Replies
+from harness.link import Link
+from harness.pace import Pace, check_line
 
 _HELLO_AGAIN_S = 0.25
 """A board that resets when its port is opened does not hear the first call."""
-
-_INDEX = 65536
-"""Sample indices are modulo this on the line."""
 
 
 @dataclass(frozen=True)
@@ -78,73 +66,29 @@ class Identity:
     """Another number after every boot."""
     theta_max: int
     """The most parameters that this build can estimate."""
+    input_blocks: int
+    """So many blocks of samples can wait in its input."""
 
 
-@dataclass(frozen=True)
-class RaisedAlarm:
-    """An alarm of the device."""
+__all__ = ["Dut", "Identity", "RaisedAlarm", "Replies", "Stretch", "connect", "open_dut", "reopen_dut"]
 
-    index: int
-    """The sample, counted from the start, not modulo anything."""
-    kind: int
-    """The trigger that raised it."""
-    statistic: float
-
-
-@dataclass(frozen=True, eq=False)
-class Replies:
-    """What the device said to n samples; p parameters."""
-
-    theta: NDArray[np.float32]
-    """(n, p): the estimate after each sample, in the order of est.h, in codes."""
-    innovation: NDArray[np.float32]
-    """(n,) codes"""
-    statistic: NDArray[np.float32]
-    """(n,): of the trigger."""
-    flags: NDArray[np.uint8]
-    """(n,): SteppedFlag."""
-    alarms: tuple[RaisedAlarm, ...]
-
-
-@dataclass(frozen=True)
-class DeviceDescription:
-    """A file of fixtures/devices, or as much as the command line says."""
-
-    name: str
-    kind: Literal["host", "inproc", "serial"]
-    """host: a process of this computer on a pseudo-terminal. inproc: within this process. serial: at ``url``."""
-    url: str | None = None
-    """Anything pyserial can open."""
-    baud: int = DEFAULT_BAUD
-    exchange: Literal["sample", "block"] = "sample"
-    """Whether samples go one at a time or in blocks. The answers are the same; blocks are faster."""
-    timeout_s: float = DEFAULT_TIMEOUT_S
-    """For the answers to one message."""
-    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
-
-    def __post_init__(self) -> None:
-        if (self.kind == "serial") != (self.url is not None):
-            raise ValueError("a url goes with the kind 'serial', and with no other")
-        if not 0 < self.baud <= MOST_BAUD:
-            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
-        if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
-            raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
-
-    def as_table(self) -> dict[str, Any]:
-        """In plain values, from which the same can be made."""
-        table = dataclasses.asdict(self) | {"estimator": self.estimator.as_table()}
-        return {key: value for key, value in table.items() if value is not None}
+Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
+"""Index of the first sample, force, displacement, missing."""
 
 
 class Dut:
     """A device behind a link. Every error names the device, what was expected and what came instead."""
 
-    def __init__(self, link: Link, description: DeviceDescription, clock: Clock = time.monotonic) -> None:
+    def __init__(self, link: Link, description: DeviceDescription) -> None:
         """Take over ``link``; nothing is sent yet."""
         self._description = description
-        self._talk = Conversation(link, description.name, description.timeout_s, clock)
+        self._talk = Conversation(link, description.name, description.timeout_s)
         self._identity: Identity | None = None
-        self._next_index = 0
+        self._run = secrets.randbelow(RUNS)
+        """Id of the last run: samples that the line has kept since an earlier connection have hardly the next one."""
+        self._exchange: Exchange | None = None
+        self._counted: Mapping[str, int] = {}
+        self._line_s = 0.0
 
     @property
     def name(self) -> str:
@@ -153,6 +97,11 @@ class Dut:
     @property
     def link_name(self) -> str:
         return self._talk.link.name
+
+    @property
+    def line_s(self) -> float:
+        """How long a line of the described speed would have taken for the samples; 0.0: none is described."""
+        return self._talk.link.line_s - self._line_s
 
     @property
     def parameters(self) -> int:
@@ -184,14 +133,9 @@ class Dut:
         :raises LinkTimeout: nobody answers.
         :raises CatalogueMismatch: it speaks another catalogue.
         """
-        deadline_s = self._talk.clock() + self._talk.timeout_s
-        while self._identity is None:
-            try:
-                self._identity = self._identify(min(deadline_s, self._talk.clock() + _HELLO_AGAIN_S))
-            except LinkTimeout:
-                if self._talk.clock() >= deadline_s:
-                    raise
+        self._identity = self._identify()
         self._control(Command.RESET)
+        self._control(Command.REPORT_INTERVAL, self._description.report_interval_n)
         return self._identity
 
     def identity(self) -> Identity:
@@ -199,13 +143,7 @@ class Dut:
 
         :raises DeviceError: not who answered the handshake: it was reset meanwhile.
         """
-        identity = self._identify(self._talk.clock() + self._talk.timeout_s)
-        if self._identity is not None and identity != self._identity:
-            raise DeviceError(
-                f"device {self.name}: it was reset after the handshake"
-                f" (boot nonce {self._identity.boot_nonce:#010x} became {identity.boot_nonce:#010x})"
-            )
-        return identity
+        return self._same(self._identify())
 
     def configure(self, estimator: EstimatorConfig | None = None) -> None:
         """Set every field of the device's configuration, by default as described, and make sure that it took it.
@@ -223,22 +161,57 @@ class Dut:
                     f" {_word(Result, answer.result)}, it has {answer.value:g}"
                 )
 
-    def start(self) -> None:
-        """Begin a run; its first sample has the index 0.
+    def set_force_zero(self, code: float) -> None:
+        """Tell the device which code of the force is none; errors as ``configure``."""
+        self.configure(dataclasses.replace(self._description.estimator, force_zero=code))
+
+    def pace(self, period_s: float) -> Pace:
+        """For a run with a sample every ``period_s``, on the clock of the line.
+
+        :raises ConfigurationError: that does not fit the line.
+        """
+        check_line(self._description, period_s)
+        return Pace(self._talk.clock, period_s)
+
+    def start(self, pace: Pace | None = None) -> None:
+        """Begin a run; its first sample has the index 0. With a ``pace`` none is sent before it is due.
 
         :raises DeviceRefused: the device cannot.
         """
-        self._control(Command.START)
-        self._next_index = 0
+        self._counted = self.status()
+        self._run = (self._run + 1) % RUNS
+        self._control(Command.START, self._run)
+        self._exchange = Exchange(
+            self._talk,
+            parameters=self.parameters,
+            packing=self._packing(),
+            run=self._run,
+            report_interval_n=self._description.report_interval_n,
+            is_there=self._is_there,
+            pace=pace,
+        )
+        self._line_s = self._talk.link.line_s
 
     def stop(self) -> dict[str, int]:
-        """End the run and return the device's counters by name.
+        """End the run and return the device's counters by name, as far as they have counted in this run.
 
         :raises DeviceError: the device was reset during the run.
         """
         self.identity()
         self._control(Command.STOP)
-        return self.status()
+        self._exchange = None
+        return {name: value - self._before_run(name) for name, value in self.status().items()}
+
+    def _before_run(self, counter: str) -> int:
+        """What it had counted when the run began; the estimator's own begin with the run."""
+        return 0 if Counter[counter.upper()] < Counter.FRAMES_DROPPED else self._counted[counter]
+
+    def _packing(self) -> Packing:
+        """No more is on its way than the device can hold."""
+        exchange = self._description.exchange
+        window = self._description.window if exchange == "stream" else 1
+        room = window if self._identity is None else max(1, self._identity.input_blocks)
+        return Packing(in_blocks=exchange != "sample", window=min(window, room))
 
     def status(self) -> dict[str, int]:
         """The device's counters by name."""
@@ -252,27 +225,60 @@ class Dut:
             counters[counter.name.lower()] = answer.value
         return counters
 
-    def _control(self, command: Command) -> None:
-        answer = self._talk.ask(Control(self._talk.next_seq(), command, 0), Controlled)
+    def _control(self, command: Command, argument: int = 0) -> None:
+        answer = self._talk.ask(Control(self._talk.next_seq(), command, argument), Controlled)
         if answer.result != Result.APPLIED:
             raise DeviceRefused(f"device {self.name}: {command.name} was refused: {_word(Result, answer.result)}")
 
-    def _identify(self, deadline_s: float) -> Identity:
+    def _is_there(self) -> None:
+        """That the device is who it was, and has said nothing that was not heard."""
+        try:
+            self._same(self._call(only=(Hello, Firmware)))
+        except (LinkClosed, LinkTimeout):
+            raise
+        except LinkError:
+            self.identity()  # if it was reset, that is why
+            raise
+
+    def _same(self, identity: Identity) -> Identity:
+        if self._identity is not None and identity != self._identity:
+            raise DeviceError(
+                f"device {self.name}: it was reset after the handshake"
+                f" (boot nonce {self._identity.boot_nonce:#010x} became {identity.boot_nonce:#010x})"
+            )
+        return identity
+
+    def _identify(self) -> Identity:
+        """Whatever is in the line from before."""
         self._talk.begin()
+        return self._call()
+
+    def _call(self, *, only: tuple[type[Message], ...] | None = None) -> Identity:
+        """Ask who is there until there is an answer; what came before the first question does not matter."""
+        deadline_s = self._talk.clock() + self._talk.timeout_s
+        while True:
+            try:
+                return self._ask_identity(min(deadline_s, self._talk.clock() + _HELLO_AGAIN_S), only)
+            except LinkTimeout:
+                if self._talk.clock() >= deadline_s:
+                    raise
+
+    def _ask_identity(self, deadline_s: float, only: tuple[type[Message], ...] | None) -> Identity:
         request = Identify(self._talk.next_seq())
         self._talk.send(request)
-        hello = self._talk.answer(request, Hello, deadline_s)
+        hello = self._talk.answer(request, Hello, deadline_s, only=only)
         if hello.catalogue_hash != CATALOGUE_HASH:
             raise CatalogueMismatch(
                 f"device {self.name}: it speaks catalogue {hello.catalogue_hash:#010x}, this harness"
                 f" {CATALOGUE_HASH:#010x}: build both from the same analogrig.dbc"
             )
-        firmware = self._talk.answer(request, Firmware, deadline_s)
+        firmware = self._talk.answer(request, Firmware, deadline_s, only=only)
         return Identity(
             firmware=_word(FirmwareId, firmware.firmware_id),
             catalogue_hash=hello.catalogue_hash,
             boot_nonce=firmware.boot_nonce,
             theta_max=hello.theta_max,
+            input_blocks=firmware.input_blocks,
         )
 
     # --------------------------------------------------------------------------------------------------------- samples
@@ -288,138 +294,70 @@ class Dut:
 
         Indices that were skipped since the last call are missing samples to the device.
 
-        :raises LinkTimeout: an answer is lacking.
+        :raises LinkTimeout: the device answers no more.
         :raises LinkError: the line failed, or lost a message of the device.
         :raises DeviceError: an answer is not the one that was due, or the device was reset.
         :raises ValueError: the arrays differ in length, or the samples have been fed before.
         """
-        if first_index < self._next_index:
-            raise ValueError(f"sample {first_index} comes again: the next one is {self._next_index}")
-        samples = list(zip(force.tolist(), displacement.tolist(), missing.tolist(), strict=True))
-        per_message = 1 if self._description.exchange == "sample" else BLOCK_SAMPLES
-        collected = _Collected((*range(self.parameters), Element.INNOVATION))
-        for start in range(0, len(samples), per_message):
-            self._exchange(first_index + start, samples[start : start + per_message], collected)
-        self._next_index = first_index + len(samples)
-        return collected.replies()
+        (replies,) = self.play([(first_index, force, displacement, missing)])
+        return replies
 
-    def _exchange(self, first: int, samples: Sequence[_Codes], collected: _Collected) -> None:
-        """One message of samples and all its answers."""
-        index = first
-        try:
-            deadline_s = self._talk.send(self._message(first, samples))
-            for index in range(first, first + len(samples)):
-                if not self._collect(index, deadline_s, collected):
-                    raise self._silence(index)
-        except LinkClosed as error:
-            place = f"after sample {index - 1}" if index > 0 else "before the first sample"
-            raise LinkClosed(f"{error} {place}") from error
+    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
+        """As ``feed`` for one stretch of samples after the other, without a pause between them."""
+        exchange = self._running()
+        waiting: deque[tuple[int, int]] = deque()
+        for first, force, displacement, missing in stretches:
+            exchange.enter(first, force, displacement, missing)
+            waiting.append((len(force), first + len(force)))
+            while waiting and exchange.ready >= waiting[0][0]:
+                yield exchange.take(*waiting.popleft())
+        exchange.finish()
+        yield from (exchange.take(*each) for each in waiting)
 
-    def _message(self, first: int, samples: Sequence[_Codes]) -> Message:
-        seq = self._talk.next_seq()
-        if self._description.exchange == "sample":
-            force, displacement, missing = samples[0]
-            return Sample(seq, SampleFlag.MISSING if missing else 0, first % _INDEX, force, displacement)
-        mask = sum(1 << i for i, (_, _, missing) in enumerate(samples) if missing)
-        codes = [code for force, displacement, _ in samples for code in (force, displacement)]
-        codes += [0] * (2 * BLOCK_SAMPLES - len(codes))
-        return SampleBlock(seq, len(samples), first % _INDEX, mask, tuple(codes))
-
-    def _collect(self, index: int, deadline_s: float, collected: _Collected) -> bool:
-        """All answers to one sample: an alarm or none, theta, the innovation, Stepped. False: they came too late."""
-        wire_index = index % _INDEX
-        elements = iter(collected.elements)
-        due = next(elements, None)
-        while (message := self._talk.receive(deadline_s)) is not None:
-            if isinstance(message, Estimate) and message.element == due and message.sample_index == wire_index:
-                collected.values.append(message.value)
-                due = next(elements, None)
-            elif isinstance(message, Stepped) and due is None and message.sample_index == wire_index:
-                collected.flags.append(message.flags)
-                collected.statistics.append(message.statistic)
-                return True
-            elif isinstance(message, Alarm) and message.sample_index == wire_index:
-                collected.alarms.append(RaisedAlarm(index, message.trigger, message.statistic))
-            else:
-                wanted = "Stepped" if due is None else f"Estimate of {_word(Element, due)}"
-                raise DeviceError(f"device {self.name}: {wanted} for sample {index} was due, {message} came")
-        return False
-
-    def _silence(self, index: int) -> DeviceError | LinkTimeout:
-        """Why there is no answer to sample ``index``: ask the device, if it still speaks."""
-        heard = (
-            f"device {self.name}: no estimate for sample {index} within {self._talk.timeout_s:g} s"
-            f" (last message: {self._talk.last})"
-        )
-        try:
-            self.identity()
-            dropped = self.status()["frames_dropped"]
-        except DeviceError as error:
-            return error
-        except LinkTimeout:
-            return LinkTimeout(f"{heard}; it answers nothing else either")
-        return LinkTimeout(f"{heard}; it is alive and has dropped {dropped} damaged frames")
+    def _running(self) -> Exchange:
+        """:raises ValueError: there is no run."""
+        if self._exchange is None:
+            raise ValueError("no run has been started")
+        return self._exchange
 
 
-_Codes = tuple[int, int, bool]
-"""Force, displacement, and whether they are missing."""
+def open_dut(name: str, **changes: Any) -> Dut:
+    """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
 
-
-@dataclass
-class _Collected:
-    """Answers as they come; in plain lists, since numpy takes as long for one number as for a hundred."""
-
-    elements: Sequence[int]
-    """What is due for each sample, in this order."""
-    values: list[float] = field(default_factory=list)
-    statistics: list[float] = field(default_factory=list)
-    flags: list[int] = field(default_factory=list)
-    alarms: list[RaisedAlarm] = field(default_factory=list)
-
-    def replies(self) -> Replies:
-        values = np.array(self.values, dtype=np.float32).reshape(len(self.flags), len(self.elements))
-        return Replies(
-            theta=values[:, :-1],
-            innovation=values[:, -1],
-            statistic=np.array(self.statistics, dtype=np.float32),
-            flags=np.array(self.flags, dtype=np.uint8),
-            alarms=tuple(self.alarms),
-        )
-
-
-def open_dut(name: str) -> Dut:
-    """A shipped or own description by name, ``inproc``, or ``serial:URL``; connected, configured, ready to start.
+    ``changes`` are fields of its description that shall be otherwise; None: as described.
 
     :raises ConfigurationError: there is none, or it is wrong.
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    kind, _, url = name.partition(":")
-    if kind == "serial" and url:
-        return connect(DeviceDescription(name=name, kind="serial", url=url))
-    if name == "inproc":
-        return connect(DeviceDescription(name="inproc", kind="inproc"))
-    path = config.locate("devices", name)
-    return connect(config.build(DeviceDescription, {"name": path.stem, **config.read_toml(path)}, str(path)))
+    return connect(_changed(describe(name), changes))
 
 
-def reopen_dut(description: Mapping[str, Any]) -> Dut:
+def reopen_dut(description: Mapping[str, Any], **changes: Any) -> Dut:
     """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
 
-    What a file names is not opened on its word alone: a device at a URL must be named again.
+    What a file names is not opened on its word alone: a device elsewhere must be named again.
     """
     table = {key: value for key, value in description.items() if key != "identity"}
-    recorded = config.build(DeviceDescription, table, "the recorded device")
-    if recorded.kind == "serial":
+    recorded = from_table(table, "the recorded device")
+    if recorded.elsewhere:
         raise ConfigurationError(
-            f"the recorded device was at {recorded.url}: say --dut serial:{recorded.url}, or another"
+            f"the recorded device was {recorded.elsewhere}: say --dut {recorded.elsewhere}, or another"
         )
-    return connect(recorded)
+    return connect(_changed(recorded, changes))
+
+
+def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
+    """:raises ConfigurationError: a value is out of range."""
+    try:
+        return dataclasses.replace(description, **{key: value for key, value in changes.items() if value is not None})
+    except ValueError as error:
+        raise ConfigurationError(f"device {description.name}: {error}") from error
 
 
 def connect(description: DeviceDescription) -> Dut:
     """Reach the device, shake hands, configure it; errors as ``open_dut``."""
-    dut = Dut(_link(description), description)
+    dut = Dut(description.open(), description)
     try:
         _handshake(dut, description)
         dut.configure()
@@ -433,17 +371,9 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
     try:
         dut.handshake()
     except LinkTimeout as error:
-        if description.kind != "serial":
+        if not description.line:
             raise
-        raise LinkTimeout(f"{error}; the line was opened at {description.baud} baud") from error
-
-
-def _link(description: DeviceDescription) -> Link:
-    if description.kind == "host":
-        return HostProcess()
-    if description.kind == "inproc":
-        return MemoryLink(boot_nonce=secrets.randbits(32))
-    return SerialLink(str(description.url), description.baud)
+        raise LinkTimeout(f"{error}; {description.line}") from error
 
 
 def _float32(value: float) -> float:

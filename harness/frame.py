@@ -8,7 +8,7 @@ from __future__ import annotations
 import anycrc
 from cobs import cobs
 
-from harness.catalogue import CATALOGUE_HASH, LAYOUTS
+from harness.catalogue import CATALOGUE_HASH, LAYOUTS, Message
 
 _CRC_BYTES = 4
 _LENGTHS = {layout.id: 1 + layout.length + _CRC_BYTES for layout in LAYOUTS.values()}
@@ -22,6 +22,11 @@ _RESIDUE = 0x48674BC7
 """The CRC-32C of any message followed by its own CRC-32C, whatever the seed."""
 
 _crc = anycrc.Model("CRC32C").calc
+
+
+def size(message_type: type[Message]) -> int:
+    """Bytes of the frame of a message."""
+    return _LENGTHS[LAYOUTS[message_type.__name__].id] + 3  # one byte of COBS, two zeros
 
 
 def encode(packet: bytes, catalogue_hash: int = CATALOGUE_HASH) -> bytes:

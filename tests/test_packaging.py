@@ -73,6 +73,7 @@ def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
         "harness/_catalogue.py",
         "harness/_device.so",
         "harness/bin/analogrig-device",
+        "harness/bin/analogrig-tether",
         "harness/fixtures/scenarios/thesis.toml",
         "harness/py.typed",
         "harness/report/uPlot.iife.min.js",

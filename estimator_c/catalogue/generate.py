@@ -50,8 +50,8 @@ class Field:
     start_byte: int
     code: str
     """As in the module struct."""
-    flags: tuple[tuple[str, int], ...] = ()
-    """Names and masks of the signals of a shared byte."""
+    bits: tuple[tuple[str, int, int], ...] = ()
+    """Of the signals of a shared byte: name, first bit, number of bits."""
 
 
 def main(arguments: list[str]) -> int:
@@ -110,11 +110,11 @@ def check(database: Database) -> None:
 
 
 def fields(message: Message) -> list[Field]:
-    """The items of a payload in their order; consecutive signals of a few bits make one item ``flags``."""
+    """The items of a payload in their order; consecutive signals of a few bits in one byte make one item ``flags``."""
     out: list[Field] = []
     for signal in message.signals:
         if signal.length < 8:
-            out = with_flag(out, message, signal)
+            out = with_bits(out, message, signal)
             continue
         code = STRUCT_CODES.get((signal.length, signal.conversion.is_float))
         if code is None or signal.start % 8 or signal.byte_order != "little_endian" or not is_plain(signal.conversion):
@@ -128,15 +128,15 @@ def is_plain(conversion: BaseConversion) -> bool:
     return conversion.scale == 1 and conversion.offset == 0
 
 
-def with_flag(out: list[Field], message: Message, signal: Signal) -> list[Field]:
+def with_bits(out: list[Field], message: Message, signal: Signal) -> list[Field]:
     """Add a signal of a few bits to the shared byte it lies in."""
     byte, bit = divmod(signal.start, 8)
-    if signal.length != 1:
-        raise CatalogueError(f"{message.name}: {signal.name} is neither a flag nor a whole byte")
-    flag = (camel_to_snake_case(signal.name), 1 << bit)
-    if out[-1].flags and out[-1].start_byte == byte:
-        return [*out[:-1], Field("flags", byte, "B", (*out[-1].flags, flag))]
-    return [*out, Field("flags", byte, "B", (flag,))]
+    bits = (camel_to_snake_case(signal.name), bit, signal.length)
+    if bit + signal.length > 8 or not is_plain(signal.conversion):
+        raise CatalogueError(f"{message.name}: {signal.name} does not lie in one byte as a plain number")
+    if not out[-1].bits or out[-1].start_byte != byte:
+        return [*out, Field("flags", byte, "B", (bits,))]
+    return [*out[:-1], Field("flags", byte, "B", (*out[-1].bits, bits))]
 
 
 def struct_format(message: Message) -> str:
@@ -330,6 +330,8 @@ class Layout(NamedTuple):
     seeded: bool
     format: str
     fields: tuple[str, ...]
+    bits: dict[str, tuple[int, int]]
+    """Of what shares the byte called flags: first bit, number of bits."""
 
 
 CATALOGUE_HASH = 0x{catalogue_hash(database):08X}
@@ -348,6 +350,7 @@ def python_layout(message: Message) -> str:
         f"seeded={is_seeded(message)}",
         f'format="{struct_format(message)}"',
         f"fields={tuple(field.name for field in fields(message))}",
+        f"bits={ {name: (bit, n) for field in fields(message) for name, bit, n in field.bits} }",
     )
     return f'    "{message.name}": Layout({", ".join(layout)}),\n'
 
@@ -357,10 +360,10 @@ def python_enums(database: Database) -> Iterator[str]:
     for name, table in enums(database).items():
         yield f"\n\nclass {name}(IntEnum):\n" + "".join(f"    {key} = {value}\n" for key, value in table.items())
     for message in database.messages:
-        for field in fields(message):
-            if field.flags:
-                yield f"\n\nclass {message.name}Flag(IntFlag):\n"
-                yield "".join(f"    {flag.upper()} = {mask}\n" for flag, mask in field.flags)
+        flags = [(name, 1 << bit) for field in fields(message) for name, bit, n in field.bits if n == 1]
+        if flags:
+            yield f"\n\nclass {message.name}Flag(IntFlag):\n"
+            yield "".join(f"    {flag.upper()} = {mask}\n" for flag, mask in flags)
 
 
 if __name__ == "__main__":

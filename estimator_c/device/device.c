@@ -12,10 +12,11 @@
 #error "the mask of missing samples has 16 bits"
 #endif
 
+#define RUN_MAX 7U      ///< of the run ids, which have three bits
 #define PAYLOAD_MAX 8U  ///< of an answer; all fit classic CAN
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
-#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE
+#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE
 
 /// Where the answers of one step of work go.
 typedef struct {
@@ -47,10 +48,11 @@ static void put_hello(device_t* const self, answer_t* const answer, const uint8_
 }
 
 static void put_firmware(device_t* const self, answer_t* const answer, const uint8_t answers) {
-    const struct analogrig_firmware_t message = { .seq         = self->seq,
-                                                  .firmware_id = self->identity.firmware_id,
-                                                  .answers     = answers,
-                                                  .boot_nonce  = self->identity.boot_nonce };
+    const struct analogrig_firmware_t message = { .seq          = self->seq,
+                                                  .firmware_id  = self->identity.firmware_id,
+                                                  .answers      = answers,
+                                                  .input_blocks = self->identity.input_blocks,
+                                                  .boot_nonce   = self->identity.boot_nonce };
     uint8_t                           payload[PAYLOAD_MAX];
     (void)analogrig_firmware_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_FIRMWARE_FRAME_ID, payload);
@@ -67,12 +69,22 @@ static void put_estimate(device_t* const self, answer_t* const answer, const uin
 
 static void put_alarm(device_t* const self, answer_t* const answer, const float statistic) {
     const struct analogrig_alarm_t message = { .seq          = self->seq,
-                                               .trigger      = (uint8_t)self->config.trigger.kind,
+                                               .trigger      = (uint8_t)self->settings.estimator.trigger.kind,
                                                .sample_index = self->next_index,
                                                .statistic    = statistic };
     uint8_t                        payload[PAYLOAD_MAX];
     (void)analogrig_alarm_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_ALARM_FRAME_ID, payload);
+}
+
+static void put_diagnosis(device_t* const self, answer_t* const answer, const est_diagnosis_t* const diagnosis) {
+    const struct analogrig_diagnosis_t message = { .seq         = self->seq,
+                                                   .change      = (uint8_t)diagnosis->change,
+                                                   .onset_index = (uint16_t)(self->alarm_index - diagnosis->onset_n),
+                                                   .extent      = diagnosis->extent };
+    uint8_t                            payload[PAYLOAD_MAX];
+    (void)analogrig_diagnosis_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_DIAGNOSIS_FRAME_ID, payload);
 }
 
 static void put_stepped(device_t* const self, answer_t* const answer, const est_step_t* step, const bool restarted) {
@@ -82,6 +94,7 @@ static void put_stepped(device_t* const self, answer_t* const answer, const est_
                                                  .restarted    = restarted ? 1U : 0U,
                                                  .gathering    = (step->status == EST_GATHERING) ? 1U : 0U,
                                                  .idle         = step->idle ? 1U : 0U,
+                                                 .run          = self->run,
                                                  .sample_index = self->next_index,
                                                  .statistic    = step->statistic };
     uint8_t                          payload[PAYLOAD_MAX];
@@ -91,10 +104,29 @@ static void put_stepped(device_t* const self, answer_t* const answer, const est_
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
+static est_step_t step(device_t* const self, const est_sample_t sample) {
+    const est_step_t out = est_step(&self->estimator, sample);
+    if (self->isolating) {
+        est_isolation_enter(&self->isolation, &self->estimator, sample, out);
+    }
+    return out;
+}
+
+/// Works on the diagnosis of the last alarm, if there is one to come, and says it once.
+static void isolate(device_t* const self, answer_t* const answer) {
+    const est_change_t before = est_isolation_diagnosis(&self->isolation).change;
+    for (uint8_t i = 0U; (i < DEVICE_ISOLATION_SLICES) && est_isolation_work(&self->isolation); i++) {
+    }
+    const est_diagnosis_t diagnosis = est_isolation_diagnosis(&self->isolation);
+    if (diagnosis.change != before) {
+        put_diagnosis(self, answer, &diagnosis);
+    }
+}
+
 static void enter_gap(device_t* const self, const uint16_t lost_n) {
     const est_sample_t missing = { .u = 0.0F, .y = 0.0F, .valid = false };
     for (uint16_t i = 0U; (i < lost_n) && (i < DEVICE_GAP_MAX); i++) {
-        (void)est_step(&self->estimator, missing);
+        (void)step(self, missing);
     }
     add(&self->counters.samples_lost, lost_n);
     self->next_index   = (uint16_t)(self->next_index + lost_n);
@@ -124,20 +156,34 @@ enter_sample(device_t* const self, answer_t* const answer, const uint16_t index,
         enter_gap(self, ahead);
     }
     const uint32_t   restarts = est_counters(&self->estimator).restarts;
-    const est_step_t step     = est_step(&self->estimator, sample);
-    if (step.alarm) {
-        put_alarm(self, answer, step.statistic);
+    const est_step_t stepped  = step(self, sample);
+    if (stepped.alarm) {
+        self->alarm_index = self->next_index;
+        put_alarm(self, answer, stepped.statistic);
     }
-    report(self, answer, step.innovation);
-    put_stepped(self, answer, &step, est_counters(&self->estimator).restarts != restarts);
+    isolate(self, answer);
+    report(self, answer, stepped.innovation);
+    put_stepped(self, answer, &stepped, est_counters(&self->estimator).restarts != restarts);
     self->next_index++;
+}
+
+/// Counts samples that cannot be entered.
+static bool accepts_samples(device_t* const self, const uint8_t run, const uint8_t samples) {
+    if (!self->running || (samples < 1U) || (samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
+        add(&self->counters.messages_refused, 1U);
+        return false;
+    }
+    if (run != self->run) {
+        add(&self->counters.samples_of_other_runs, samples);
+        return false;
+    }
+    return true;
 }
 
 static void on_sample(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
     struct analogrig_sample_t message;
     (void)analogrig_sample_unpack(&message, payload, ANALOGRIG_SAMPLE_LENGTH);
-    if (!self->running) {
-        add(&self->counters.messages_refused, 1U);
+    if (!accepts_samples(self, message.run, 1U)) {
         return;
     }
     const est_sample_t sample = { .u     = (float)message.force,
@@ -149,8 +195,7 @@ static void on_sample(device_t* const self, answer_t* const answer, const uint8_
 static void on_sample_block(device_t* const self, const uint8_t* const payload) {
     struct analogrig_sample_block_t block;
     (void)analogrig_sample_block_unpack(&block, payload, ANALOGRIG_SAMPLE_BLOCK_LENGTH);
-    if (!self->running || (block.samples < 1U) || (block.samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
-        add(&self->counters.messages_refused, 1U);
+    if (!accepts_samples(self, block.run, block.samples)) {
         return;
     }
     self->job         = DEVICE_STEPPING;
@@ -184,7 +229,7 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
     if (self->running) {
         return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
     }
-    switch (settings_set(&self->config, key, value)) {
+    switch (settings_set(&self->settings, key, value)) {
     case SETTINGS_APPLIED:
         return ANALOGRIG_CONFIGURED_RESULT_APPLIED_CHOICE;
     case SETTINGS_OUT_OF_RANGE:
@@ -204,7 +249,7 @@ static void on_configure(device_t* const self, answer_t* const answer, const uin
         .key     = message.key,
         .answers = message.seq,
         .result  = result,
-        .value   = settings_get(&self->config, message.key),
+        .value   = settings_get(&self->settings, message.key),
     };
     uint8_t out[PAYLOAD_MAX];
     (void)analogrig_configured_pack(out, &applied, sizeof(out));
@@ -218,21 +263,24 @@ static void reset(device_t* const self) {
     frame_decoder_init(&self->decoder, self->identity.catalogue_hash);
     self->counters          = (device_counters_t){ 0 };
     self->stopped           = (est_counters_t){ 0 };
-    self->config            = est_config_default();
+    self->settings          = settings_default();
     self->running           = false;
     self->report_interval_n = 1U;
-    (void)est_init(&self->estimator, &self->config);
+    (void)est_init(&self->estimator, &self->settings.estimator);
 }
 
-static uint8_t start(device_t* const self, const uint32_t first_index) {
+static uint8_t start(device_t* const self, const uint32_t run) {
     if (self->running) {
         return ANALOGRIG_CONTROLLED_RESULT_RUNNING_CHOICE;
     }
-    if ((first_index > UINT16_MAX) || !est_init(&self->estimator, &self->config)) {
+    if ((run > RUN_MAX) || !est_init(&self->estimator, &self->settings.estimator)) {
         return ANALOGRIG_CONTROLLED_RESULT_OUT_OF_RANGE_CHOICE;
     }
+    self->isolating = est_isolation_init(&self->isolation, &self->settings.estimator, self->settings.force_zero) &&
+                      self->settings.isolation;
     self->running      = true;
-    self->next_index   = (uint16_t)first_index;
+    self->run          = (uint8_t)run;
+    self->next_index   = 0U;
     self->unreported_n = 0U;
     return ANALOGRIG_CONTROLLED_RESULT_APPLIED_CHOICE;
 }
@@ -323,6 +371,10 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
         return self->counters.samples_lost;
     case ANALOGRIG_STATUS_COUNTER_SAMPLES_IGNORED_CHOICE:
         return self->counters.samples_ignored;
+    case ANALOGRIG_STATUS_COUNTER_SAMPLES_OF_OTHER_RUNS_CHOICE:
+        return self->counters.samples_of_other_runs;
+    case ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE:
+        return self->counters.receive_overruns;
     default:
         return 0U;
     }

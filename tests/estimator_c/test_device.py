@@ -18,13 +18,17 @@ from harness import frame
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
+    RUN_SHIFT,
+    RUNS,
     Alarm,
+    Change,
     Command,
     Configure,
     Configured,
     Control,
     Controlled,
     Counter,
+    Diagnosis,
     Element,
     Estimate,
     Firmware,
@@ -42,8 +46,12 @@ from harness.catalogue import (
     Trigger,
     pack,
 )
-from harness.link import LIBRARY, MemoryLink
+from harness.link import FramedLink
+from harness.wire import LIBRARY, MemoryWire
+from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import Estimator
+from tests.estimator_c.performance import FULL
+from tests.estimator_c.plants import FRONT, simulate
 
 M = TypeVar("M", bound=Message)
 
@@ -54,7 +62,7 @@ class Device:
     """A device and the numbering of what it is told."""
 
     def __init__(self, catalogue_hash: int = CATALOGUE_HASH) -> None:
-        self.link = MemoryLink(NONCE, catalogue_hash=catalogue_hash)
+        self.link = FramedLink(MemoryWire(NONCE, catalogue_hash=catalogue_hash))
         self.seq = 0
 
     def tell(self, message: Message) -> list[Message]:
@@ -133,7 +141,7 @@ def test_identify_is_answered_by_catalogue_and_firmware() -> None:
     device.seq = 77
     assert device.tell(Identify(0)) == [
         Hello(0, 6, 77, CATALOGUE_HASH),
-        Firmware(1, FirmwareId.LIBRARY, 77, NONCE),
+        Firmware(1, FirmwareId.LIBRARY, 77, 255, NONCE),
     ]
 
 
@@ -193,6 +201,95 @@ def test_alarm_comes_before_the_rest_of_its_sample(device: Device) -> None:
         assert isinstance(alarm, Alarm)
         assert isinstance(stepped, Stepped)
         assert (alarm.sample_index, alarm.statistic) == (stepped.sample_index, stepped.statistic)
+
+
+# ---- diagnoses
+
+CHANGED_AT = 600
+
+
+def changed_codes(change: isolation.Change, zero: int = 0) -> tuple[list[int], list[int]]:
+    """Codes of force, whose zero is at ``zero``, and displacement: the front suspension changes at CHANGED_AT."""
+    plants = FRONT, isolation.changed(FRONT, change)
+    played = simulate(plants, np.array([CHANGED_AT]), FULL, CHANGED_AT + 120, seed=4)
+    u, y = np.clip(played.u[0], 0, None) + zero, np.clip(played.y[0], 0, None)
+    return u.astype(int).tolist(), y.astype(int).tolist()
+
+
+def diagnosed(device: Device, u: list[int], y: list[int], first: int = 0) -> list[tuple[int, Diagnosis]]:
+    """Each diagnosis with the sample to which it was an answer."""
+    out = []
+    for k, (force, displacement) in enumerate(zip(u, y, strict=True)):
+        answers = device.sample((first + k) % 65536, force, displacement)
+        out += [(k, message) for message in of(Diagnosis, answers)]
+        assert isinstance(answers[-1], Stepped)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "named", "extent"),
+    [
+        ({"M": 0.8}, Change.MASS, 0.8),
+        ({"B": 1.2}, Change.DAMPING, 1.2),
+        ({"K": 0.8}, Change.STIFFNESS, 0.8),
+        ({"B": 0.7, "K": 1.3}, Change.SEVERAL, 1.0),
+    ],
+    ids=str,
+)
+def test_change_is_diagnosed_once(device: Device, change: isolation.Change, named: Change, extent: float) -> None:
+    ((at, said),) = diagnosed(device, *changed_codes(change))
+    assert CHANGED_AT < at < CHANGED_AT + 80
+    assert said.change == named
+    assert said.extent == pytest.approx(extent, rel=0.03)
+    assert abs(said.onset_index - CHANGED_AT) <= 8
+
+
+def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    first = 65536 - CHANGED_AT - 2
+    for k in range(30_000, first, 30_000):
+        device.sample(k, 0, 0)
+    ((_, said),) = diagnosed(device, u, y, first=first)
+    assert min(said.onset_index, 65536 - said.onset_index) <= 10
+
+
+def test_zero_of_the_force_is_taken_from_the_configuration(idle: Device) -> None:
+    idle.configure(Key.FORCE_ZERO, 1000.0)
+    idle.control(Command.START)
+    ((_, said),) = diagnosed(idle, *changed_codes({"M": 0.8}, zero=1000))
+    assert said.change == Change.MASS
+    assert said.extent == pytest.approx(0.8, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{Key.ISOLATION: 0.0}, {Key.TRIGGER: float(Trigger.PREDICTION_ERROR), Key.CEILING: 12.0}],
+    ids=["switched off", "no cumulative sum"],
+)
+def test_nothing_is_diagnosed_where_it_is_off_or_cannot_be(idle: Device, settings: dict[Key, float]) -> None:
+    for key, value in settings.items():
+        assert idle.configure(key, value).result == Result.APPLIED
+    assert idle.control(Command.START) == Result.APPLIED
+    assert diagnosed(idle, *changed_codes({"K": 0.8})) == []
+
+
+def test_skipped_sample_after_the_alarm_leaves_it_undiagnosed(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    answers = [message for k in range(len(u)) if k != CHANGED_AT + 8 for message in device.sample(k, u[k], y[k])]
+    assert of(Alarm, answers)[0].sample_index < CHANGED_AT + 8
+    assert of(Diagnosis, answers) == []
+
+
+def test_diagnosis_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    idle.configure(Key.ISOLATION, 0.0)
+    idle.control(Command.START)
+    with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
+    assert of(Diagnosis, with_it)
+    assert np.array_equal(theta_of(with_it), theta_of(without))
+
+
+# ---- blocks
 
 
 def blocks(u: list[int], y: list[int], missing: list[bool], size: int) -> Iterator[SampleBlock]:
@@ -290,13 +387,30 @@ def test_huge_gap_costs_bounded_time_and_gives_the_same_estimate(device: Device)
 
 
 def test_index_wraps_around(device: Device) -> None:
-    u, y = codes(BLOCK_SAMPLES * 20)
+    u, y = codes(200)
+    for index in (32767, 65435):
+        device.sample(index, u[0], y[0])
+    lost = device.counters()[Counter.SAMPLES_LOST]
     first = 65536 - 100
-    device.control(Command.STOP)
-    assert device.control(Command.START, first) == Result.APPLIED
     answers = [m for k in range(200) for m in device.sample(first + k, u[k], y[k])]
     assert [m.sample_index for m in of(Stepped, answers)] == [(first + k) % 65536 for k in range(200)]
-    assert device.counters()[Counter.SAMPLES_LOST] == 0
+    assert device.counters()[Counter.SAMPLES_LOST] == lost == 65436 - 2
+
+
+@pytest.mark.parametrize("in_blocks", [False, True])
+def test_samples_of_another_run_are_not_taken(in_blocks: bool) -> None:  # noqa: FBT001 - a parameter of pytest
+    """As when the line has kept some of a run that was broken off."""
+    device = Device()
+    assert device.control(Command.START, 5) == Result.APPLIED
+    for run in range(RUNS):
+        nothing = (0,) * (2 * BLOCK_SAMPLES)
+        bits = run << RUN_SHIFT
+        message = SampleBlock(0, bits | 3, 0, 0, nothing) if in_blocks else Sample(0, bits, 0, 1, 1)
+        stepped = of(Stepped, device.tell(message))
+        assert len(stepped) == (0 if run != 5 else 3 if in_blocks else 1)
+        assert {answer.flags >> RUN_SHIFT for answer in stepped} <= {5}
+    assert device.counters()[Counter.SAMPLES_OF_OTHER_RUNS] == 7 * (3 if in_blocks else 1)
+    assert device.counters()[Counter.MESSAGES_REFUSED] == 0
 
 
 # ---- configuration
@@ -326,6 +440,8 @@ VALUES = {
     Key.WARM_UP_N: 50.0,
     Key.ABSOLUTE: 1.0,
     Key.RESET: 1.0,
+    Key.ISOLATION: 0.0,
+    Key.FORCE_ZERO: 341.25,
     Key.C1: -0.5,
     Key.C2: 0.25,
 }
@@ -385,6 +501,8 @@ def test_configuration_is_what_the_run_uses(idle: Device, estimator: Estimator) 
         (Key.RESET, 0.25),
         (Key.HOLD_OFF_N, 65536.0),
         (Key.C1, math.inf),
+        (Key.ISOLATION, 2.0),
+        (Key.FORCE_ZERO, 1.1e6),
     ],
 )
 def test_value_out_of_range_changes_nothing(idle: Device, key: Key, value: float) -> None:
@@ -437,7 +555,7 @@ def test_reset_is_as_good_as_new(device: Device) -> None:
     device.control(Command.REPORT_INTERVAL, 5)
     device.control(Command.START)
     device.sample(0, 1, 1)
-    device.link.send_bytes(b"\0garbage\0")
+    device.link.wire.write(b"\0garbage\0")
     assert device.control(Command.RESET) == Result.APPLIED
     assert set(device.counters().values()) == {0}
     assert current(device, Key.P0) == 10.0
@@ -461,7 +579,7 @@ def test_impossible_commands_are_refused(idle: Device) -> None:
     assert idle.control(99) == Result.UNKNOWN
     assert idle.control(Command.REPORT_INTERVAL, 0) == Result.OUT_OF_RANGE
     assert idle.control(Command.REPORT_INTERVAL, 65536) == Result.OUT_OF_RANGE
-    assert idle.control(Command.START, 65536) == Result.OUT_OF_RANGE
+    assert idle.control(Command.START, RUNS) == Result.OUT_OF_RANGE
 
 
 def test_messages_of_devices_are_refused(idle: Device) -> None:
@@ -484,7 +602,7 @@ def test_lost_message_is_a_gap_in_the_sequence(device: Device) -> None:
 def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
     damaged = bytearray(frame.encode(pack(Sample(device.seq % 256, 0, 0, 1, 2))))
     damaged[6] ^= 0x10
-    device.link.send_bytes(bytes(damaged))
+    device.link.wire.write(bytes(damaged))
     assert device.heard() == []
     assert device.counters()[Counter.FRAMES_DROPPED] == 1
 
@@ -492,7 +610,7 @@ def test_damaged_sample_is_dropped_and_counted(device: Device) -> None:
 def test_noise_is_never_answered_and_never_stops_it(device: Device) -> None:
     rng = random.Random(3)
     for _ in range(100):
-        device.link.send_bytes(rng.randbytes(1000))
+        device.link.wire.write(rng.randbytes(1000))
     assert device.heard() == []
     assert len(device.sample(0, 1, 2)) == 8
     assert device.counters()[Counter.FRAMES_DROPPED] > 100
@@ -539,5 +657,5 @@ def test_answers_do_not_depend_on_pieces_and_room() -> None:
     rng = random.Random(11)
     whole = answers_in_pieces(stream, rng, 65536)
     assert len(frame.FrameDecoder().feed(whole)) == 2 + 1 + 60 * 8 + len(Counter)
-    for room in (144, 145, 160, 1000):  # 144: DEVICE_ANSWER_MAX of this build
+    for room in (160, 161, 176, 1000):  # 160: DEVICE_ANSWER_MAX of this build
         assert answers_in_pieces(stream, rng, room) == whole

@@ -12,7 +12,7 @@ import pytest
 
 from harness import frame
 from harness.catalogue import CATALOGUE_HASH, LAYOUTS
-from harness.link import LIBRARY
+from harness.wire import LIBRARY
 
 
 class Decoder(ctypes.Structure):

@@ -12,12 +12,13 @@ from harness import config
 from harness.catalogue import Configure, Configured, Identify, Key, Trigger
 from harness.errors import ConfigurationError
 from harness.estimator_config import EstimatorConfig
-from harness.link import MemoryLink
+from harness.link import FramedLink
+from harness.wire import MemoryWire
 
 
 def test_defaults_are_those_of_the_device() -> None:
     """A value that is no number is refused, and the answer says what is set."""
-    link = MemoryLink(1)
+    link = FramedLink(MemoryWire(1))
     link.send([Identify(0)])
     for seq, (key, value) in enumerate(EstimatorConfig().settings(), start=1):
         link.send([Configure(seq, key, math.nan)])

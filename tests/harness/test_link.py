@@ -1,16 +1,12 @@
-"""Links over real lines: pseudo-terminals, sockets, the device as a process."""
+"""Links over real lines: pseudo-terminals, sockets; and the program of the host port by itself."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import pty
-import select
-import signal
 import socket
-import stat
 import subprocess
-import sys
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,9 +25,10 @@ from harness.catalogue import (
     Stepped,
     pack,
 )
+from harness.devices import HOST_PROGRAM
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.host_process import PROGRAM, HostProcess
-from harness.link import Link, MemoryLink, SerialLink
+from harness.link import FramedLink
+from harness.wire import MemoryWire, PortWire
 
 LONG_S = 20.0
 """For what comes at once unless something is broken."""
@@ -56,6 +53,10 @@ class Terminal:
         os.close(self.far)
 
 
+def at_port(url: str) -> FramedLink:
+    return FramedLink(PortWire(url))
+
+
 @pytest.fixture
 def terminal() -> Iterator[Terminal]:
     out = Terminal()
@@ -64,22 +65,22 @@ def terminal() -> Iterator[Terminal]:
 
 
 @pytest.fixture
-def link(terminal: Terminal) -> Iterator[SerialLink]:
-    out = SerialLink(terminal.path)
+def link(terminal: Terminal) -> Iterator[FramedLink]:
+    out = at_port(terminal.path)
     yield out
     out.close()
 
 
-# ---- SerialLink
+# ---- a port
 
 
-def test_messages_go_out_as_frames_in_one_piece(link: SerialLink, terminal: Terminal) -> None:
+def test_messages_go_out_as_frames_in_one_piece(link: FramedLink, terminal: Terminal) -> None:
     messages: list[Message] = [Identify(1), Control(2, 3, 4)]
     link.send(messages)
     assert os.read(terminal.far, 4096) == b"".join(frame.encode(pack(message)) for message in messages)
 
 
-def test_messages_come_in_one_by_one(link: SerialLink, terminal: Terminal) -> None:
+def test_messages_come_in_one_by_one(link: FramedLink, terminal: Terminal) -> None:
     messages: list[Message] = [Hello(1, 6, 0, 2), Stepped(2, 0, 7, 1.5), Stepped(3, 0, 8, 2.5)]
     os.write(terminal.far, b"noise" + b"".join(frame.encode(pack(message)) for message in messages))
     assert [link.receive(LONG_S) for _ in messages] == messages
@@ -87,7 +88,7 @@ def test_messages_come_in_one_by_one(link: SerialLink, terminal: Terminal) -> No
     assert link.dropped == 1
 
 
-def test_message_that_comes_in_halves_is_waited_for(link: SerialLink, terminal: Terminal) -> None:
+def test_message_that_comes_in_halves_is_waited_for(link: FramedLink, terminal: Terminal) -> None:
     message = Stepped(2, 0, 7, 1.5)
     whole = frame.encode(pack(message))
     os.write(terminal.far, whole[:9])
@@ -104,13 +105,14 @@ def test_time_is_over_though_the_line_babbles(terminal: Terminal) -> None:
         os.write(terminal.far, b"babble" * 50)
         return float(next(seconds))
 
-    link = SerialLink(terminal.path, clock=clock)
+    link = at_port(terminal.path)
+    link.clock = clock
     assert link.receive(50.0) is None
     assert 50 <= next(seconds) <= 110
     link.close()
 
 
-def test_other_end_that_hangs_up_is_told_from_silence(link: SerialLink, terminal: Terminal) -> None:
+def test_other_end_that_hangs_up_is_told_from_silence(link: FramedLink, terminal: Terminal) -> None:
     terminal.hang_up()
     with pytest.raises(LinkClosed, match=terminal.path):
         link.receive(LONG_S)
@@ -119,41 +121,41 @@ def test_other_end_that_hangs_up_is_told_from_silence(link: SerialLink, terminal
 
 
 def test_line_that_takes_nothing_is_an_error_not_a_hang(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.link.WRITE_TIMEOUT_S", 0.05)
-    link = SerialLink(terminal.path)
+    monkeypatch.setattr("harness.wire.WRITE_TIMEOUT_S", 0.05)
+    link = at_port(terminal.path)
     with pytest.raises(LinkError, match="takes nothing"):
         link.send([Identify(0)] * 100_000)
     link.close()
 
 
-def test_port_is_opened_by_one_alone(link: SerialLink, terminal: Terminal) -> None:  # noqa: ARG001 - it holds the port
+def test_port_is_opened_by_one_alone(link: FramedLink, terminal: Terminal) -> None:  # noqa: ARG001 - it holds the port
     with pytest.raises(LinkError, match=f"cannot open {terminal.path}"):
-        SerialLink(terminal.path)
+        at_port(terminal.path)
 
 
 def test_absent_port_is_named() -> None:
     with pytest.raises(LinkError, match="^cannot open /dev/ttyNOWHERE: No such file or directory$"):
-        SerialLink("/dev/ttyNOWHERE")
+        at_port("/dev/ttyNOWHERE")
 
 
 def test_file_that_is_no_port_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(LinkError, match=f"cannot open {tmp_path}/file"):
-        SerialLink(str(tmp_path / "file"))
+        at_port(str(tmp_path / "file"))
 
 
 def test_unknown_kind_of_url_is_a_wrong_configuration() -> None:
     with pytest.raises(ConfigurationError, match="pigeon://coop"):
-        SerialLink("pigeon://coop")
+        at_port("pigeon://coop")
 
 
-def test_link_may_be_closed_twice(link: SerialLink) -> None:
+def test_link_may_be_closed_twice(link: FramedLink) -> None:
     link.close()
     link.close()
 
 
 def test_any_url_of_pyserial_will_do_loop() -> None:
-    link = SerialLink("loop://")
+    link = at_port("loop://")
     messages: list[Message] = [Identify(1), Control(2, 3, 4)]
     link.send(messages)
     assert [link.receive(LONG_S), link.receive(LONG_S), link.receive(0.0)] == [*messages, None]
@@ -162,7 +164,7 @@ def test_any_url_of_pyserial_will_do_loop() -> None:
 
 def test_any_url_of_pyserial_will_do_socket() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        link = SerialLink(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        link = at_port(f"socket://127.0.0.1:{server.getsockname()[1]}")
         far, _ = server.accept()
         with far:
             link.send([Identify(1)])
@@ -175,107 +177,12 @@ def test_any_url_of_pyserial_will_do_socket() -> None:
         link.close()
 
 
-# ---- MemoryLink
+# ---- the device in this process
 
 
 def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match="make setup"):
-        MemoryLink(1, library=tmp_path / "absent.so")
-
-
-# ---- HostProcess
-
-
-def hello(link: Link) -> Hello:
-    link.send([Identify(0)])
-    answer = link.receive(LONG_S)
-    assert isinstance(answer, Hello)
-    return answer
-
-
-def ends(pid: int, within_s: float = LONG_S) -> bool:
-    """Whether a process ends in time, or has ended."""
-    try:
-        fd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([fd], [], [], within_s)[0])
-    finally:
-        os.close(fd)
-
-
-def test_process_answers_and_is_gone_after_close() -> None:
-    link = HostProcess()
-    assert hello(link).catalogue_hash == CATALOGUE_HASH
-    pid = link.pid
-    link.close()
-    assert ends(pid, 0.0)
-    link.close()
-
-
-def test_ctrl_c_at_the_terminal_does_not_reach_the_process() -> None:
-    """It goes to all processes of a group."""
-    link = HostProcess()
-    assert os.getpgid(link.pid) != os.getpgid(0)
-    link.close()
-
-
-def test_process_that_hangs_is_gone_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.host_process.END_TIMEOUT_S", 0.05)
-    link = HostProcess()
-    os.kill(link.pid, signal.SIGSTOP)
-    link.close()
-    assert ends(link.pid, 0.0)
-
-
-def test_killed_process_is_told_with_its_status() -> None:
-    link = HostProcess()
-    os.kill(link.pid, signal.SIGKILL)
-    with pytest.raises(LinkClosed, match="^the device process ended with status -9$"):
-        link.receive(LONG_S)
-    with pytest.raises(LinkClosed, match="^the device process ended with status -9$"):
-        link.send([Identify(0)])
-    link.close()
-
-
-def test_process_that_pretends_another_catalogue_says_so() -> None:
-    link = HostProcess(["--catalogue-hash", "0xdeadbeef"])
-    assert hello(link).catalogue_hash == 0xDEADBEEF
-    link.close()
-
-
-def test_absent_program_is_named_with_the_cure(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match=f"{tmp_path}/absent: No such file or directory; run `make setup`"):
-        HostProcess(program=tmp_path / "absent")
-
-
-def program(folder: Path, script: str) -> Path:
-    path = folder / "program"
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(stat.S_IRWXU)
-    return path
-
-
-def test_program_that_ends_at_once_is_told_with_its_status(tmp_path: Path) -> None:
-    with pytest.raises(LinkClosed, match="ended with status 5"):
-        HostProcess(program=program(tmp_path, "exit 5"))
-
-
-def test_program_that_says_nothing_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.host_process.START_TIMEOUT_S", 0.05)
-    with pytest.raises(LinkError, match="said nothing within"):
-        HostProcess(program=program(tmp_path, "read end"))
-
-
-def test_process_does_not_outlive_a_killed_parent() -> None:
-    parent = (
-        "import os, signal; from harness.host_process import HostProcess;"
-        " link = HostProcess(); print(link.pid, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
-    )
-    out = subprocess.run([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, check=False)
-    assert out.returncode == -signal.SIGKILL
-    assert ends(int(out.stdout))
+        MemoryWire(1, library=tmp_path / "absent.so")
 
 
 # ---- the program by itself
@@ -283,7 +190,12 @@ def test_process_does_not_outlive_a_killed_parent() -> None:
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [PROGRAM, *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=LONG_S, check=False
+        [HOST_PROGRAM, *arguments],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LONG_S,
+        check=False,
     )
 
 
@@ -322,7 +234,7 @@ def test_line_that_cannot_be_opened_is_named(path: str) -> None:
 
 
 def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(terminal: Terminal) -> None:
-    with subprocess.Popen([PROGRAM, terminal.path], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen([HOST_PROGRAM, terminal.path], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         os.write(terminal.far, frame.encode(pack(Identify(0))))
         received: list[bytes] = []
         decoder = frame.FrameDecoder()
@@ -338,9 +250,9 @@ def test_program_serves_a_serial_device_that_is_there_and_ends_when_it_is_gone(t
 def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
     """Work that is left over when the output has just been emptied must not wait for the next message."""
     burst, bursts = 11, 1500
-    with subprocess.Popen([PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([HOST_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        link = SerialLink(process.stdout.readline().strip())
+        link = at_port(process.stdout.readline().strip())
         link.send([Control(0, Command.START, 0)])
         assert link.receive(LONG_S) is not None
         for i in range(bursts):
@@ -359,9 +271,9 @@ def test_device_answers_bursts_that_fill_its_output_to_the_last() -> None:
 
 def test_device_waits_for_a_harness_that_does_not_read() -> None:
     """A line that is full of answers delays, and loses nothing."""
-    with subprocess.Popen([PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([HOST_PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        link = SerialLink(process.stdout.readline().strip())
+        link = at_port(process.stdout.readline().strip())
         asked = 300  # their answers are 13 times as long: far more than a terminal holds
         for i in range(asked):
             link.send([Control(i % 256, 5, 0)])

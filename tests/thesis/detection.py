@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.bench import Bench
-from harness.dut import DeviceDescription, connect, open_dut
+from harness.devices import DeviceDescription, InprocDevice
+from harness.dut import connect, open_dut
 from harness.plant import PARAMETERS
 from harness.rig import open_rig
 from harness.scenario import Scenario
@@ -50,7 +51,7 @@ def shipped_device_in_process() -> DeviceDescription:
         table = dict(dut.description())
     with open_dut("inproc") as dut:
         assert dut.description()["estimator"] == table["estimator"]
-    return DeviceDescription(name="inproc", kind="inproc", exchange="block")
+    return InprocDevice(name="inproc", exchange="block")
 
 
 def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection:

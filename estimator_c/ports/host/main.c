@@ -255,6 +255,7 @@ static int serve(const options_t* const options) {
     static line_t     line;
     const char*       name     = (options->path != NULL) ? options->path : "a pseudo-terminal";
     device_identity_t identity = { .catalogue_hash = options->catalogue_hash,
+                                   .input_blocks   = INPUT_SIZE / FRAME_SIZE(ANALOGRIG_SAMPLE_BLOCK_LENGTH),
                                    .firmware_id    = ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE };
     if (!draw_nonce(&identity.boot_nonce)) {
         return fail("cannot read", "/dev/urandom");

@@ -1,0 +1,22 @@
+"""The firmware that the tests of QEMU need."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from harness.devices import FIRMWARE, QEMU
+
+CORES = ("m3", "m4", "m7")
+
+FOLDER = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
+
+needs_firmware = [
+    pytest.mark.skipif(shutil.which(QEMU) is None, reason=f"no {QEMU}: apt-get install qemu-system-arm"),
+    pytest.mark.skipif(
+        not all((FOLDER / f"analogrig-{core}.elf").exists() for core in CORES), reason="no firmware: make firmware"
+    ),
+]

@@ -1,0 +1,167 @@
+"""Cortex-M firmware under QEMU: the same bits as everywhere, and every way to fail has its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from harness.bench import Bench
+from harness.config import names
+from harness.devices import (
+    KINDS,
+    DeviceDescription,
+    HostDevice,
+    InprocDevice,
+    QemuDevice,
+    QemuM4,
+    describe,
+    from_table,
+)
+from harness.dut import Dut, connect, reopen_dut
+from harness.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
+from harness.rig import open_rig
+from harness.run import Run
+from harness.scenario import Scenario
+from tests.harness.firmware import CORES, FOLDER, needs_firmware
+from tests.harness.processes import descendants
+
+pytestmark = needs_firmware
+
+LONGEST = 450
+"""Samples of a scenario that a test plays under QEMU, at a thousand a second."""
+
+
+def play(description: DeviceDescription, scenario: Scenario) -> Run:
+    with open_rig("emulator") as rig, connect(description) as dut:
+        return Bench(rig, dut).play(scenario, seed=11)
+
+
+def shortened(name: str) -> Scenario:
+    """The first samples of a shipped scenario; its changes come nearer, so that some are among them."""
+    scenario = Scenario.load(name)
+    if scenario.samples <= LONGEST:
+        return scenario
+    at = scenario.tweaks[0].sample - LONGEST // 2 if scenario.tweaks else 0
+    tweaks = [dataclasses.replace(tweak, sample=tweak.sample - at) for tweak in scenario.tweaks]
+    return dataclasses.replace(
+        scenario, samples=LONGEST, tweaks=tuple(tweak for tweak in tweaks if tweak.sample + tweak.ramp_n < LONGEST)
+    )
+
+
+@pytest.fixture(scope="module", params=names("scenarios"))
+def reference(request: pytest.FixtureRequest) -> tuple[Scenario, Run]:
+    """A scenario, and its run with the device in this process."""
+    scenario = shortened(request.param)
+    return scenario, play(InprocDevice(name="bob"), scenario)
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"inproc", "serial"}))
+@pytest.mark.parametrize("exchange", ["sample", "stream"])
+def test_every_scenario_gives_the_same_bits_on_every_device(
+    reference: tuple[Scenario, Run], kind: str, exchange: str
+) -> None:
+    scenario, expected = reference
+    run = play(from_table({"name": kind, "kind": kind, "exchange": exchange}, kind), scenario)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected.theta_hash()
+    assert (run.statistic == expected.statistic).all()
+    assert (run.flags == expected.flags).all()
+    assert run.alarm_index.tolist() == expected.alarm_index.tolist()
+
+
+def test_shortened_scenarios_still_have_alarms() -> None:
+    assert len(play(HostDevice(name="bob"), shortened("thesis")).alarm_index) > 0
+
+
+@pytest.mark.parametrize("core", CORES)
+def test_firmware_says_which_it_is_and_every_boot_has_its_number(core: str) -> None:
+    nonces = set()
+    for _ in range(2):
+        with connect(describe(f"qemu-{core}")) as dut:
+            identity = dut.description()["identity"]
+            assert identity["firmware"] == f"QEMU_{core.upper()}"
+            nonces.add(identity["boot_nonce"])
+    assert len(nonces) == 2
+
+
+# ---- failures
+
+
+@pytest.fixture
+def started() -> Iterator[tuple[Dut, int]]:
+    """A device that is about to run, and the number of the QEMU that it runs in."""
+    before = set(descendants(os.getpid()))
+    with connect(QemuM4(name="bob", timeout_s=0.3)) as dut:
+        (pid,) = (
+            pid
+            for pid in set(descendants(os.getpid())) - before
+            if Path(f"/proc/{pid}/comm").read_text().startswith("qemu")
+        )
+        dut.start()
+        yield dut, pid
+        dut.close()
+        assert not Path(f"/proc/{pid}").exists()
+
+
+def run(dut: Dut) -> Run:
+    with open_rig("emulator") as rig:
+        return Bench(rig, dut).play(shortened("healthy"), seed=1)
+
+
+def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Dut, int]) -> None:
+    dut, pid = started
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(LinkClosed, match=r"^device bob: QEMU \(mps2-an386\) ended with status -9"):
+        dut.status()
+
+
+def test_qemu_that_hangs_is_told_and_ended(started: tuple[Dut, int]) -> None:
+    dut, pid = started
+    os.kill(pid, signal.SIGSTOP)
+    with pytest.raises(LinkTimeout, match="^device bob: no .* within 0.3 s"):
+        dut.status()
+
+
+def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> None:
+    """Without a vector table the processor locks up."""
+    (tmp_path / "nothing.elf").write_bytes(b"")
+    with pytest.raises(LinkError, match=r"QEMU \(mps2-an386\) ended with status -6: qemu: fatal: Lockup"):
+        connect(describe(f"qemu-m4:{tmp_path}/nothing.elf"))
+
+
+def test_absent_firmware_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ANALOGRIG_FIRMWARE", str(tmp_path))
+    with pytest.raises(LinkError, match=f"there is no firmware {tmp_path}/analogrig-m4.elf: run `make firmware`"):
+        connect(describe("qemu-m4"))
+    with pytest.raises(LinkError, match="^there is no firmware my.elf$"):
+        connect(describe("qemu-m4:my.elf"))
+
+
+def test_absent_qemu_is_named_with_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(LinkError, match="qemu-system-arm is not installed: apt-get install qemu-system-arm"):
+        connect(describe("qemu-m4"))
+
+
+def test_own_firmware_is_named_by_its_path_and_not_run_on_the_word_of_a_recording(tmp_path: Path) -> None:
+    """It may ask QEMU for any file of this computer."""
+    image = tmp_path / "my.elf"
+    shutil.copyfile(FOLDER / "analogrig-m4.elf", image)
+    with connect(describe(f"qemu-m4:{image}")) as dut:
+        record = dict(dut.description())
+    with pytest.raises(ConfigurationError, match=f"say --dut qemu-m4:{image}, or another"):
+        reopen_dut(record)
+    own = {**record, "firmware": None}
+    with reopen_dut({key: value for key, value in own.items() if value is not None}) as dut:
+        assert dut.description()["kind"] == "qemu-m4"
+
+
+def test_every_kind_of_qemu_is_in_the_registry() -> None:
+    kinds = {f"qemu-{core}" for core in CORES}
+    assert {kind for kind, cls in KINDS.items() if issubclass(cls, QemuDevice)} == kinds
