@@ -1,9 +1,9 @@
 """That nothing undefined can happen in the core: Frama-C's Eva, an abstract interpreter, over eva.c. `make eva`.
 
-For every shape of the model, any configuration and any samples: no access outside an array or by a stale pointer, no read
-of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the infinities are numbers here:
-samples may be such. What keeps them out of the state is asked of est_invariants_hold() after every step of the fuzzer and
-of the tests; intervals cannot show it, since they know of no relation between P, theta and the data.
+For every shape of the model, any configuration and any samples: no access outside an array or by a stale pointer, no
+read of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the infinities are
+numbers here: samples may be such. What keeps them out of the state is asked of est_invariants_hold() after every step
+of the fuzzer and of the tests; intervals cannot show it, since they know of no relation between P, theta and the data.
 """
 
 from __future__ import annotations
