@@ -78,6 +78,9 @@ analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer
 eva: $(PRODUCTS) ## Frama-C over the core, each shape of the model: nothing undefined can happen; an hour
 	@$(BIN)/python -m estimator_c.evidence.eva
 
+mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sample 60" takes so many mutants; build/mutation.json
+	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)
+
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
 
