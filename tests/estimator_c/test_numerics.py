@@ -180,3 +180,12 @@ def test_prediction_at_any_order_and_scale_is_that_of_extended_precision(
     assert (result.status[3:] == UPDATED).all()
     error = ((result.theta - exact.theta) * exact.phi).sum(axis=1)
     assert np.abs(error).max() <= 1e-5 * np.abs(exact.y).max()
+
+
+def test_a_c_is_taken_iff_its_zeros_are_inside_the_unit_circle(estimator: Estimator) -> None:
+    """Those closer to the circle than 0.02 are left out: double zeros there would filter the data into overflow."""
+    for c1 in np.linspace(-2.3, 2.3, 47):
+        for c2 in np.linspace(-1.2, 1.2, 25):
+            radius = np.abs(np.roots([1.0, c1, c2])).max()
+            if abs(radius - 1.0) > 0.02:
+                assert estimator.init(c=(float(c1), float(c2))) == (radius < 1.0), (c1, c2)
