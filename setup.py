@@ -37,7 +37,7 @@ PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/*.c",)
-DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/device/*.c")
+DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c",)
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/tether.c",)
@@ -47,7 +47,7 @@ OTHER_SOURCES = (
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/*/*.h",
-    "estimator_c/isolation/*",
+    "estimator_c/isolation/*.h",
     "estimator_c/catalogue/*",
     *FIXTURES,
 )
@@ -94,7 +94,8 @@ class BuildProducts(Command):
             (destination / product).parent.mkdir(parents=True, exist_ok=True)
         generate_codecs(generated, destination / CATALOGUE)
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
-        include = (*ROOM, *(f"-I{path}" for path in ("estimator_c/core", "estimator_c/device", generated)))
+        folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "device")), generated)
+        include = (*ROOM, *(f"-I{path}" for path in folders))
         compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
         compile_c(destination / DEVICE, (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
         compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))

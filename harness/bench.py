@@ -47,6 +47,7 @@ class _Collected:
 
     def run(self, conditions: Conditions, parameters: int) -> Run:
         alarms = [alarm for reply in self.replies for alarm in reply.alarms]
+        diagnoses = [diagnosis for reply in self.replies for diagnosis in reply.diagnoses]
         return Run(
             conditions=conditions,
             codes=_stacked(self.codes, (0, len(CHANNELS)), np.uint16),
@@ -58,6 +59,10 @@ class _Collected:
             alarm_index=np.array([alarm.index for alarm in alarms], dtype=np.int64),
             alarm_kind=np.array([alarm.kind for alarm in alarms], dtype=np.uint8),
             alarm_statistic=np.array([alarm.statistic for alarm in alarms], dtype=np.float32),
+            diagnosis_index=np.array([diagnosis.index for diagnosis in diagnoses], dtype=np.int64),
+            diagnosis_change=np.array([diagnosis.change for diagnosis in diagnoses], dtype=np.uint8),
+            diagnosis_onset=np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
+            diagnosis_extent=np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
         )
 
 
@@ -102,6 +107,7 @@ class Bench:
         """
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._paced(performance)
+        self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
         conditions = Conditions(
             seed=seed,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 from harness._catalogue import (
     CATALOGUE_HASH,
     LAYOUTS,
+    Change,
     Command,
     Counter,
     Element,
@@ -32,12 +33,14 @@ __all__ = [
     "RUNS",
     "RUN_SHIFT",
     "Alarm",
+    "Change",
     "Command",
     "Configure",
     "Configured",
     "Control",
     "Controlled",
     "Counter",
+    "Diagnosis",
     "Element",
     "Estimate",
     "Firmware",
@@ -181,6 +184,16 @@ class Alarm(NamedTuple):
     statistic: float
 
 
+class Diagnosis(NamedTuple):
+    """Device: what has changed."""
+
+    seq: int
+    change: int
+    onset_index: int
+    extent: float
+    """New over old."""
+
+
 class Status(NamedTuple):
     """Device: one counter."""
 
@@ -203,6 +216,7 @@ Message: TypeAlias = (
     | Estimate
     | Stepped
     | Alarm
+    | Diagnosis
     | Status
 )
 

@@ -161,6 +161,10 @@ class Dut:
                     f" {_word(Result, answer.result)}, it has {answer.value:g}"
                 )
 
+    def set_force_zero(self, code: float) -> None:
+        """Tell the device which code of the force is none; errors as ``configure``."""
+        self.configure(dataclasses.replace(self._description.estimator, force_zero=code))
+
     def pace(self, period_s: float) -> Pace:
         """For a run with a sample every ``period_s``, on the clock of the line.
 

@@ -25,6 +25,7 @@ _EDGE_INSTANTS: tuple[EdgeInstants, ...] = ("locked", "may-slip", "anywhere")
 _SETTINGS = (
     *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
     *("forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"),
+    *("isolation", "force_zero"),
 )
 """The fields that the device knows under the same name and as they are."""
 
@@ -74,6 +75,10 @@ class EstimatorConfig:
     code_low: float = -1.0e6
     """A reading at or below ``code_low``, or at or above ``code_high``, is saturated; codes."""
     code_high: float = 1.0e6
+    isolation: bool = True
+    """Say after an alarm which of M, B, K has changed; for na = 2, nb + nk <= 3 and the trigger ``cusum``."""
+    force_zero: float = 0.0
+    """The code at which the force is zero, for that. The bench sets it, by the range of the rig's card."""
     edge_instants: EdgeInstants = "may-slip"
     """Where between two samples the edges of the force come: always at the same place (``locked``), at nearly the same
     (``may-slip``), or each elsewhere (``anywhere``), as when the period is no whole number of samples."""

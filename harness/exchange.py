@@ -21,6 +21,8 @@ from harness.catalogue import (
     RUN_SHIFT,
     RUNS,
     Alarm,
+    Change,
+    Diagnosis,
     Element,
     Estimate,
     Message,
@@ -46,6 +48,8 @@ _INDEX = 65536
 _NO_INDEX = -1
 _NO_ELEMENT = -1
 
+_SAID = frozenset(Change) - {Change.UNDECIDED}
+
 Codes = tuple[int, int, bool]
 """Force, displacement, and whether they are missing."""
 
@@ -61,6 +65,20 @@ class RaisedAlarm:
     statistic: float
 
 
+@dataclass(frozen=True)
+class StatedDiagnosis:
+    """What the device says has changed."""
+
+    index: int
+    """The sample after which it was said; this and ``onset`` are counted from the start, not modulo anything."""
+    change: int
+    """As Change of the catalogue."""
+    onset: int
+    """The likeliest sample of the change; that of the alarm if several parameters have changed."""
+    extent: float
+    """Of the parameter, new over old; 1 if several have changed."""
+
+
 @dataclass(frozen=True, eq=False)
 class Replies:
     """What the device said to n samples; p parameters."""
@@ -74,6 +92,7 @@ class Replies:
     flags: NDArray[np.uint8]
     """(n,): SteppedFlag, LOST, UNREPORTED."""
     alarms: tuple[RaisedAlarm, ...]
+    diagnoses: tuple[StatedDiagnosis, ...]
 
 
 @dataclass(frozen=True)
@@ -100,6 +119,7 @@ class _Rows:
         self.statistics: list[float] = []
         self.flags: list[int] = []
         self.alarms: list[RaisedAlarm] = []
+        self.diagnoses: list[StatedDiagnosis] = []
         self._last_taken = (width * [0.0], 0.0)
 
     def repeat(self, flags: int, statistic: float | None = None) -> None:
@@ -113,7 +133,7 @@ class _Rows:
         self.statistics.append(statistic)
 
     def take(self, n: int, before: int) -> Replies:
-        """The first n samples, and the alarms ``before`` an index."""
+        """The first n samples, and the alarms and diagnoses ``before`` an index."""
         cut = n * self.width
         values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
         out = Replies(
@@ -122,10 +142,12 @@ class _Rows:
             statistic=np.array(self.statistics[:n], dtype=np.float32),
             flags=np.array(self.flags[:n], dtype=np.uint8),
             alarms=tuple(alarm for alarm in self.alarms if alarm.index < before),
+            diagnoses=tuple(diagnosis for diagnosis in self.diagnoses if diagnosis.index < before),
         )
         if n:
             self._last_taken = (self.values[cut - self.width : cut], self.statistics[n - 1])
         del self.values[:cut], self.statistics[:n], self.flags[:n], self.alarms[: len(out.alarms)]
+        del self.diagnoses[: len(out.diagnoses)]
         return out
 
 
@@ -165,6 +187,8 @@ class Exchange:
         """The oldest sample without all its answers; all before are rows."""
         self._wire_index = _NO_INDEX
         """The same as the line has it, if there is one."""
+        self._diagnosis: Diagnosis | None = None
+        """It names no sample: the next Stepped does."""
         self._silences = 0
         self.next_index = 0
         self.taken = 0
@@ -199,7 +223,7 @@ class Exchange:
         return len(self._rows.flags)
 
     def take(self, n: int, before: int) -> Replies:
-        """The oldest n rows, with the alarms ``before`` a sample."""
+        """The oldest n rows, with the alarms and diagnoses ``before`` a sample."""
         return self._rows.take(n, before)
 
     # ---- to the device
@@ -268,6 +292,8 @@ class Exchange:
             self._step(message)
         elif isinstance(message, Alarm) and message.sample_index == self._wire_index:
             self._rows.alarms.append(RaisedAlarm(self._answered, message.trigger, message.statistic))
+        elif isinstance(message, Diagnosis) and message.change in _SAID and self._pending:
+            self._diagnosis = message
         elif lost := self._predecessors(message):
             self._lose(lost)
             self._accept(message)
@@ -281,6 +307,11 @@ class Exchange:
 
     def _step(self, message: Stepped) -> None:
         flags = message.flags & _DEVICE_FLAGS
+        if self._diagnosis is not None:
+            onset = self._answered - (self._answered - self._diagnosis.onset_index) % _INDEX
+            stated = StatedDiagnosis(self._answered, self._diagnosis.change, onset, self._diagnosis.extent)
+            self._rows.diagnoses.append(stated)
+            self._diagnosis = None
         if self._at:
             self._rows.finish(flags, message.statistic)
             self._at = 0

@@ -1,4 +1,4 @@
-"""How soon a change can be seen at all.
+"""How soon a change can be seen at all, and how soon it can be told what has changed.
 
 No detector whose mean time between false alarms is ARL0 can, to first order, raise the alarm before the information
 
@@ -6,19 +6,49 @@ No detector whose mean time between false alarms is ARL0 can, to first order, ra
 
 between the plant as it was and the plant as it has become reaches ln ARL0 (Lorden 1971; Moustakides 1986; Lai 1998).
 It depends on where in the excitation the change fell, so it is computed for that very change in that very run.
+
+Which parameter has changed can be told, with 95 % confidence, once the same information between the plant as it has
+become and the likeliest plant in which another parameter alone had changed reaches ln 20.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.plant import AT_REST, Plant, SampledPlant, State
+from harness.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State
 from harness.run import Run
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
+
+
+LN_CERTAIN = math.log(20.0)
+
+ISOLATION_HORIZON_N = 300
+"""A change that cannot be told from others within so many samples counts as one that never can."""
+
+_RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 221))
+"""Magnitudes of a rival; the best is interpolated."""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """One change of the plant in a run."""
+
+    before: Plant
+    after: Plant
+    steps: Sequence[SampledPlant]
+    """The plant in each of the sample periods after it."""
+    state: State
+    """In which it finds the plant."""
+    force_n: Sequence[float]
+    """(n,) as it was measured."""
+    weight: NDArray[np.float64]
+    """(n,) of a squared metre of displacement, after each of these forces: information; 0 for a missing sample."""
 
 
 def changes(run: Run) -> list[NDArray[np.float64]]:
@@ -27,27 +57,50 @@ def changes(run: Run) -> list[NDArray[np.float64]]:
     Both plants start from the state in which the change finds the true one and feel the force that was measured.
     Samples that the device could not use carry no information.
     """
+    period_s = run.conditions.sample_period_problem_s
+    out = []
+    for change in _changes(run):
+        unchanged = [SampledPlant.of(change.before, period_s)] * len(change.steps)
+        difference_m = _course(change, change.steps) - _course(change, unchanged)
+        out.append(np.cumsum(difference_m**2 * change.weight))
+    return out
+
+
+def isolation_bounds(run: Run) -> list[int | None]:
+    """For each change of the plant in ``run``: the samples after which it can be told from a change of any other one
+    parameter, be it by the factor that looks most like it; None: not before the next change or the end.
+    """
+    period_s = run.conditions.sample_period_problem_s
+    out = []
+    for change in _changes(run):
+        changed = tuple(change.before.changes_to(change.after))
+        course = _course(change, change.steps)[:ISOLATION_HORIZON_N]
+        least = np.full(len(course), np.inf)
+        for name in PARAMETERS:
+            if changed != (name,):
+                rivals = [change.before.scaled(name, factor) for factor in _RIVAL_FACTORS]
+                apart = (_courses(change, rivals, period_s) - course) ** 2 * change.weight[: len(course)]
+                least = np.minimum(least, _least(np.cumsum(apart, axis=1)))
+        out.append(first_reaching(least, LN_CERTAIN))
+    return out
+
+
+def _changes(run: Run) -> Iterator[_Change]:
     conditions = run.conditions
     force_n = run.channel("force").tolist()
     displacement = conditions.channels["displacement"]
-    variance_lsb2 = displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2
-    usable = ~run.missing
-    period_s = conditions.sample_period_problem_s
+    variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
+    weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
     state = AT_REST
     before: Plant | None = None
-    out: list[NDArray[np.float64]] = []
     for start, end, plant in run.segments:
-        steps = _steps(before or plant, plant, ramps_n[start], end - start, period_s)
+        steps = _steps(before or plant, plant, ramps_n[start], end - start, conditions.sample_period_problem_s)
         if before is not None:
-            unchanged = SampledPlant.of(before, period_s)
-            difference_m = _displacement_difference(unchanged, steps, state, force_n[start : end - 1])
-            seen = np.where(usable[start + 1 : end], difference_m / displacement.lsb, 0.0)
-            out.append(np.cumsum(seen**2) / (2.0 * variance_lsb2))
+            yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
         for step, force in zip(steps, force_n[start:end], strict=True):
             state = step.next(state, force)
         before = plant
-    return out
 
 
 def _steps(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
@@ -64,13 +117,34 @@ def first_reaching(information: Sequence[float] | NDArray[np.float64], level: fl
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _displacement_difference(
-    before: SampledPlant, after: Sequence[SampledPlant], state: State, force_n: Sequence[float]
-) -> NDArray[np.float64]:
+def _course(change: _Change, steps: Sequence[SampledPlant]) -> NDArray[np.float64]:
     """(n,) metres, after each of the n forces."""
-    unchanged, changed = state, state
-    out = np.empty(len(force_n))
-    for k, force in enumerate(force_n):
-        unchanged, changed = before.next(unchanged, force), after[k].next(changed, force)
-        out[k] = changed[0] - unchanged[0]
+    state = change.state
+    out = np.empty(len(steps))
+    for k, (step, force) in enumerate(zip(steps, change.force_n, strict=True)):
+        state = step.next(state, force)
+        out[k] = state[0]
     return out
+
+
+def _courses(change: _Change, plants: Sequence[Plant], period_s: float) -> NDArray[np.float64]:
+    """(p, n) metres, of each of p plants, up to the horizon."""
+    sampled = [SampledPlant.of(plant, period_s) for plant in plants]
+    xx, xv, vx, vv = np.array([each.transition for each in sampled]).T
+    xf, vf = np.array([each.response for each in sampled]).T
+    x, v = (np.full(len(plants), value) for value in change.state)
+    forces = change.force_n[:ISOLATION_HORIZON_N]
+    out = np.empty((len(plants), len(forces)))
+    for k, force in enumerate(forces):
+        x, v = xx * x + xv * v + xf * force, vx * x + vv * v + vf * force
+        out[:, k] = x
+    return out
+
+
+def _least(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(f, n) at evenly spaced f: the least over f (n,), by a parabola through the three lowest."""
+    at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
+    low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))
+    curvature = low + high - 2.0 * mid
+    dip = np.divide((high - low) ** 2, 8.0 * curvature, out=np.zeros_like(mid), where=curvature > 0.0)
+    return np.asarray(np.maximum(np.minimum(mid, mid - dip), 0.0))

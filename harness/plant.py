@@ -40,6 +40,11 @@ class Plant:
         """The values under their short names ``M``, ``B``, ``K``."""
         return dict(zip(PARAMETERS, (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m), strict=True))
 
+    def scaled(self, name: str, factor: float) -> Plant:
+        """The plant with its ``M``, ``B`` or ``K`` times a factor."""
+        values = self.parameters()
+        return Plant(*(value * factor if name == each else value for each, value in values.items()))
+
     def on_the_way(self, other: Plant, part: float) -> Plant:
         """The plant at a part (0..1) of a ramp to another: what the pots pass, 1/M, B and K, changes evenly.
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import config
+from harness.catalogue import Change
 from harness.errors import ConfigurationError, RecordingError
 from harness.plant import Plant
 from harness.storage import replacing
@@ -45,6 +46,14 @@ _ARRAYS: dict[str, tuple[str, int]] = {
     "alarm_statistic": ("float32", 1),
 }
 
+_LATER_ARRAYS: dict[str, tuple[str, int]] = {
+    "diagnosis_index": ("int64", 1),
+    "diagnosis_change": ("uint8", 1),
+    "diagnosis_onset": ("int64", 1),
+    "diagnosis_extent": ("float32", 1),
+}
+"""Recordings made before a device could say what has changed lack them: they are empty."""
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -64,6 +73,11 @@ class Channel:
     def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
         """Codes of any shape to volts at the rig (float64, same shape)."""
         return self.low_v + codes.astype(np.float64) * self.lsb_v
+
+    @property
+    def zero(self) -> float:
+        """The code of zero volts, not rounded; it may lie outside the range."""
+        return -self.low_v / self.lsb_v
 
     @property
     def lsb(self) -> float:
@@ -144,6 +158,14 @@ class Run:
     """(a,): sample index of each alarm."""
     alarm_kind: NDArray[np.uint8]
     alarm_statistic: NDArray[np.float32]
+    diagnosis_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(d,): sample after which the device said what had changed."""
+    diagnosis_change: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    """(d,): Change of the catalogue."""
+    diagnosis_onset: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(d,): the sample of the change, as the device has it."""
+    diagnosis_extent: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    """(d,): new over old."""
 
     @property
     def samples(self) -> int:
@@ -180,7 +202,7 @@ class Run:
         :raises RecordingError: the file cannot be written.
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays = {name: getattr(self, name) for name in _ARRAYS | _LATER_ARRAYS}
         with replacing(path) as file:
             np.savez(file, allow_pickle=False, header=np.array(header), **arrays)
 
@@ -195,7 +217,8 @@ class Run:
                 _check_archive(raw)
                 with np.load(raw, allow_pickle=False) as file:
                     header = json.loads(str(file["header"]))
-                    arrays = {name: _checked(name, file[name]) for name in _ARRAYS}
+                    names = (*_ARRAYS, *(name for name in _LATER_ARRAYS if name in file))
+                    arrays = {name: _checked(name, file[name]) for name in names}
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
         except Exception as error:  # numpy and zipfile raise a dozen types on damaged archives, undocumented
@@ -206,19 +229,22 @@ class Run:
 
     def _check_consistency(self, path: Path) -> None:
         """The arrays belong together, and so do they and the header."""
-        n, alarms = self.samples, len(self.alarm_index)
+        n, alarms, diagnoses = self.samples, len(self.alarm_index), len(self.diagnosis_index)
         conditions = self.conditions
         starts = [segment.start for segment in conditions.segments]
         checks = {
             "arrays of different lengths": all(
                 len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
             )
-            and len(self.alarm_kind) == len(self.alarm_statistic) == alarms,
+            and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
+            and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
             "channels": set(conditions.channels) == set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
             "sample times": conditions.sample_period_s > 0.0 and conditions.time_scale > 0.0,
             "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
+            "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
+            and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
             "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),
@@ -248,7 +274,7 @@ def _parameters(estimator: Any) -> int | None:
 
 
 def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    dtype, dimensions = _ARRAYS[name]
+    dtype, dimensions = (_ARRAYS | _LATER_ARRAYS)[name]
     if array.dtype != np.dtype(dtype) or array.ndim != dimensions:
         raise ValueError(f"array {name} is {array.dtype} with {array.ndim} dimensions")
     return array

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from harness.advice import advice
 from harness.plant import UNITS
 from harness.run import Run
-from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
+from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
 
 SHOWN_ALARMS = 10
 
@@ -23,6 +23,13 @@ def summary(run: Run, verdict: Verdict) -> str:
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
         lines += [_tweak_line(tweak) for tweak in verdict.tweaks]
+    diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
+    if diagnoses:
+        lines += [
+            "",
+            "  sample  named    right  extent   error  said after  bound  onset off by  (samples)",
+            *diagnoses,
+        ]
     lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
     if verdict.missing_n:
         lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
@@ -52,6 +59,17 @@ def _tweak_line(tweak: TweakVerdict) -> str:
     latency = "missed" if tweak.missed else "-" if tweak.latency_n is None else str(tweak.latency_n)
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
     return f"  {tweak.sample:6}  {_change(tweak.before, tweak.after):43}  {latency:>7}  {bound:>5}"
+
+
+def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
+    extent = "-" if diagnosis.extent is None else f"{diagnosis.extent:.3f}"
+    error = "-" if diagnosis.extent_error is None else f"{diagnosis.extent_error:+.1%}"
+    bound = "none" if diagnosis.bound_n is None else str(diagnosis.bound_n)
+    right = "yes" if diagnosis.right else "NO"
+    return (
+        f"  {sample:6}  {diagnosis.named:7}  {right:>5}  {extent:>6}  {error:>6}"
+        f"  {diagnosis.delay_n:10}  {bound:>5}  {diagnosis.onset_error_n:+12}"
+    )
 
 
 def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:

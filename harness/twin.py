@@ -21,6 +21,7 @@ SLIP_DOUBT = 1000.0
 CONTRACTION = 0.99
 REFRESH_STEP = 0.002
 REFRESH_STRIDE, REFRESH_DOUBT = 0.05, 100.0
+REFRESH_MEMORIES = 2.0
 
 NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
 
@@ -169,6 +170,7 @@ class Twin:
         self.residuals = [0.0] * config.nc
         self.pending = self._past_n
         self.equations = 0
+        self.since_n = 0  # samples since an edge of u
         self.statistic = 0.0
         self.rivals = [0.0, 0.0]
         self.mean, self.mean_n = 0.0, 0
@@ -213,6 +215,7 @@ class Twin:
             if self.doubt.age_n > DOUBT_N:
                 self.doubt = None
         edge = known and abs(u - self.u[1]) >= self.config.edge_codes
+        self.since_n = 0 if edge else self.since_n + 1
         if edge and self.config.edge_instants == "anywhere":
             self.pending = max(self.pending, self.config.na)
         if edge and self.config.edge_instants == "may-slip" and self.config.trigger == "cusum":
@@ -295,7 +298,8 @@ class Twin:
             square = min(innovation**2 / variance, NOISE_CLIP * self.noise_variance)
             self.noise_variance += NOISE_RATE * (square / NOISE_KEPT - self.noise_variance)
         self.equations += 1
-        if config.refresh_n and self.equations >= config.refresh_n and self.doubt is None:
+        remembers_edge = (1.0 - config.forgetting) * self.since_n < REFRESH_MEMORIES
+        if config.refresh_n and self.equations >= config.refresh_n and self.doubt is None and remembers_edge:
             self._refresh()
 
     def _refresh(self) -> None:

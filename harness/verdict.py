@@ -7,6 +7,7 @@ alarm was many times what is needed.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import config, information
+from harness.catalogue import Change
 from harness.plant import PARAMETERS, physical_parameters
 from harness.run import Run
 
@@ -54,6 +56,29 @@ class Expectations:
                 raise ValueError(f"{name} must not be negative")
 
 
+NAMES = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
+"""What a device can say has changed."""
+
+
+@dataclass(frozen=True)
+class DiagnosisVerdict:
+    """What the device said had changed, after the alarm that noticed the change."""
+
+    named: str
+    """``M``, ``B``, ``K`` or ``several``."""
+    right: bool
+    delay_n: int
+    """Samples from the change until it was said."""
+    bound_n: int | None
+    """The isolation bound of this very change; None: it could not be told from others before the next or the end."""
+    onset_error_n: int
+    """Of the sample that was named, in samples."""
+    extent: float | None
+    """New over old, as it was said; None if several."""
+    extent_error: float | None
+    """Relative; None unless one parameter has changed and was named."""
+
+
 @dataclass(frozen=True)
 class TweakVerdict:
     """One change of the plant and how it was noticed. Latencies are samples from the change to the alarm."""
@@ -69,6 +94,8 @@ class TweakVerdict:
     """The information bound of this very change; None: it could not be seen before the next change or the end."""
     deadline_n: int | None
     """A later alarm is late."""
+    diagnosis: DiagnosisVerdict | None = None
+    """None: the device did not say, for lack of certainty or because it does not isolate."""
 
     @property
     def missed(self) -> bool:
@@ -172,6 +199,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                 "bound": tweak.bound_n,
                 "deadline": tweak.deadline_n,
                 "missed": tweak.missed,
+                "diagnosis": None if tweak.diagnosis is None else dataclasses.asdict(tweak.diagnosis),
             }
             for tweak in verdict.tweaks
         ],
@@ -197,8 +225,9 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
-    for (_, _, before), (start, end, after), gathered in zip(
-        run.segments, run.segments[1:], information.changes(run), strict=False
+    isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
+    for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
+        run.segments, run.segments[1:], information.changes(run), isolation_bounds, strict=False
     ):
         # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
         mine = [index for index in alarms if start < index <= end]
@@ -215,9 +244,35 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
                 latency_n=None if detection is None else detection - start,
                 bound_n=information.first_reaching(gathered, level),
                 deadline_n=None if late is None else late + expect.late_slack_n,
+                diagnosis=None
+                if detection is None
+                else _diagnosis(run, start, (detection, end), changed, isolation_bound_n),
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
+
+
+def _diagnosis(
+    run: Run, start: int, span: tuple[int, int], changed: Mapping[str, tuple[float, float]], bound_n: int | None
+) -> DiagnosisVerdict | None:
+    """The first that was said from the alarm to the end of the segment, both included in ``span``."""
+    said = np.flatnonzero((run.diagnosis_index >= span[0]) & (run.diagnosis_index <= span[1]))
+    if not len(said):
+        return None
+    first = said[0]
+    named = NAMES[Change(run.diagnosis_change[first])]
+    extent = float(run.diagnosis_extent[first]) if named in PARAMETERS else None
+    right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
+    error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
+    return DiagnosisVerdict(
+        named=named,
+        right=right,
+        delay_n=int(run.diagnosis_index[first]) - start,
+        bound_n=bound_n,
+        onset_error_n=int(run.diagnosis_onset[first]) - start,
+        extent=extent,
+        extent_error=error,
+    )
 
 
 def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:

@@ -36,19 +36,23 @@
 #define REFRESH_STRIDE 0.05F
 #define REFRESH_DOUBT 100.0F
 
+/// The estimate remembers some 1 / (1 - forgetting) samples. After so many times that without an edge, what it says of A comes from
+/// the noise, which any A = C fits: C would follow it anywhere.
+#define REFRESH_MEMORIES 2.0F
+
 /// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
 /// counts as no more, so that a change of the plant is not taken for noise; of Gaussian noise that keeps NOISE_KEPT.
 #define NOISE_RATE 0.005F
 #define NOISE_CLIP 9.0F
 #define NOISE_KEPT 0.9851F
 
-static void count(uint16_t* const counter) { *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U)); }
+EST_OUTLINE void count(uint16_t* const counter) { *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U)); }
 
-static void count_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
+EST_OUTLINE void count_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
-static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
+static uint_fast8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
-static bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
+EST_OUTLINE bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
@@ -101,8 +105,8 @@ bool est_config_valid(const est_config_t* const config) {
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-static void shift(float* const x, const uint8_t n, const float newest) {
-    for (uint8_t i = (uint8_t)(n - 1U); i > 0U; i--) {
+static void shift(float* const x, const uint_fast8_t n, const float newest) {
+    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
         x[i] = x[i - 1U];
     }
     x[0] = newest;
@@ -111,7 +115,7 @@ static void shift(float* const x, const uint8_t n, const float newest) {
 /// All of the past is kept, whatever the order needs: a loop of fixed length is the faster one.
 static void shift_u(est_t* const self, const float newest) {
     EST_UNROLL
-    for (uint8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
+    for (uint_fast8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
         self->u[i] = self->u[i - 1U];
     }
     self->u[0] = newest;
@@ -119,20 +123,20 @@ static void shift_u(est_t* const self, const float newest) {
 
 static void shift_y(est_t* const self, const float newest) {
     EST_UNROLL
-    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+    for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
         self->y[i] = self->y[i - 1U];
     }
     self->y[0] = newest;
 }
 
 /// How many samples before its own an equation reaches back to.
-static uint8_t past_n(const est_config_t* const config) {
-    return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
+static uint_fast8_t past_n(const est_config_t* const config) {
+    return larger(config->na, (uint_fast8_t)(config->nb + config->nk - 1U));
 }
 
 /// The next equation is at least `pending_n` samples away, and the first of its kind.
-static void restart(est_t* const self, const uint8_t pending_n) {
-    self->pending_n = larger(self->pending_n, pending_n);
+static void restart(est_t* const self, const uint_fast8_t pending_n) {
+    self->pending_n = (uint8_t)larger(self->pending_n, pending_n);
 }
 
 /// One sample less to come before the next equation is complete. What an alarm, or a new C, leaves to do to P is done here, where
@@ -225,7 +229,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
         count(&self->counters.stuck);
         return EST_REFUSED;
     }
-    if (EST_WITH_WATCH || EST_WITH_EDGES) {
+    if (EST_WITH_WATCH || EST_WITH_EDGES || EST_WITH_ADAPTATION) {
         count(&self->edges.since_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
@@ -258,21 +262,11 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-/// The residual of an equation.
-EST_INLINE float residual(const float* const phi, const float* const theta, const uint8_t n) {
-    float out = phi[n];
-    EST_UNROLL
-    for (uint8_t i = 0U; i < n; i++) {
-        out -= phi[i] * theta[i];
-    }
-    return out;
-}
-
 /// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
 /// they are taken against what was believed before the doubt.
 EST_INLINE void
 read_otherwise(est_t* const self, const est_shape_t shape, const float* const phi, float* const readings) {
-    const float e = residual(phi, self->edges.theta, est_shape_count(shape));
+    const float e = est_equation_residual(phi, self->edges.theta, est_shape_count(shape));
     float       early;
     float       late;
     est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
@@ -284,7 +278,7 @@ read_otherwise(est_t* const self, const est_shape_t shape, const float* const ph
 static void keep_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
-        shift(self->residual, self->config->nc, residual(phi, self->theta, self->count));
+        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, self->count));
     }
 #else
     (void)self;
@@ -301,28 +295,35 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
+/// Of the magnitudes of the two, the first of which is one.
+static float larger_magnitude(const float a, const float b) {
+    const float magnitude = (b < 0.0F) ? -b : b;
+    return (a < magnitude) ? magnitude : a;
+}
+
 /// After convergence the noise of the equations is coloured by A itself (thesis section 3.5: noise on the output).
 static void refresh_prefilter(est_t* const self) {
-    const uint8_t na = self->config->na;
+    const uint_fast8_t na = self->config->na;
     float         c[EST_NA_MAX];
     float         factor = 1.0F;
-    bool          moved  = false;
-    bool          far    = false;
-    for (uint8_t i = 0U; i < na; i++) {
+    float         step   = 0.0F;  // of the coefficient that moves most
+    for (uint_fast8_t i = 0U; i < na; i++) {
         factor *= CONTRACTION;
         c[i]  = self->theta[i] * factor;
-        const float step = c[i] - self->whitener.c[i];
-        moved = moved || !within(step, -REFRESH_STEP, REFRESH_STEP);
-        far   = far || !within(step, -REFRESH_STRIDE, REFRESH_STRIDE);
+        step = larger_magnitude(step, c[i] - self->whitener.c[i]);
     }
-    if (moved && est_whitener_accepts(c, na)) {
+    if ((step > REFRESH_STEP) && est_whitener_accepts(c, na)) {
         est_whitener_set(&self->whitener, c, na);
         count(&self->counters.refreshes);
-        if (far) {
+        if (step > REFRESH_STRIDE) {
             self->renewal = EST_RENEWAL_DOUBT;
             restart(self, 1U);
         }
     }
+}
+
+static bool remembers_edge(const est_t* const self) {
+    return ((1.0F - self->config->forgetting) * (float)self->edges.since_n) < REFRESH_MEMORIES;
 }
 
 /// Not while edges are in doubt: theta may have followed what did not happen.
@@ -331,7 +332,7 @@ EST_INLINE void approach_refresh(est_t* const self) {
     if (self->refresh_in > 0U) {
         return;
     }
-    if (self->edges.age_n > 0U) {
+    if ((self->edges.age_n > 0U) || !remembers_edge(self)) {
         self->refresh_in = 1U;
     } else {
         self->refresh_in = self->config->refresh_n;
@@ -344,9 +345,9 @@ EST_INLINE void approach_refresh(est_t* const self) {
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
 /// did on u(k), or the other way round. The statistic goes on as this reading has it, so that a change is not lost in it.
 static void follow_slip(est_t* const self) {
-    const uint8_t nb = self->config->nb;
+    const uint_fast8_t nb = self->config->nb;
     float* const  b  = &self->theta[self->config->na];
-    for (uint8_t i = 0U; i < self->count; i++) {
+    for (uint_fast8_t i = 0U; i < self->count; i++) {
         self->theta[i] = self->edges.theta[i];
     }
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
@@ -354,13 +355,13 @@ static void follow_slip(est_t* const self) {
         shift(b, nb, 0.0F);
         return;
     }
-    for (uint8_t j = 0U; j < nb; j++) {
+    for (uint_fast8_t j = 0U; j < nb; j++) {
         b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
     }
 }
 
-static void zero(float* const x, const uint8_t n) {
-    for (uint8_t i = 0U; i < n; i++) {
+static void zero(float* const x, const uint_fast8_t n) {
+    for (uint_fast8_t i = 0U; i < n; i++) {
         x[i] = 0.0F;
     }
 }
@@ -461,7 +462,7 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
 // ---------------------------------------------          API           ---------------------------------------------
 
 est_config_t est_config_default(void) {
-    est_config_t config = {
+    static const est_config_t config = {
         .na             = (uint8_t)DEFAULT_NA,
         .nb             = (uint8_t)DEFAULT_NB,
         .nk             = 0U,
@@ -476,7 +477,9 @@ est_config_t est_config_default(void) {
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
-        .c              = { 0.0F },
+#if EST_NA_MAX >= 2
+        .c              = { -1.6F, 0.64F },
+#endif
         .edge_codes     = 64.0F,
         .code_low       = -EST_CODE_LIMIT,
         .code_high      = EST_CODE_LIMIT,
@@ -487,10 +490,6 @@ est_config_t est_config_default(void) {
                             .warm_up_n  = 150U,
                             .ceiling    = 11.512925F },
     };
-#if EST_NA_MAX >= 2
-    config.c[0] = -1.6F;
-    config.c[1] = 0.64F;
-#endif
     return config;
 }
 
@@ -500,7 +499,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;
     }
     *self                = (est_t){ .config = config };
-    self->count          = est_shape_count(est_shape_of(config));
+    self->count          = (uint8_t)est_shape_count(est_shape_of(config));
     self->adaptive       = adaptive(config);
     self->refresh_in     = config->refresh_n;
     self->noise_variance = config->noise_variance;
@@ -557,7 +556,7 @@ bool est_invariants_hold(const est_t* const self) {
     if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != est_shape_count(est_shape_of(self->config)))) {
         return false;
     }
-    for (uint8_t i = 0U; i < self->count; i++) {
+    for (uint_fast8_t i = 0U; i < self->count; i++) {
         if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
             return false;
         }

@@ -26,7 +26,7 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
 /// sample before had an equation, which an edge one sample early would have entered.
 void est_edges_begin(
-    est_edges_t* self, const est_config_t* config, const float* theta, uint8_t count, float step, bool after_equation);
+    est_edges_t* self, const est_config_t* config, const float* theta, uint_fast8_t count, float step, bool after_equation);
 
 /// What the edges, had they come early, and late, would have added to the present equation, whitened.
 void est_edges_shares(est_edges_t*          self,

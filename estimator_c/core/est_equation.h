@@ -14,9 +14,9 @@ typedef struct {
     float variance;                 ///< of the equation's noise, in noise variances
 } est_equation_t;
 
-EST_INLINE float* append(float* const out, const float* const from, const uint8_t n) {
+EST_INLINE float* append(float* const out, const float* const from, const uint_fast8_t n) {
     EST_UNROLL
-    for (uint8_t i = 0U; i < n; i++) {
+    for (uint_fast8_t i = 0U; i < n; i++) {
         out[i] = from[i];
     }
     return &out[n];
@@ -26,7 +26,7 @@ EST_INLINE float* append(float* const out, const float* const from, const uint8_
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
     float* out = phi;
     EST_UNROLL
-    for (uint8_t i = 0U; i < shape.na; i++) {
+    for (uint_fast8_t i = 0U; i < shape.na; i++) {
         *out++ = -self->y[i];
     }
     out = append(out, &self->u[shape.nk], shape.nb);
@@ -39,27 +39,33 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
     *out = y;
 }
 
+/// What theta does not foresee of y(k), the element after the regressor.
+EST_INLINE float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
+    float out = phi[n];
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < n; i++) {
+        out -= phi[i] * theta[i];
+    }
+    return out;
+}
+
 /// Whitens the equation in place, and finds its innovation.
 EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     const est_shape_t     shape,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
-    const uint8_t count = est_shape_count(shape);
+    const uint_fast8_t count = est_shape_count(shape);
     float* const  phi   = equation->phi;
     float         gain[EST_NA_MAX];
-    float         predicted = 0.0F;
     EST_UNROLL
-    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         gain[i] = whitener->gain[0][i];
     }
     EST_UNROLL
-    for (uint8_t j = 0U; j < count; j++) {
-        const float x = est_filter(gain, &whitener->past[j], phi[j]);
-        phi[j]        = x;
-        predicted += x * theta[j];
+    for (uint_fast8_t j = 0U; j <= count; j++) {
+        phi[j] = est_filter(gain, &whitener->past[j], phi[j]);
     }
-    phi[count]           = est_filter(gain, &whitener->past[count], phi[count]);
-    equation->innovation = phi[count] - predicted;
+    equation->innovation = est_equation_residual(phi, theta, count);
 }
 
 /// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
@@ -69,19 +75,18 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint8_t      count       = est_shape_count(shape);
+    const uint_fast8_t      count       = est_shape_count(shape);
     const float        remembering = 1.0F / config->forgetting;
     const float* const phi         = equation->phi;
     float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled
     float              alpha   = config->forgetting * equation->variance;
     float              inverse = (equation->variance > 1.0F) ? (remembering / equation->variance) : remembering;
-    float              d       = 0.0F;
     float*             column  = self->upper;
     EST_UNROLL
-    for (uint8_t j = 0U; j < count; j++) {
+    for (uint_fast8_t j = 0U; j < count; j++) {
         float f = phi[j];
         EST_UNROLL
-        for (uint8_t i = 0U; i < j; i++) {
+        for (uint_fast8_t i = 0U; i < j; i++) {
             f += column[i] * phi[i];
         }
         const float v      = self->d[j] * f;
@@ -89,22 +94,18 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
         const float shrunk = self->d[j] * (alpha * remembering);
         alpha += f * v;
         inverse    = 1.0F / alpha;
-        d          = shrunk * inverse;
-        self->d[j] = est_limited(d, config->p0);
+        self->d[j] = est_limited(shrunk * inverse, est_factors_prior(config, shape, j));
         EST_UNROLL
-        for (uint8_t i = 0U; i < j; i++) {
+        for (uint_fast8_t i = 0U; i < j; i++) {
             const float u = *column;
             *column++     = u - (p * gain[i]);
             gain[i] += u * v;
         }
         gain[j] = v;
     }
-    if (shape.offset) {
-        self->d[count - 1U] = est_limited(d, config->p0_offset);
-    }
     const float scale = equation->innovation * inverse;
     EST_UNROLL
-    for (uint8_t i = 0U; i < count; i++) {
+    for (uint_fast8_t i = 0U; i < count; i++) {
         theta[i] += gain[i] * scale;
     }
     return inverse;

@@ -1,26 +1,22 @@
 #include "est_factors.h"
 
-static float prior_of(const est_config_t* const config, const uint8_t count, const uint8_t j) {
-    return (((j + 1U) == count) && config->offset) ? config->p0_offset : config->p0;
-}
-
 void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
-    const uint8_t count  = est_shape_count(est_shape_of(config));
-    float*        column = self->upper;
-    for (uint8_t j = 0U; j < count; j++) {
-        self->d[j] = prior_of(config, count, j);
-        for (uint8_t i = 0U; i < j; i++) {
+    const est_shape_t shape  = est_shape_of(config);
+    float*            column = self->upper;
+    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
+        self->d[j] = est_factors_prior(config, shape, j);
+        for (uint_fast8_t i = 0U; i < j; i++) {
             *column++ = 0.0F;
         }
     }
 }
 
 /// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
-static void walk_row(est_factors_t* const self, const uint8_t row, const float variance) {
+static void walk_row(est_factors_t* const self, const uint_fast8_t row, const float variance) {
     float a[EST_THETA_MAX] = { 0.0F };
     float c                = variance;
     a[row]                 = 1.0F;
-    for (uint8_t j = (uint8_t)(row + 1U); j > 0U; j--) {
+    for (uint_fast8_t j = (uint_fast8_t)(row + 1U); j > 0U; j--) {
         float* const column = &self->upper[((j - 1U) * (j - 2U)) / 2U];
         const float  s      = a[j - 1U];
         const float  before = self->d[j - 1U];
@@ -28,7 +24,7 @@ static void walk_row(est_factors_t* const self, const uint8_t row, const float v
         const float  b      = (c * s) / d;
         c *= before / d;
         self->d[j - 1U] = d;
-        for (uint8_t i = 0U; (i + 1U) < j; i++) {
+        for (uint_fast8_t i = 0U; (i + 1U) < j; i++) {
             a[i] -= s * column[i];
             column[i] += b * a[i];
         }
@@ -36,22 +32,22 @@ static void walk_row(est_factors_t* const self, const uint8_t row, const float v
 }
 
 void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
-    for (uint8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
+    for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
         walk_row(self, i, config->random_walk);
     }
     est_factors_inflate(self, config, 1.0F);
 }
 
 void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
-    const uint8_t count = est_shape_count(est_shape_of(config));
-    for (uint8_t j = 0U; j < count; j++) {
-        self->d[j] = est_limited(self->d[j] * factor, prior_of(config, count, j));
+    const est_shape_t shape = est_shape_of(config);
+    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
+        self->d[j] = est_limited(self->d[j] * factor, est_factors_prior(config, shape, j));
     }
 }
 
-float est_factors_variance(const est_factors_t* const self, const uint8_t count, const uint8_t index) {
+float est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const uint_fast8_t index) {
     float sum = self->d[index];
-    for (uint8_t k = (uint8_t)(index + 1U); k < count; k++) {
+    for (uint_fast8_t k = (uint_fast8_t)(index + 1U); k < count; k++) {
         const float u = self->upper[((k * (k - 1U)) / 2U) + index];
         sum += u * u * self->d[k];
     }

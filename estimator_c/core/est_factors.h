@@ -16,6 +16,11 @@ EST_INLINE float est_limited(const float d, const float upper) {
 }
 
 /// P := P0.
+/// The variance of parameter j before anything is known, and at most.
+EST_INLINE float est_factors_prior(const est_config_t* const config, const est_shape_t shape, const uint_fast8_t j) {
+    return (((j + 1U) == est_shape_count(shape)) && shape.offset) ? config->p0_offset : config->p0;
+}
+
 void est_factors_reset(est_factors_t* self, const est_config_t* config);
 
 /// Every parameter walks: P := P + random_walk I, no d beyond the prior. The factors of Thornton's time update, "Triangular
@@ -26,6 +31,6 @@ void est_factors_walk(est_factors_t* self, const est_config_t* config);
 void est_factors_inflate(est_factors_t* self, const est_config_t* config, float factor);
 
 /// One diagonal element of P.
-float est_factors_variance(const est_factors_t* self, uint8_t count, uint8_t index);
+float est_factors_variance(const est_factors_t* self, uint_fast8_t count, uint_fast8_t index);
 
 #endif  // EST_FACTORS_H_INCLUDED

@@ -26,6 +26,13 @@
 #define EST_INLINE static inline
 #endif
 
+/// A build for size would rather call a short function than have it everywhere.
+#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
+#define EST_OUTLINE static __attribute__((noinline))
+#else
+#define EST_OUTLINE static inline
+#endif
+
 /// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUT_PAST_MAX, which are small.
 #if defined(__GNUC__) && (defined(EST_FIXED_NA) || !defined(__OPTIMIZE_SIZE__))
 #define EST_UNROLL _Pragma("GCC unroll 8")
@@ -57,8 +64,8 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
 }
 
 /// The number of parameters.
-EST_INLINE uint8_t est_shape_count(const est_shape_t shape) {
-    return (uint8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
+EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
+    return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
 }
 
 #endif  // EST_SHAPE_H_INCLUDED

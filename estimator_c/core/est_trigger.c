@@ -48,23 +48,26 @@ static float other_statistic(est_trigger_t* const              self,
     }
 }
 
-static float cusum(const float before, const float innovation, const float precision) {
+EST_OUTLINE float cusum(const float before, const float innovation, const float precision) {
     const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
     return (sum > 0.0F) ? sum : 0.0F;
+}
+
+/// The statistic of the other reading that explains the innovations better.
+EST_OUTLINE float best_rival(const est_trigger_t* const self) {
+    return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
 }
 
 /// The plant has changed only if no reading of the edges explains the innovations.
 static est_finding_t
 find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const readings, const float precision, const bool expires) {
-    bool explained = false;
-    for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
         self->rival[i] = cusum(self->rival[i], readings[i + 1U], precision);
-        explained      = explained || (self->rival[i] < ceiling);
     }
     if (self->statistic < ceiling) {
         return EST_QUIET;
     }
-    if (!explained) {
+    if (best_rival(self) >= ceiling) {
         return EST_ALARM;
     }
     return expires ? EST_SLIP : EST_QUIET;
@@ -86,7 +89,7 @@ void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
 }
 
 void est_trigger_begin_doubt(est_trigger_t* const self) {
-    for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
         self->rival[i] = self->statistic;
     }
 }
@@ -95,10 +98,8 @@ est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger
     if (self->statistic >= config->ceiling) {
         return EST_SLIP;
     }
-    for (uint8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        if (self->rival[i] < self->statistic) {
-            self->statistic = self->rival[i];
-        }
+    if (est_trigger_in_doubt(self)) {
+        self->statistic = best_rival(self);
     }
     est_trigger_begin_doubt(self);
     return EST_QUIET;
@@ -106,13 +107,13 @@ est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger
 
 bool est_trigger_settle_late(est_trigger_t* const self) {
     const bool late = self->rival[1] < self->rival[0];
-    self->statistic = late ? self->rival[1] : self->rival[0];
+    self->statistic = best_rival(self);
     est_trigger_begin_doubt(self);
     return late;
 }
 
 bool est_trigger_in_doubt(const est_trigger_t* const self) {
-    return (self->rival[0] < self->statistic) || (self->rival[1] < self->statistic);
+    return best_rival(self) < self->statistic;
 }
 
 est_finding_t est_trigger_step(est_trigger_t* const              self,

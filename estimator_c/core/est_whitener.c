@@ -7,30 +7,29 @@
 #define REFLECTION_MAX 0.9999F
 
 /// Schur-Cohn (step-down): all zeros are inside iff every reflection coefficient is below 1.
-bool est_whitener_accepts(const float* const c, const uint8_t na) {
+bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
     float a[EST_NA_MAX];
-    for (uint8_t i = 0U; i < na; i++) {
+    for (uint_fast8_t i = 0U; i < na; i++) {
         a[i] = c[i];
     }
-    for (uint8_t order = na; order > 0U; order--) {
+    for (uint_fast8_t order = na; order > 0U; order--) {
         const float k = a[order - 1U];
         if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
             return false;
         }
         const float rest = 1.0F - (k * k);
-        float       lower[EST_NA_MAX];
-        for (uint8_t i = 0U; (i + 1U) < order; i++) {
-            lower[i] = (a[i] - (k * a[order - 2U - i])) / rest;
-        }
-        for (uint8_t i = 0U; (i + 1U) < order; i++) {
-            a[i] = lower[i];
+        for (uint_fast8_t i = 0U; ((2U * i) + 1U) < order; i++) {
+            float* const mirror = &a[order - 2U - i];
+            const float  lower  = (a[i] - (k * *mirror)) / rest;
+            *mirror             = (*mirror - (k * a[i])) / rest;
+            a[i]                = lower;
         }
     }
     return true;
 }
 
-void est_whitener_set(est_whitener_t* const self, const float* const c, const uint8_t na) {
-    for (uint8_t i = 0U; i < na; i++) {
+void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
+    for (uint_fast8_t i = 0U; i < na; i++) {
         self->c[i]       = c[i];
         self->gain[0][i] = c[i];
     }
@@ -39,18 +38,18 @@ void est_whitener_set(est_whitener_t* const self, const float* const c, const ui
 void est_whitener_restart(est_whitener_t* const self) {
     self->n       = 0U;
     self->settled = false;
-    for (uint8_t j = 0U; j <= EST_THETA_MAX; j++) {
-        for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t j = 0U; j <= EST_THETA_MAX; j++) {
+        for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
             self->past[j].x[i] = 0.0F;
         }
     }
 }
 
 /// The autocovariance of C(z) e at this lag.
-static float autocovariance(const float* const c, const uint8_t lag) {
+static float autocovariance(const float* const c, const uint_fast8_t lag) {
     float sum = (lag == 0U) ? 1.0F : c[lag - 1U];
     EST_UNROLL
-    for (uint8_t i = lag; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = lag; i < EST_NA_MAX; i++) {
         sum += c[i] * c[i - lag];
     }
     return sum;
@@ -59,11 +58,11 @@ static float autocovariance(const float* const c, const uint8_t lag) {
 /// The gains of a new equation.
 static void remember(est_whitener_t* const self, const float* const gain, const float variance) {
     EST_UNROLL
-    for (uint8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
+    for (uint_fast8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
         self->precision[row] = self->precision[row - 1U];
     }
-    for (uint8_t row = EST_GAINS_KEPT - 1U; row > 0U; row--) {
-        for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t row = EST_GAINS_KEPT - 1U; row > 0U; row--) {
+        for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
             self->gain[row][i] = self->gain[row - 1U][i];
         }
     }
@@ -71,7 +70,7 @@ static void remember(est_whitener_t* const self, const float* const gain, const 
     self->settled      = variance < SETTLED;
     self->n            = (uint8_t)(self->n + ((self->n < EST_NA_MAX) ? 1U : 0U));
     EST_UNROLL
-    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->gain[0][i] = self->settled ? self->c[i] : gain[i];
     }
 }
@@ -82,10 +81,10 @@ float est_whitener_advance(est_whitener_t* const self) {
     float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
     float variance = autocovariance(self->c, 0U);
     EST_UNROLL
-    for (uint8_t i = EST_NA_MAX; i > 0U; i--) {
+    for (uint_fast8_t i = EST_NA_MAX; i > 0U; i--) {
         float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
         EST_UNROLL
-        for (uint8_t m = EST_NA_MAX; m > i; m--) {
+        for (uint_fast8_t m = EST_NA_MAX; m > i; m--) {
             sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];
         }
         covariance[i - 1U] = sum;

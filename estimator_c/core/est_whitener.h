@@ -9,10 +9,10 @@
 #include "est_shape.h"
 
 /// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
-bool est_whitener_accepts(const float* c, uint8_t na);
+bool est_whitener_accepts(const float* c, uint_fast8_t na);
 
 /// From now on C is this; how the next equations hang together with those before is kept.
-void est_whitener_set(est_whitener_t* self, const float* c, uint8_t na);
+void est_whitener_set(est_whitener_t* self, const float* c, uint_fast8_t na);
 
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
@@ -24,7 +24,7 @@ float est_whitener_advance(est_whitener_t* self);
 EST_INLINE float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
     EST_UNROLL
-    for (uint8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
+    for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
         out -= gain[i] * past->x[i];
         past->x[i] = past->x[i - 1U];
     }

@@ -4,8 +4,12 @@
 #include "settings.h"
 
 #ifndef DEVICE_ASSERT
+#ifdef NDEBUG  // a freestanding compiler has no assert.h
+#define DEVICE_ASSERT(x) ((void)0)
+#else
 #include <assert.h>
 #define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
 #endif
 
 #if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
@@ -69,12 +73,22 @@ static void put_estimate(device_t* const self, answer_t* const answer, const uin
 
 static void put_alarm(device_t* const self, answer_t* const answer, const float statistic) {
     const struct analogrig_alarm_t message = { .seq          = self->seq,
-                                               .trigger      = (uint8_t)self->config.trigger.kind,
+                                               .trigger      = (uint8_t)self->settings.estimator.trigger.kind,
                                                .sample_index = self->next_index,
                                                .statistic    = statistic };
     uint8_t                        payload[PAYLOAD_MAX];
     (void)analogrig_alarm_pack(payload, &message, sizeof(payload));
     put(self, answer, ANALOGRIG_ALARM_FRAME_ID, payload);
+}
+
+static void put_diagnosis(device_t* const self, answer_t* const answer, const est_diagnosis_t* const diagnosis) {
+    const struct analogrig_diagnosis_t message = { .seq         = self->seq,
+                                                   .change      = (uint8_t)diagnosis->change,
+                                                   .onset_index = (uint16_t)(self->alarm_index - diagnosis->onset_n),
+                                                   .extent      = diagnosis->extent };
+    uint8_t                            payload[PAYLOAD_MAX];
+    (void)analogrig_diagnosis_pack(payload, &message, sizeof(payload));
+    put(self, answer, ANALOGRIG_DIAGNOSIS_FRAME_ID, payload);
 }
 
 static void put_stepped(device_t* const self, answer_t* const answer, const est_step_t* step, const bool restarted) {
@@ -94,10 +108,29 @@ static void put_stepped(device_t* const self, answer_t* const answer, const est_
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
+static est_step_t step(device_t* const self, const est_sample_t sample) {
+    const est_step_t out = est_step(&self->estimator, sample);
+    if (self->isolating) {
+        est_isolation_enter(&self->isolation, &self->estimator, sample, out);
+    }
+    return out;
+}
+
+/// Works on the diagnosis of the last alarm, if there is one to come, and says it once.
+static void isolate(device_t* const self, answer_t* const answer) {
+    const est_change_t before = est_isolation_diagnosis(&self->isolation).change;
+    for (uint8_t i = 0U; (i < DEVICE_ISOLATION_SLICES) && est_isolation_work(&self->isolation); i++) {
+    }
+    const est_diagnosis_t diagnosis = est_isolation_diagnosis(&self->isolation);
+    if (diagnosis.change != before) {
+        put_diagnosis(self, answer, &diagnosis);
+    }
+}
+
 static void enter_gap(device_t* const self, const uint16_t lost_n) {
     const est_sample_t missing = { .u = 0.0F, .y = 0.0F, .valid = false };
     for (uint16_t i = 0U; (i < lost_n) && (i < DEVICE_GAP_MAX); i++) {
-        (void)est_step(&self->estimator, missing);
+        (void)step(self, missing);
     }
     add(&self->counters.samples_lost, lost_n);
     self->next_index   = (uint16_t)(self->next_index + lost_n);
@@ -127,12 +160,14 @@ enter_sample(device_t* const self, answer_t* const answer, const uint16_t index,
         enter_gap(self, ahead);
     }
     const uint32_t   restarts = est_counters(&self->estimator).restarts;
-    const est_step_t step     = est_step(&self->estimator, sample);
-    if (step.alarm) {
-        put_alarm(self, answer, step.statistic);
+    const est_step_t stepped  = step(self, sample);
+    if (stepped.alarm) {
+        self->alarm_index = self->next_index;
+        put_alarm(self, answer, stepped.statistic);
     }
-    report(self, answer, step.innovation);
-    put_stepped(self, answer, &step, est_counters(&self->estimator).restarts != restarts);
+    isolate(self, answer);
+    report(self, answer, stepped.innovation);
+    put_stepped(self, answer, &stepped, est_counters(&self->estimator).restarts != restarts);
     self->next_index++;
 }
 
@@ -198,7 +233,7 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
     if (self->running) {
         return ANALOGRIG_CONFIGURED_RESULT_RUNNING_CHOICE;
     }
-    switch (settings_set(&self->config, key, value)) {
+    switch (settings_set(&self->settings, key, value)) {
     case SETTINGS_APPLIED:
         return ANALOGRIG_CONFIGURED_RESULT_APPLIED_CHOICE;
     case SETTINGS_OUT_OF_RANGE:
@@ -218,7 +253,7 @@ static void on_configure(device_t* const self, answer_t* const answer, const uin
         .key     = message.key,
         .answers = message.seq,
         .result  = result,
-        .value   = settings_get(&self->config, message.key),
+        .value   = settings_get(&self->settings, message.key),
     };
     uint8_t out[PAYLOAD_MAX];
     (void)analogrig_configured_pack(out, &applied, sizeof(out));
@@ -232,19 +267,21 @@ static void reset(device_t* const self) {
     frame_decoder_init(&self->decoder, self->identity.catalogue_hash);
     self->counters          = (device_counters_t){ 0 };
     self->stopped           = (est_counters_t){ 0 };
-    self->config            = est_config_default();
+    self->settings          = settings_default();
     self->running           = false;
     self->report_interval_n = 1U;
-    (void)est_init(&self->estimator, &self->config);
+    (void)est_init(&self->estimator, &self->settings.estimator);
 }
 
 static uint8_t start(device_t* const self, const uint32_t run) {
     if (self->running) {
         return ANALOGRIG_CONTROLLED_RESULT_RUNNING_CHOICE;
     }
-    if ((run > RUN_MAX) || !est_init(&self->estimator, &self->config)) {
+    if ((run > RUN_MAX) || !est_init(&self->estimator, &self->settings.estimator)) {
         return ANALOGRIG_CONTROLLED_RESULT_OUT_OF_RANGE_CHOICE;
     }
+    self->isolating = est_isolation_init(&self->isolation, &self->settings.estimator, self->settings.force_zero) &&
+                      self->settings.isolation;
     self->running      = true;
     self->run          = (uint8_t)run;
     self->next_index   = 0U;
@@ -443,6 +480,11 @@ device_run(device_t* const self, const uint8_t* const in, const size_t in_n, uin
         progress.given += answer.n;
     }
     return progress;
+}
+
+void device_overrun(device_t* const self, const uint32_t lost_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.receive_overruns, lost_n);
 }
 
 bool device_is_busy(const device_t* const self) {

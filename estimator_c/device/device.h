@@ -6,7 +6,7 @@
 /// down and nothing is lost.
 ///
 ///     Identify    -> Hello, Firmware          Configure   -> Configured
-///     Control     -> Controlled               Sample      -> [Alarm] [Estimate ...] Stepped
+///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Estimate ...] Stepped
 ///     STATUS      -> Status, one per counter  SampleBlock -> the same for each of its samples
 ///
 /// A sample that is not the next one in the order of its index is never entered: one that comes again or late is ignored,
@@ -19,7 +19,9 @@
 #define DEVICE_H_INCLUDED
 
 #include "est.h"
+#include "est_isolation.h"
 #include "frame.h"
+#include "settings.h"
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -29,12 +31,16 @@
 extern "C" {
 #endif
 
-/// The most bytes that one step of work answers with: an alarm, theta, the innovation and Stepped.
-#define DEVICE_ANSWER_MAX ((EST_THETA_MAX + 3U) * FRAME_SIZE(8U))
+/// The most bytes that one step of work answers with: an alarm, a diagnosis, theta, the innovation and Stepped.
+#define DEVICE_ANSWER_MAX ((EST_THETA_MAX + 4U) * FRAME_SIZE(8U))
 
 /// Of a gap so many samples are entered as missing, at most. The estimate is the same from the first one on; this bounds
 /// the time that one message may take.
 #define DEVICE_GAP_MAX 1024U
+
+/// Slices of work on a diagnosis with each sample. A sample takes EST_ISOLATION_ONSETS_N of them, and at the alarm up to 24
+/// are waiting: with twice as many the diagnosis comes 0.7 samples later than with all of them at once.
+#define DEVICE_ISOLATION_SLICES (2U * EST_ISOLATION_ONSETS_N)
 
 /// What a port knows about itself.
 typedef struct {
@@ -67,8 +73,11 @@ typedef struct {
     device_identity_t identity;
     frame_decoder_t   decoder;
     device_counters_t counters;
-    est_config_t      config;  ///< what START will use
+    settings_t        settings;  ///< what START will use
     est_t             estimator;
+    est_isolation_t   isolation;
+    bool              isolating;
+    uint16_t          alarm_index;
     est_counters_t    stopped;  ///< the estimator's counters when it was stopped; it may have been overwritten since
     bool              running;
     uint8_t           run;  ///< of START
@@ -97,8 +106,12 @@ void device_init(device_t* self, const device_identity_t* identity);
 /// Works until all input is taken and answered, or until the output has less than DEVICE_ANSWER_MAX bytes left: then call
 /// again, with the rest of the input and a new output. Call again too when all input was taken and the output was nearly
 /// full: device_is_busy() tells. Input is taken only as far as it could be answered.
-/// Cost: per byte O(1); per sample one est_step() and its answers; a gap at most DEVICE_GAP_MAX missing samples on top.
+/// Cost: per byte O(1); per sample one est_step() and its answers; a gap at most DEVICE_GAP_MAX missing samples on top,
+/// for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
 device_progress_t device_run(device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
+
+/// So many bytes came that the port could not keep. The harness can ask for their sum.
+void device_overrun(device_t* self, uint32_t lost_n);
 
 /// Whether answers to input already taken are still to come.
 bool device_is_busy(const device_t* self);

@@ -8,43 +8,45 @@
 typedef struct {
     uint8_t  key;
     uint8_t  size;    ///< of the member [bytes]
-    uint16_t offset;  ///< of the member in est_config_t
+    uint16_t offset;  ///< of the member in settings_t
     uint16_t limit;   ///< the largest whole number; 0: a floating-point number
 } field_t;
 
 #define MEMBER(name, member, most)                                                                                     \
     {                                                                                                                  \
-        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((est_config_t*)0)->member),           \
-        .offset = (uint16_t)offsetof(est_config_t, member), .limit = (most)                                            \
+        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((settings_t*)0)->member),           \
+        .offset = (uint16_t)offsetof(settings_t, member), .limit = (most)                                            \
     }
 
 #define NUMBER(name, member) MEMBER(name, member, 0U)
 
 static const field_t FIELDS[] = {
-    MEMBER(NA, na, UINT8_MAX),
-    MEMBER(NB, nb, UINT8_MAX),
-    MEMBER(NK, nk, UINT8_MAX),
-    MEMBER(NC, nc, UINT8_MAX),
-    MEMBER(OFFSET, offset, 1U),
-    MEMBER(NOISE_ESTIMATED, noise_estimated, 1U),
-    MEMBER(REFRESH_N, refresh_n, UINT16_MAX),
-    MEMBER(STUCK_N, stuck_n, UINT8_MAX),
-    MEMBER(IDLE_N, idle_n, UINT16_MAX),
-    MEMBER(EDGE_INSTANTS, edge_instants, EST_EDGES_ANYWHERE),
-    MEMBER(TRIGGER, trigger.kind, EST_TRIGGER_CUSUM),
-    MEMBER(RESET, trigger.reset, EST_RESET_ALL),
-    MEMBER(ABSOLUTE, trigger.absolute, 1U),
-    MEMBER(HOLD_OFF_N, trigger.hold_off_n, UINT16_MAX),
-    MEMBER(WARM_UP_N, trigger.warm_up_n, UINT16_MAX),
-    NUMBER(FORGETTING, forgetting),
-    NUMBER(RANDOM_WALK, random_walk),
-    NUMBER(P0, p0),
-    NUMBER(P0_OFFSET, p0_offset),
-    NUMBER(NOISE_VARIANCE, noise_variance),
-    NUMBER(EDGE_CODES, edge_codes),
-    NUMBER(CODE_LOW, code_low),
-    NUMBER(CODE_HIGH, code_high),
-    NUMBER(CEILING, trigger.ceiling),
+    MEMBER(NA, estimator.na, UINT8_MAX),
+    MEMBER(NB, estimator.nb, UINT8_MAX),
+    MEMBER(NK, estimator.nk, UINT8_MAX),
+    MEMBER(NC, estimator.nc, UINT8_MAX),
+    MEMBER(OFFSET, estimator.offset, 1U),
+    MEMBER(NOISE_ESTIMATED, estimator.noise_estimated, 1U),
+    MEMBER(REFRESH_N, estimator.refresh_n, UINT16_MAX),
+    MEMBER(STUCK_N, estimator.stuck_n, UINT8_MAX),
+    MEMBER(IDLE_N, estimator.idle_n, UINT16_MAX),
+    MEMBER(EDGE_INSTANTS, estimator.edge_instants, EST_EDGES_ANYWHERE),
+    MEMBER(TRIGGER, estimator.trigger.kind, EST_TRIGGER_CUSUM),
+    MEMBER(RESET, estimator.trigger.reset, EST_RESET_ALL),
+    MEMBER(ABSOLUTE, estimator.trigger.absolute, 1U),
+    MEMBER(HOLD_OFF_N, estimator.trigger.hold_off_n, UINT16_MAX),
+    MEMBER(WARM_UP_N, estimator.trigger.warm_up_n, UINT16_MAX),
+    MEMBER(ISOLATION, isolation, 1U),
+    NUMBER(FORGETTING, estimator.forgetting),
+    NUMBER(RANDOM_WALK, estimator.random_walk),
+    NUMBER(P0, estimator.p0),
+    NUMBER(P0_OFFSET, estimator.p0_offset),
+    NUMBER(NOISE_VARIANCE, estimator.noise_variance),
+    NUMBER(EDGE_CODES, estimator.edge_codes),
+    NUMBER(CODE_LOW, estimator.code_low),
+    NUMBER(CODE_HIGH, estimator.code_high),
+    NUMBER(CEILING, estimator.trigger.ceiling),
+    NUMBER(FORCE_ZERO, force_zero),
 };
 
 #define FIELDS_N (sizeof(FIELDS) / sizeof(FIELDS[0]))
@@ -53,7 +55,7 @@ static const field_t FIELDS[] = {
 static field_t field_of(const uint8_t key) {
     const uint8_t first = ANALOGRIG_CONFIGURE_KEY_C1_CHOICE;
     if ((key >= first) && (key < (first + EST_NA_MAX))) {
-        const size_t offset = offsetof(est_config_t, c) + ((key - first) * sizeof(float));
+        const size_t offset = offsetof(settings_t, estimator.c) + ((key - first) * sizeof(float));
         return (field_t){ .key = key, .size = (uint8_t)sizeof(float), .offset = (uint16_t)offset, .limit = 0U };
     }
     for (uint8_t i = 0U; i < FIELDS_N; i++) {
@@ -91,8 +93,8 @@ static bool holds(const field_t field, const float value) {
     return (value >= 0.0F) && (value <= (float)field.limit) && !((value - (float)(uint16_t)value) > 0.0F);
 }
 
-static void put(est_config_t* const config, const field_t field, const float value) {
-    uint8_t* const member = (uint8_t*)config + field.offset;
+static void put(settings_t* const self, const field_t field, const float value) {
+    uint8_t* const member = (uint8_t*)self + field.offset;
     if (field.limit == 0U) {
         *(float*)(void*)member = value;
     } else {
@@ -102,21 +104,25 @@ static void put(est_config_t* const config, const field_t field, const float val
 
 /// A value that the estimator can take, whatever the other fields will come to: they are set one by one.
 static bool acceptable(const field_t field, const float value) {
-    est_config_t base = est_config_default();
+    settings_t base = settings_default();
 #ifndef EST_FIXED_NA
-    base.na     = 1U;
-    base.nb     = 1U;
-    base.nc     = 0U;
-    base.offset = false;
+    base.estimator.na     = 1U;
+    base.estimator.nb     = 1U;
+    base.estimator.nc     = 0U;
+    base.estimator.offset = false;
 #endif
     put(&base, field, value);
     for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
-        base.c[i] = 0.0F;
+        base.estimator.c[i] = 0.0F;
     }
-    return est_config_valid(&base);
+    return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) && (base.force_zero <= EST_CODE_LIMIT);
 }
 
-settings_result_t settings_set(est_config_t* const config, const uint8_t key, const float value) {
+settings_t settings_default(void) {
+    return (settings_t){ .estimator = est_config_default(), .force_zero = 0.0F, .isolation = true };
+}
+
+settings_result_t settings_set(settings_t* const self, const uint8_t key, const float value) {
     const field_t field = field_of(key);
     if (field.size == 0U) {
         return SETTINGS_UNKNOWN;
@@ -124,15 +130,15 @@ settings_result_t settings_set(est_config_t* const config, const uint8_t key, co
     if (!holds(field, value) || !acceptable(field, value)) {
         return SETTINGS_OUT_OF_RANGE;
     }
-    put(config, field, value);
+    put(self, field, value);
     return SETTINGS_APPLIED;
 }
 
-float settings_get(const est_config_t* const config, const uint8_t key) {
+float settings_get(const settings_t* const self, const uint8_t key) {
     const field_t field = field_of(key);
     if (field.size == 0U) {
         return 0.0F;
     }
-    const uint8_t* const member = (const uint8_t*)config + field.offset;
+    const uint8_t* const member = (const uint8_t*)self + field.offset;
     return (field.limit == 0U) ? *(const float*)(const void*)member : (float)get_whole(member, field.size);
 }

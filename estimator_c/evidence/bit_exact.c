@@ -2,11 +2,17 @@
 /// what happened in them, and a hash of all results. bit_exact.py compares the outputs of compilers and targets.
 
 #include "est.h"
+#include "est_isolation.h"
 #include "plant.h"
 
 #include <stdio.h>
 
 #define STEPS_N 120U  ///< in each configuration
+
+/// With isolation, the plant changing once it is known.
+#define ISOLATION_STEPS_N 500U
+#define ISOLATION_CHANGE 300U
+#define ISOLATION_RUNS_N 36U
 
 typedef struct {
     uint64_t hash;
@@ -17,6 +23,7 @@ typedef struct {
     uint32_t refused;
     uint32_t missing;
     uint32_t refreshes;
+    uint32_t diagnoses;
     uint32_t violations;  ///< steps after which the invariants did not hold
 } record_t;
 
@@ -186,6 +193,50 @@ static bool run(record_t* const self, const uint32_t number) {
     return true;
 }
 
+static void enter_diagnosis(record_t* const self, const est_diagnosis_t diagnosis) {
+    enter_bits(self, (uint32_t)diagnosis.change | ((uint32_t)diagnosis.samples_n << 8U));
+    enter_bits(self, diagnosis.onset_n | ((uint32_t)diagnosis.onset_low_n << 8U) | ((uint32_t)diagnosis.onset_high_n << 16U));
+    enter_number(self, diagnosis.extent);
+}
+
+/// Locked edges with four parameters or any edges with six; M, B, K or two of them change.
+static bool run_isolation(record_t* const self, uint32_t number) {
+    const plant_mechanics_t front     = PLANT_FRONT;
+    const plant_mechanics_t changed[] = { PLANT_FRONT_SOFT,
+                                          { front.stiffness, front.damping * 3 / 2, front.drive },
+                                          { front.stiffness * 5 / 4, front.damping * 5 / 4, front.drive * 5 / 4 },
+                                          { front.stiffness * 3 / 2, front.damping * 2 / 3, front.drive } };
+    est_config_t            config    = est_config_default();
+    plant_t                 plant     = plant_at_rest(PLANT_FRONT, number, 5U * PLANT_TICKS_PER_SAMPLE);
+    const uint32_t          change    = digit(&number, 4U);
+    config.edge_instants              = (est_edge_instants_t)digit(&number, 3U);
+    if (config.edge_instants == EST_EDGES_LOCKED) {
+        config.nb     = 2U;
+        config.nk     = 1U;
+        config.offset = false;
+    } else {
+        plant.edge_tick += 5U;
+    }
+    est_t           estimator;
+    est_isolation_t isolation;
+    if (!est_init(&estimator, &config) || !est_isolation_init(&isolation, &config, 0.0F)) {
+        return false;
+    }
+    for (uint32_t k = 0U; k < ISOLATION_STEPS_N; k++) {
+        if (k == ISOLATION_CHANGE) {
+            plant.mechanics = changed[change];
+        }
+        const plant_codes_t codes  = plant_next(&plant);
+        const est_sample_t  sample = { .u = (float)codes.u, .y = (float)codes.y, .valid = true };
+        est_isolation_enter(&isolation, &estimator, sample, est_step(&estimator, sample));
+        while (est_isolation_work(&isolation)) {
+        }
+        enter_diagnosis(self, est_isolation_diagnosis(&isolation));
+    }
+    self->diagnoses += (est_isolation_diagnosis(&isolation).change != EST_CHANGE_UNDECIDED) ? 1U : 0U;
+    return true;
+}
+
 int main(void) {
     record_t record = { .hash = 14695981039346656037U };
     for (uint32_t number = 0U; number < (2U * 3U * 2U * 3U * 2U * 3U * 5U); number++) {
@@ -194,11 +245,18 @@ int main(void) {
             return 1;
         }
     }
+    for (uint32_t number = 0U; number < ISOLATION_RUNS_N; number++) {
+        if (!run_isolation(&record, number)) {
+            (void)printf("configuration %lu with isolation was refused\n", (unsigned long)number);
+            return 1;
+        }
+    }
     (void)printf(
-        "steps %lu nan %lu violations %lu alarms %lu slips %lu refused %lu missing %lu refreshes %lu hash %08lx%08lx\n",
+        "steps %lu nan %lu violations %lu alarms %lu slips %lu refused %lu missing %lu refreshes %lu diagnoses %lu "
+        "hash %08lx%08lx\n",
         (unsigned long)record.steps, (unsigned long)record.nan_n, (unsigned long)record.violations,
         (unsigned long)record.alarms, (unsigned long)record.slips, (unsigned long)record.refused,
-        (unsigned long)record.missing, (unsigned long)record.refreshes, (unsigned long)(record.hash >> 32U),
-        (unsigned long)(record.hash & 0xFFFFFFFFU));
+        (unsigned long)record.missing, (unsigned long)record.refreshes, (unsigned long)record.diagnoses,
+        (unsigned long)(record.hash >> 32U), (unsigned long)(record.hash & 0xFFFFFFFFU));
     return 0;
 }

@@ -16,14 +16,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from estimator_c.evidence.cost import FLOAT_ROUTINES
+
 __all__ = ["BUILDS", "QUICK", "Build", "main", "missing_tools", "outcome"]
 
 HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
+ISOLATION = HERE.parent / "isolation"
 
 FLAGS = (
     *("-std=c99", "-static", "-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
-    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{CORE}"),
+    *("-DEST_NC_MAX=2U", "-DEST_THETA_MAX=8U", f"-I{CORE}", f"-I{ISOLATION}"),
 )
 EXACT = "-ffp-contract=off"
 LEVELS = ("-O0", "-O1", "-O2", "-O3")
@@ -31,16 +34,18 @@ LEVELS = ("-O0", "-O1", "-O2", "-O3")
 
 @dataclass(frozen=True)
 class Target:
-    """A processor that programs are made for, what runs them here, and Debian's package of their C library."""
+    """A processor to make programs for, what runs them here, Debian's package of its C library, and sources of ours."""
 
     name: str
     compiler: str
     emulator: str
     libc: str
+    library: tuple[str, ...] = ()
 
 
 FOREIGN = (
     Target("ARM, soft float", "arm-linux-gnueabi-gcc", "qemu-arm", "libc6-dev-armel-cross"),
+    Target("Cortex-M0's float", "arm-linux-gnueabi-gcc", "qemu-arm", "libc6-dev-armel-cross", (str(FLOAT_ROUTINES),)),
     Target("ARM, hard float", "arm-linux-gnueabihf-gcc", "qemu-arm", "libc6-dev-armhf-cross"),
     Target("aarch64", "aarch64-linux-gnu-gcc", "qemu-aarch64", "libc6-dev-arm64-cross"),
     Target("riscv64", "riscv64-linux-gnu-gcc", "qemu-riscv64", "libc6-dev-riscv64-cross"),
@@ -68,7 +73,7 @@ def _builds() -> Iterator[Build]:
     for compiler, flags in itertools.product(("gcc", "clang"), here):
         yield Build(f"this machine, {compiler} {' '.join(flags)}", (compiler, *flags))
     for target, level in itertools.product(FOREIGN, LEVELS):
-        yield Build(f"{target.name}, gcc {level}", (target.compiler, level), (target.emulator,))
+        yield Build(f"{target.name}, gcc {level}", (target.compiler, level, *target.library), (target.emulator,))
 
 
 BUILDS = tuple(_builds())
@@ -88,7 +93,7 @@ def outcome(build: Build, *, contraction: str = EXACT) -> str:
     """What the program prints when it is built in this way."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "bit_exact")
-        sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c"))]
+        sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]
         run([*build.command, *FLAGS, contraction, *sources, "-o", program])
         return run([*build.runner, program])
 

@@ -21,6 +21,8 @@ __all__ = ["Cost", "costs", "count_steps", "link", "main", "missing_tools"]
 
 HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
+FLOAT_ROUTINES = HERE.parent / "ports" / "cortex_m0" / "float.S"
+ISOLATION = HERE.parent / "isolation"
 RESULTS = Path("build/cost.json")
 
 COMPILER = "arm-none-eabi-gcc"
@@ -30,7 +32,7 @@ PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm"}
 FLAGS = (
     *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
     *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are one byte here
-    *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}"),
+    *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}"),
 )
 
 EVEN = 1.2
@@ -39,16 +41,17 @@ EVEN = 1.2
 
 @dataclass(frozen=True)
 class Processor:
-    """One that code is made for, and the board of QEMU that runs it."""
+    """One that code is made for, the board of QEMU that runs it, and what it needs beside the compiler's library."""
 
     name: str
     flags: tuple[str, ...]
     machine: str
+    library: tuple[Path, ...] = ()
 
 
 M4F = Processor("M4F", ("-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"), "mps2-an386")
 M3 = Processor("M3", ("-mcpu=cortex-m3",), "mps2-an385")
-M0 = Processor("M0", ("-mcpu=cortex-m0",), "mps2-an385")
+M0 = Processor("M0", ("-mcpu=cortex-m0",), "mps2-an385", (FLOAT_ROUTINES,))
 """QEMU has no board of this kind with an M0, whose instructions are some of an M3's."""
 
 
@@ -92,6 +95,11 @@ OTHER = Orders(2, 2, 1, 1)
 
 # A build with the default trigger and nothing that can be left out.
 TRIGGER_ALONE = tuple(f"-DEST_WITH_{what}=0" for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH"))
+
+
+# What footprint.c is to use.
+EVERYTHING = ("-DFOOTPRINT_ALL",)
+ISOLATES = "-DFOOTPRINT_ISOLATES"
 
 
 @dataclass(frozen=True)
@@ -138,6 +146,11 @@ def core_sources() -> list[Path]:
     return sorted(CORE.glob("*.c"))
 
 
+def all_sources() -> list[Path]:
+    """With isolation."""
+    return [*core_sources(), *sorted(ISOLATION.glob("*.c"))]
+
+
 def symbols(image: Path) -> dict[str, tuple[int, int]]:
     """Address and size of each symbol of an image; without the lowest bit, which stands for Thumb code."""
     rows = (line.split() for line in run(["arm-none-eabi-nm", "-S", image]).splitlines())
@@ -154,22 +167,21 @@ def section_bytes(image: Path, *names: str) -> int:
 # ---- instructions
 
 
-def _between(log: Iterable[bytes], ends: set[int]) -> Iterator[int]:
-    """The instructions executed from one of these addresses to the next.
+def _between(log: Iterable[bytes], ends: set[int]) -> Iterator[tuple[int, int]]:
+    """Each of these addresses that was come to, and the instructions executed from there to the next of them.
 
     QEMU disassembles each block of straight-line code once, after "IN:", and names it each time it executes it:
     Trace 0: 0x7f.. [00000000/address/flags/flags] function
     """
     length: dict[int, int] = {}
-    block = count = 0
-    begun = False
+    block = count = begun = 0
     for line in log:
         if line.startswith(b"Trace "):
             address = int(line.split(b"/", 2)[1], 16)
             if address in ends:
                 if begun:
-                    yield count
-                begun, count = True, 0
+                    yield begun, count
+                begun, count = address, 0
             count += length[address]
         elif line.startswith(b"IN:"):
             block = 0
@@ -179,8 +191,9 @@ def _between(log: Iterable[bytes], ends: set[int]) -> Iterator[int]:
             length[block] = 1 if address == block else length[block] + 1
 
 
-def count_steps(image: Path, machine: str, step: str) -> list[int]:
-    """How many instructions each call of the function ``step`` took, in the order of the calls.
+def count_steps(image: Path, machine: str, step: str, *others: str) -> list[int]:
+    """How many instructions each call of the function ``step`` took, in the order of the calls; ``others`` are called
+    between them.
 
     SystemExit if the image judges that its run was not what it is made for: subject_judge() in its source.
     """
@@ -203,7 +216,8 @@ def count_steps(image: Path, machine: str, step: str) -> list[int]:
     command += ["-semihosting", "-d", "in_asm,exec,nochain", "-dfilter", f"{first:#x}..{last - 1:#x}"]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE) as simulator:
         assert simulator.stderr is not None  # noqa: S101 - it is a pipe
-        counts = list(_between(simulator.stderr, {places[name][0] for name in (step, "after_last_step")}))
+        ends = {places[name][0] for name in (step, *others, "after_last_step")}
+        counts = [count for begun, count in _between(simulator.stderr, ends) if begun == places[step][0]]
     if simulator.returncode != 0:
         raise SystemExit(
             f"cost: {image.name} ended with status {simulator.returncode}: see subject_judge() in its source"
@@ -251,22 +265,34 @@ class Bench:
         flags = (f"-DTEXTBOOK_N={n}U", *(("-DTEXTBOOK_FACTORS",) if factors else ()))
         return self._steps(name, processor, [HERE / "image.c", HERE / "textbook.c"], flags, "textbook_step")
 
+    def isolation(self, processor: Processor, orders: Orders) -> Iterator[Steps]:
+        """What isolation takes: to enter a sample, which is most at an alarm, and each slice of work after that."""
+        calls = ("est_isolation_work", "est_isolation_enter", "est_step")
+        sources = [HERE / "image.c", HERE / "subject_est.c", *all_sources()]
+        flags = ("-O2", *processor.flags, *orders.flags(fixed=False), "-DSUBJECT_ISOLATES")
+        image = link(self._folder / "image.elf", sources, flags)
+        work = count_steps(image, processor.machine, *calls)
+        yield Steps(f"{processor.name}, isolation, a slice of work", [count for count in work if count > min(work)])
+        entered = count_steps(image, processor.machine, *calls[1:], calls[0])
+        yield Steps(f"{processor.name}, isolation, a sample entered", entered)
+
     def _steps(
         self, name: str, processor: Processor, sources: Sequence[Path], flags: Sequence[str], step: str
     ) -> Steps:
-        image = link(self._folder / "image.elf", sources, ("-O2", *processor.flags, *flags))
+        image = link(self._folder / "image.elf", [*sources, *processor.library], ("-O2", *processor.flags, *flags))
         return Steps(name, count_steps(image, processor.machine, step))
 
     def text_bytes(self, *flags: str) -> int:
         """Code and constants of the core, without memset and memcpy of a C library."""
-        sources = [HERE / "footprint.c", *core_sources()]
-        image = link(self._folder / "footprint.elf", sources, ("-Os", *M4F.flags, *flags))
-        return section_bytes(image, ".text", ".rodata")
+        return section_bytes(self._footprint(*flags), ".text", ".rodata")
 
-    def state_bytes(self) -> int:
-        """sizeof(est_t)."""
-        image = link(self._folder / "footprint.elf", [HERE / "footprint.c", *core_sources()], ("-Os", *M4F.flags))
-        return symbols(image)["estimator"][1]
+    def state_bytes(self, state: str, *flags: str) -> int:
+        """The size of what the variable ``state`` of footprint.c holds."""
+        return symbols(self._footprint(*flags))[state][1]
+
+    def _footprint(self, *flags: str) -> Path:
+        sources = [HERE / "footprint.c", *all_sources()]
+        return link(self._folder / "footprint.elf", sources, ("-Os", *M4F.flags, *flags))
 
 
 # ---- the table
@@ -278,13 +304,24 @@ def costs(folder: Path) -> Iterator[Cost]:
     yield from instructions(bench)
     yield from soft_float(bench)
     for name, flags, limit in (
-        ("code of the core at -Os, everything", ("-DFOOTPRINT_ALL",), 4096),
+        ("code of the core at -Os, everything", EVERYTHING, 4096),
         ("code of the core at -Os, trigger alone", TRIGGER_ALONE, 1536),
     ):
         text_bytes = bench.text_bytes(*flags)
         yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
-    state_bytes = bench.state_bytes()
+    state_bytes = bench.state_bytes("estimator")
     yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
+    yield from isolation(bench)
+
+
+def isolation(bench: Bench) -> Iterator[Cost]:
+    """Beside the core, on the M4F."""
+    for steps in bench.isolation(M4F, LARGE):
+        yield Cost(steps.name, steps.typical, "instructions")
+        yield Cost(f"{steps.name}, worst", max(steps.counts), "instructions")
+    text_bytes = bench.text_bytes(*EVERYTHING, ISOLATES) - bench.text_bytes(*EVERYTHING)
+    yield Cost("M4F, code of isolation at -Os, beside the core's", text_bytes, "B")
+    yield Cost("M4F, state: sizeof(est_isolation_t)", bench.state_bytes("isolation", ISOLATES), "B")
 
 
 def instructions(bench: Bench) -> Iterator[Cost]:

@@ -1,6 +1,6 @@
-"""Which lines and branches of the core the tests go through. `make coverage`.
+"""Which lines and branches of core and isolation the tests go through. `make coverage`.
 
-Runs the tests of the core on a driver built with gcov's counters (without optimisation, asserts off, one copy of every
+Runs their tests on a driver built with gcov's counters (without optimisation, asserts off, one copy of every
 line), and lists what none of them reached. 100 % is demanded of lines and branches.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 __all__ = ["Coverage", "main", "measured"]
 
 ROOT = Path(__file__).parents[2]
-CORE = ROOT / "estimator_c" / "core"
+SOURCES = tuple(ROOT / "estimator_c" / name for name in ("core", "isolation"))
 
 ELSEWHERE = {
     "a.na == b.na": "shapes differ only where a build knows one alone: tests/estimator_c/test_est_builds.py",
@@ -55,7 +55,7 @@ class Coverage:
 
 
 def measured(pytest_arguments: tuple[str, ...] = ()) -> Coverage:
-    """Runs the tests of the core; raises CalledProcessError if one fails."""
+    """Runs the tests of core and isolation; raises CalledProcessError if one fails."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         tests = sorted(str(path) for path in (ROOT / "tests" / "estimator_c").glob("test_est_*.py"))
@@ -80,7 +80,7 @@ def _read(folder: Path) -> Coverage:
     for report in sorted(folder.glob("*.gcov.json.gz")):
         for name, line in _lines(json.loads(gzip.decompress(report.read_bytes()))):
             _merge(merged, name, line)
-    texts = {path.name: path.read_text().splitlines() for path in CORE.iterdir()}
+    texts = {path.name: path.read_text().splitlines() for folder in SOURCES for path in folder.iterdir()}
     for (name, number), line in sorted(merged.items()):
         coverage.add(name, line, texts[name][number - 1])
     return coverage
@@ -89,7 +89,7 @@ def _read(folder: Path) -> Coverage:
 def _lines(report: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     for file in report["files"]:
         path = Path(file["file"])
-        if path.parent.name == "core":
+        if path.parent.name in {folder.name for folder in SOURCES}:
             for line in file["lines"]:
                 yield path.name, line
 

@@ -1,7 +1,8 @@
 /// Uses what a program uses of the estimator, so that the linker keeps that and drops the rest; with -DFOOTPRINT_ALL the
-/// whole of its interface.
+/// whole of its interface, with -DFOOTPRINT_ISOLATES isolation too.
 
 #include "est.h"
+#include "est_isolation.h"
 
 #include <stddef.h>
 
@@ -11,15 +12,26 @@ est_t                 estimator;
 static est_config_t   config;
 static volatile float sink;
 
+#ifdef FOOTPRINT_ISOLATES
+est_isolation_t isolation;
+#endif
+
 OUTSIDE void reset(void) {
     config = est_config_default();
     (void)est_init(&estimator, &config);
-    const est_step_t step = est_step(&estimator, (est_sample_t){ .u = sink, .y = sink, .valid = true });
+    const est_sample_t sample = { .u = sink, .y = sink, .valid = true };
+    const est_step_t   step   = est_step(&estimator, sample);
     sink                  = step.statistic + est_theta(&estimator, 0U);
 #ifdef FOOTPRINT_ALL
     sink = est_variance(&estimator, 0U) + est_noise_variance(&estimator);
     sink = (float)(est_counters(&estimator).alarms + est_theta_count(&estimator));
     sink = est_invariants_hold(&estimator) ? 1.0F : 0.0F;
+#endif
+#ifdef FOOTPRINT_ISOLATES
+    (void)est_isolation_init(&isolation, &config, 0.0F);
+    est_isolation_enter(&isolation, &estimator, sample, step);
+    (void)est_isolation_work(&isolation);
+    sink = est_isolation_diagnosis(&isolation).extent;
 #endif
 }
 

@@ -1,7 +1,8 @@
 /// The estimator as a subject. With -DSUBJECT_LOCKED the generator is on the card's clock; -DSUBJECT_NA=2U, _NB, _NK and
-/// _OFFSET are the orders.
+/// _OFFSET are the orders; with -DSUBJECT_ISOLATES the change is isolated.
 
 #include "est.h"
+#include "est_isolation.h"
 #include "subject.h"
 
 #ifdef SUBJECT_LOCKED
@@ -12,6 +13,10 @@ const bool subject_drifts = true;
 
 static est_t        estimator;
 static est_config_t config;
+
+#ifdef SUBJECT_ISOLATES
+static est_isolation_t isolation;
+#endif
 
 const uint32_t subject_state_bytes = sizeof(est_t);
 
@@ -25,15 +30,34 @@ SUBJECT void subject_begin(void) {
     config.edge_instants = EST_EDGES_LOCKED;
 #endif
     (void)est_init(&estimator, &config);  // a refusal leaves nothing to count, and subject_judge() says so
+#ifdef SUBJECT_ISOLATES
+    (void)est_isolation_init(&isolation, &config, 0.0F);
+#endif
 }
 
 SUBJECT void subject_enter(const float u, const float y, const bool valid) {
-    (void)est_step(&estimator, (est_sample_t){ .u = u, .y = y, .valid = valid });
+    const est_sample_t sample = { .u = u, .y = y, .valid = valid };
+#ifdef SUBJECT_ISOLATES
+    est_isolation_enter(&isolation, &estimator, sample, est_step(&estimator, sample));
+    while (est_isolation_work(&isolation)) {
+    }
+#else
+    (void)est_step(&estimator, sample);
+#endif
+}
+
+/// Of the change, it was the stiffness.
+static bool is_isolated(void) {
+#ifdef SUBJECT_ISOLATES
+    return est_isolation_diagnosis(&isolation).change == EST_CHANGE_STIFFNESS;
+#else
+    return true;
+#endif
 }
 
 /// The change of the plant was seen, a drift was not taken for one, and the gap was a gap.
 SUBJECT uint32_t subject_judge(void) {
     const est_counters_t counters = est_counters(&estimator);
     return (est_invariants_hold(&estimator) ? 0U : 1U) | ((counters.alarms == 1U) ? 0U : 2U) |
-           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U);
+           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U) | (is_isolated() ? 0U : 16U);
 }

@@ -1,7 +1,8 @@
-/// libFuzzer target over the public API of the core: any configuration, any samples; the invariants must hold after every
-/// step, and nothing may be read or written that is not there. `make fuzz` builds and runs it.
+/// libFuzzer target over the public API of core and isolation: any configuration, any samples, any time to work; the
+/// invariants must hold after every step, and nothing may be read or written that is not there. `make fuzz` builds and runs it.
 
 #include "est.h"
+#include "est_isolation.h"
 
 #include <stddef.h>
 #include <stdlib.h>
@@ -89,6 +90,18 @@ static void expect(const bool holds) {
 
 static bool number_is_finite(const float x) { return (x - x) == 0.0F; }
 
+/// Entered, and worked on for so many slices, whether it pays or not.
+static void isolate(est_isolation_t* const isolation, const est_t* const estimator, const est_sample_t sample, const est_step_t step, const uint8_t slices) {
+    est_isolation_enter(isolation, estimator, sample, step);
+    for (uint8_t i = 0U; i < slices; i++) {
+        (void)est_isolation_work(isolation);
+    }
+    const est_diagnosis_t diagnosis = est_isolation_diagnosis(isolation);
+    expect(number_is_finite(diagnosis.extent) && (diagnosis.change <= EST_CHANGE_SEVERAL));
+    expect((diagnosis.onset_low_n <= diagnosis.onset_n) && (diagnosis.onset_n <= diagnosis.onset_high_n));
+    expect(diagnosis.onset_high_n < EST_ISOLATION_KEPT_N);
+}
+
 int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     input_t            input  = { .bytes = data, .n = size };
     const est_config_t config = configuration(&input);
@@ -97,6 +110,9 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
         return 0;
     }
     expect(est_config_valid(&config) && est_invariants_hold(&estimator));
+    est_isolation_t isolation;
+    const bool      isolates = est_isolation_init(&isolation, &config, (float)byte(&input));
+    const uint8_t   slices   = (uint8_t)(byte(&input) % 32U);
     while (input.n > 0U) {
         const uint8_t repeats = (uint8_t)(1U + (byte(&input) % 32U));
         const bool    valid   = (byte(&input) % 16U) != 0U;
@@ -108,6 +124,9 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
             const est_step_t   step   = est_step(&estimator, sample);
             expect(est_invariants_hold(&estimator));
             expect(number_is_finite(step.innovation) && number_is_finite(step.statistic));
+            if (isolates) {
+                isolate(&isolation, &estimator, sample, step, slices);
+            }
         }
     }
     for (uint8_t i = 0U; i < est_theta_count(&estimator); i++) {

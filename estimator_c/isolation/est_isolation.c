@@ -92,7 +92,7 @@ static void from_moments(float* const out, const float sum, const float first, c
 /// What theta says of the plant. The poles of A are exp(-p/2 +- w) with p = B T / M and p^2/4 - w^2 = q = K T^2 / M. The
 /// plant answers 1, t and t^2, as deflections by a force, with 1, t - D, and t^2 - 2 D t + 2 (D^2 - 1/q), where D = B / K
 /// is its lag: the coefficients follow that make the sampled answers the same. False iff it is no plant.
-static bool believe(est_believed_t* const self, const est_config_t* const config) {
+static bool believe(est_believed_t* const self, const est_config_t* const config, const float force_zero) {
     const float a1  = self->theta[0];
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
@@ -116,27 +116,31 @@ static bool believe(est_believed_t* const self, const est_config_t* const config
     self->hold         = sum - ((sum * (lag_n - 0.5F)) + first);
     from_moments(self->spring, sum, drag_n + first, second + (2.0F * ((lag_n * (first + drag_n)) - (sum / q))));
     from_moments(self->damper, 0.0F, -drag_n, -2.0F * lag_n * (first + drag_n));
-    self->rest    = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
-    self->gain    = 0.0F;
+    self->gain = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
         self->gain += self->theta[2U + i] / sum;
     }
+    const float offset = config->offset ? (self->theta[2U + config->nb + config->nc] / sum) : 0.0F;
+    self->rest         = offset + (self->gain * force_zero);
     return true;
 }
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
 static const est_kept_t* kept(const est_isolation_t* const self, const uint32_t ago) {
-    return &self->kept[((uint32_t)self->newest + EST_ISOLATION_KEPT_N - ago) % EST_ISOLATION_KEPT_N];
+    return &self->kept[((self->newest + EST_ISOLATION_KEPT_N) - ago) % EST_ISOLATION_KEPT_N];
 }
 
-static uint8_t one_more(const uint8_t n) { return (uint8_t)((n < UINT8_MAX) ? (n + 1U) : n); }
+static uint8_t one_more(const uint8_t n) { return (n < UINT8_MAX) ? (uint8_t)(n + 1U) : n; }
 
 static void keep(est_isolation_t* const self, const est_sample_t sample, const float innovation) {
     self->newest             = (uint8_t)((self->newest + 1U) % EST_ISOLATION_KEPT_N);
     self->kept[self->newest] = (est_kept_t){ .u = sample.u, .y = sample.y, .innovation = innovation };
     self->known_n            = (uint8_t)((self->known_n < EST_ISOLATION_KEPT_N) ? (self->known_n + 1U) : self->known_n);
 }
+
+/// Measured u, counted from where F = 0.
+static float force(const est_isolation_t* const self, const uint32_t ago) { return kept(self, ago)->u - self->force_zero; }
 
 /// The force on the plant in the past sample, times what it does to y, since an onset `age_n` samples ago. An edge of u may
 /// come anywhere within the interval, as the b's tell: b_0, if nk is 0, is the share of the new level.
@@ -146,12 +150,11 @@ static float pushed(const est_isolation_t* const self, const uint32_t ago, const
     if (age_n == 1U) {
         const float direct = (config->nk == 0U) ? b[0] : 0.0F;
         const float whole  = self->believed.gain * self->believed.hold;
-        return (direct * kept(self, ago)->u) + ((whole - direct) * kept(self, ago + 1U)->u);
+        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));
     }
     float out = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
-        const uint32_t lag = (uint32_t)i + config->nk;
-        out += (lag <= age_n) ? (b[i] * kept(self, ago + lag)->u) : 0.0F;
+        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: est_isolation_init()
     }
     return out;
 }
@@ -217,7 +220,7 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, c
 /// An element of the normal equations once the push is eliminated; i >= j.
 static float element(const est_onset_t* const self, const uint8_t i, const uint8_t j) {
     const float* const push = &self->matrix[6];
-    return self->matrix[((i * (i + 1U)) / 2U) + j] - (push[i] * push[j] / (push[PUSH] + UNKNOWN));
+    return self->matrix[((i * (i + 1U)) / 2U) + j] - ((push[i] * push[j]) / (push[PUSH] + UNKNOWN));
 }
 
 /// Of the pair i > j, whose number is i + j - 1.
@@ -232,7 +235,7 @@ static void judge_pair(est_fit_t* const fit, const est_onset_t* const onset, con
         if (both > fit->pair[pair]) {
             const float ii       = element(onset, i, i) + UNKNOWN;
             fit->pair[pair]      = both;
-            fit->certainty[pair] = (ii > jj) ? (left * jj / ii) : left;
+            fit->certainty[pair] = (ii > jj) ? ((left * jj) / ii) : left;
         }
     }
 }
@@ -346,7 +349,8 @@ static uint8_t before(const uint8_t quiet_n, const uint8_t i, const uint8_t earl
     const uint32_t spacing_n = spacing(quiet_n);
     const uint32_t later_n   = spacing_n * i;
     const uint32_t n         = quiet_n + (spacing_n * (EST_ISOLATION_ONSETS_N / 2U));
-    const uint32_t wanted_n  = (n > (later_n + LATEST_N)) ? (n - later_n) : LATEST_N;
+    const uint32_t latest_n  = later_n + LATEST_N;
+    const uint32_t wanted_n  = ((n > latest_n) ? n : latest_n) - later_n;
     return (uint8_t)((wanted_n < earliest_n) ? wanted_n : earliest_n);
 }
 
@@ -358,7 +362,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     stop(self);
     self->since_n   = 0U;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
-    if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config)) {
+    if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config, self->force_zero)) {
         return;
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
@@ -374,9 +378,9 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     self->residual[1]    = kept(self, self->waiting_n + 1U)->innovation;
 }
 
-bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config) {
+bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
     EST_ASSERT((self != 0) && (config != 0));
-    *self           = (est_isolation_t){ .config = config };
+    *self           = (est_isolation_t){ .config = config, .force_zero = force_zero };
     self->quiet_n   = NEVER;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     return (config->na == 2U) && ((config->nb + config->nk) <= 3U) && (config->trigger.kind == EST_TRIGGER_CUSUM);

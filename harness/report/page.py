@@ -45,6 +45,7 @@ def render(run: Run, verdict: Verdict) -> str:
         outcome=tables.outcome(run, verdict),
         conditions=tables.conditions(run, verdict),
         tweaks=tables.tweaks(verdict),
+        diagnoses=tables.diagnoses(verdict),
         false_alarms=tables.false_alarms(run, verdict),
         estimates=tables.estimates(verdict),
         settings=tables.settings(run),

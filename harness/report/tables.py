@@ -10,7 +10,7 @@ from harness.advice import advice
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
 from harness.summary import lamps_text
-from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
+from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
 
 _MAX_FALSE_ALARMS = 20
 """Rows of their table; the plots mark them all."""
@@ -74,6 +74,19 @@ def tweaks(verdict: Verdict) -> str:
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
     )
     return _table(caption, head, (_tweak_row(tweak) for tweak in verdict.tweaks))
+
+
+def diagnoses(verdict: Verdict) -> str:
+    """What the device said had changed, against the truth."""
+    said = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
+    if not said:
+        return "<p>The device did not say what had changed.</p>"
+    caption = (
+        "What the device said had changed; samples from the change, and the bound is that of telling it from others"
+    )
+    numbers = ("Extent", "Error", "Said after", "Bound", "Onset off by")
+    head = _row([_head("Sample"), _head("Changed"), _head("Named"), *map(_number_head, numbers), _head("Result")])
+    return _table(caption, head, (_diagnosis_row(*each) for each in said))
 
 
 def false_alarms(run: Run, verdict: Verdict) -> str:
@@ -158,6 +171,14 @@ def _tweak_row(tweak: TweakVerdict) -> str:
     word, kind = _result(tweak)
     cells = [_zoom(tweak.sample), _cell(change, "text"), _number(tweak.latency_n), _number(tweak.bound_n)]
     return _row([*cells, _number(ratio, ".2f"), _cell(word, f"text {kind}")])
+
+
+def _diagnosis_row(tweak: TweakVerdict, diagnosis: DiagnosisVerdict) -> str:
+    word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
+    cells = [f'<th scope="row">{tweak.sample}</th>', _cell(tweak.what, "text"), _cell(diagnosis.named, "text")]
+    cells += [_number(diagnosis.extent, ".3f"), _number(diagnosis.extent_error, "+.1%")]
+    cells += [_number(diagnosis.delay_n), _number(diagnosis.bound_n), _number(diagnosis.onset_error_n, "+d")]
+    return _row([*cells, _cell(word, f"text {kind}")])
 
 
 def _result(tweak: TweakVerdict) -> tuple[str, str]:

@@ -129,21 +129,21 @@ void driver_counters(unsigned out[9]) {
 
 int driver_can_isolate(void) {
     static est_isolation_t isolation;
-    return est_isolation_init(&isolation, &config) ? 1 : 0;
+    return est_isolation_init(&isolation, &config, 0.0F) ? 1 : 0;
 }
 
 /* t runs of n samples, each from the start; `slices` calls of est_isolation_work() after each sample. found, (t, 8): the first
    alarm at or after `from`, the sample of the diagnosis (n: none), class, extent then and at the end, onset before the alarm,
    the least and the most. */
 void driver_isolate(size_t t, size_t n, const double* u, const double* y, const unsigned char* valid, const long long* from,
-                    int slices, double* found) {
+                    int slices, double force_zero, double* found) {
     static est_isolation_t isolation;
     for (size_t run = 0; run < t; run++) {
         double* const out = &found[run * 8U];
         out[0] = out[1] = (double)n;
         out[2] = out[3] = 0.0;
         est_init(&self, &config);
-        est_isolation_init(&isolation, &config);
+        est_isolation_init(&isolation, &config, (float)force_zero);
         for (size_t k = 0; k < n; k++) {
             const size_t       at     = (run * n) + k;
             const est_sample_t sample = { .u = (float)u[at], .y = (float)y[at], .valid = valid[at] != 0 };
@@ -166,4 +166,28 @@ void driver_isolate(size_t t, size_t n, const double* u, const double* y, const 
             out[4] = now.extent;
         }
     }
+}
+
+/* What est_isolation makes of n steps that are given, the estimate being theta all the time; `slices` calls of
+   est_isolation_work() after each. worked, (n,): how many of them left more to do. found, (3,): class, extent, samples. */
+void driver_diagnose(size_t n, const double* theta, const double* u, const double* y, const double* statistic,
+                     const unsigned char* status, const unsigned char* alarm, int slices, int* worked, double* found) {
+    static est_isolation_t isolation;
+    est_init(&self, &config);
+    for (uint8_t i = 0; i < est_theta_count(&self); i++) {
+        self.theta[i] = (float)theta[i];
+    }
+    est_isolation_init(&isolation, &config, 0.0F);
+    for (size_t k = 0; k < n; k++) {
+        const est_step_t step = { .status = (est_status_t)status[k], .statistic = (float)statistic[k], .alarm = alarm[k] != 0 };
+        est_isolation_enter(&isolation, &self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true }, step);
+        worked[k] = 0;
+        for (int i = 0; i < slices; i++) {
+            worked[k] += est_isolation_work(&isolation) ? 1 : 0;
+        }
+    }
+    const est_diagnosis_t now = est_isolation_diagnosis(&isolation);
+    found[0] = (double)now.change;
+    found[1] = now.extent;
+    found[2] = now.samples_n;
 }

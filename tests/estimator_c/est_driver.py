@@ -91,6 +91,23 @@ class Isolated:
     most_n: NDArray[np.float64]
 
 
+ONSETS_N = 7
+"""As EST_ISOLATION_ONSETS_N in est_isolation.h: the slices of work that a sample takes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosed:
+    """What est_isolation made of n steps that were given to it."""
+
+    left: NDArray[np.intc]
+    """(n,) after how many of the slices of work after this step there was more to do."""
+    change: str
+    """One of CHANGES, at the end; and the following likewise."""
+    extent: float
+    samples_n: int
+    """Samples after the alarm that it rests on."""
+
+
 class Estimator:
     """One estimator at a time, as in the driver."""
 
@@ -156,17 +173,38 @@ class Estimator:
         start: NDArray[np.int64],
         valid: ArrayLike | None = None,
         slices: int = 1000,
+        force_zero: float = 0.0,
     ) -> Isolated:
-        """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,)."""
+        """Whole runs (t, n), each from the start: the diagnosis of the first alarm at or after ``start`` (t,).
+
+        :param force_zero: u where the force is zero.
+        """
         runs, samples = u.shape
         found = np.zeros((runs, 8))
         valid_ = np.ascontiguousarray(np.ones((runs, samples)) if valid is None else valid, dtype=np.uint8)
         inputs = (np.ascontiguousarray(u), np.ascontiguousarray(y), valid_, np.ascontiguousarray(start, np.int64))
         pointers = [ctypes.c_void_p(a.ctypes.data) for a in inputs]
         counts = (ctypes.c_size_t(runs), ctypes.c_size_t(samples))
-        self._c.driver_isolate(*counts, *pointers, slices, ctypes.c_void_p(found.ctypes.data))
+        self._c.driver_isolate(
+            *counts, *pointers, slices, ctypes.c_double(force_zero), ctypes.c_void_p(found.ctypes.data)
+        )
         alarm, at, change, extent, refined, onset, least, most = found.T
         return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
+
+    def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = ONSETS_N) -> Diagnosed:
+        """What est_isolation makes of steps (n, 3) that are given: statistic, status, alarm; theta stays as it is.
+
+        The force is a square wave, which the plant does not answer.
+        """
+        n = len(steps)
+        u = 1000.0 * (np.arange(n) // 25 % 2)
+        numbers = [np.ascontiguousarray(x, np.float64) for x in (theta, u, np.zeros(n), steps[:, 0])]
+        flags = [np.ascontiguousarray(steps[:, i], np.uint8) for i in (1, 2)]
+        worked, found = np.zeros(n, np.intc), np.zeros(3)
+        inputs = [ctypes.c_void_p(x.ctypes.data) for x in numbers] + [ctypes.c_void_p(x.ctypes.data) for x in flags]
+        ends = (ctypes.c_void_p(worked.ctypes.data), ctypes.c_void_p(found.ctypes.data))
+        self._c.driver_diagnose(ctypes.c_size_t(n), *inputs, slices, *ends)
+        return Diagnosed(worked, CHANGES[int(found[0])], float(found[1]), int(found[2]))
 
 
 def compile_driver(folder: Path, *options: str) -> Path:

@@ -28,6 +28,7 @@ def test_the_run_is_long_enough_and_holds_what_may_happen(expected: str) -> None
     assert counts["steps"] >= 100_000
     assert counts["nan"] == counts["violations"] == 0
     assert min(counts[name] for name in ("alarms", "slips", "refused", "missing", "refreshes")) > 0
+    assert counts["diagnoses"] >= 24
 
 
 def test_a_fused_multiplication_would_be_noticed(expected: str) -> None:

@@ -11,7 +11,7 @@ from types import ModuleType
 import cantools
 import pytest
 
-from harness.catalogue import CATALOGUE_HASH, Hello, Identify, Key, Trigger, pack, unpack
+from harness.catalogue import CATALOGUE_HASH, Change, Hello, Identify, Key, Trigger, pack, unpack
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 DBC = ESTIMATOR / "catalogue" / "analogrig.dbc"
@@ -101,9 +101,9 @@ def test_catalogue_that_breaks_a_rule_is_refused(generate: ModuleType, old: str,
         generate.check(changed(DBC.read_text(), old, new))
 
 
-def declarations(struct: str) -> set[str]:
-    """The names of the fields of a struct of est.h."""
-    header = (ESTIMATOR / "core" / "est.h").read_text()
+def declarations(struct: str, path: str = "core/est.h") -> set[str]:
+    """The names of the fields of a struct of a header."""
+    header = (ESTIMATOR / path).read_text()
     body = re.search(r"typedef struct \{([^{}]*)\} " + struct + ";", header)
     assert body is not None
     return set(re.findall(r"^\s+\w+\s+(\w+)(?:\[\w+\])?;", body[1], flags=re.MULTILINE))
@@ -111,14 +111,22 @@ def declarations(struct: str) -> set[str]:
 
 def test_every_field_of_the_configuration_has_a_key() -> None:
     fields = declarations("est_config_t") | declarations("est_trigger_config_t")
+    fields |= declarations("settings_t", "device/settings.h")
     keys = {key.name.lower() for key in Key}
     named_otherwise = {
         "c": {f"c{i}" for i in range(1, 9)},
         "kind": {"trigger"},
         "trigger": set[str](),
+        "estimator": set[str](),
         "custom": set[str](),
     }
     assert keys == set().union(*(named_otherwise.get(name, {name}) for name in fields))
+
+
+def test_changes_have_the_numbers_of_isolation() -> None:
+    header = (ESTIMATOR / "isolation" / "est_isolation.h").read_text()
+    numbers = dict(re.findall(r"EST_CHANGE_(\w+) += (\d+)", header))
+    assert {change.name: change.value for change in Change} == {name: int(n) for name, n in numbers.items()}
 
 
 def test_triggers_have_the_numbers_of_the_core() -> None:

@@ -21,12 +21,14 @@ from harness.catalogue import (
     RUN_SHIFT,
     RUNS,
     Alarm,
+    Change,
     Command,
     Configure,
     Configured,
     Control,
     Controlled,
     Counter,
+    Diagnosis,
     Element,
     Estimate,
     Firmware,
@@ -46,7 +48,10 @@ from harness.catalogue import (
 )
 from harness.link import FramedLink
 from harness.wire import LIBRARY, MemoryWire
+from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import Estimator
+from tests.estimator_c.performance import FULL
+from tests.estimator_c.plants import FRONT, simulate
 
 M = TypeVar("M", bound=Message)
 
@@ -198,6 +203,95 @@ def test_alarm_comes_before_the_rest_of_its_sample(device: Device) -> None:
         assert (alarm.sample_index, alarm.statistic) == (stepped.sample_index, stepped.statistic)
 
 
+# ---- diagnoses
+
+CHANGED_AT = 600
+
+
+def changed_codes(change: isolation.Change, zero: int = 0) -> tuple[list[int], list[int]]:
+    """Codes of force, whose zero is at ``zero``, and displacement: the front suspension changes at CHANGED_AT."""
+    plants = FRONT, isolation.changed(FRONT, change)
+    played = simulate(plants, np.array([CHANGED_AT]), FULL, CHANGED_AT + 120, seed=4)
+    u, y = np.clip(played.u[0], 0, None) + zero, np.clip(played.y[0], 0, None)
+    return u.astype(int).tolist(), y.astype(int).tolist()
+
+
+def diagnosed(device: Device, u: list[int], y: list[int], first: int = 0) -> list[tuple[int, Diagnosis]]:
+    """Each diagnosis with the sample to which it was an answer."""
+    out = []
+    for k, (force, displacement) in enumerate(zip(u, y, strict=True)):
+        answers = device.sample((first + k) % 65536, force, displacement)
+        out += [(k, message) for message in of(Diagnosis, answers)]
+        assert isinstance(answers[-1], Stepped)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "named", "extent"),
+    [
+        ({"M": 0.8}, Change.MASS, 0.8),
+        ({"B": 1.2}, Change.DAMPING, 1.2),
+        ({"K": 0.8}, Change.STIFFNESS, 0.8),
+        ({"B": 0.7, "K": 1.3}, Change.SEVERAL, 1.0),
+    ],
+    ids=str,
+)
+def test_change_is_diagnosed_once(device: Device, change: isolation.Change, named: Change, extent: float) -> None:
+    ((at, said),) = diagnosed(device, *changed_codes(change))
+    assert CHANGED_AT < at < CHANGED_AT + 80
+    assert said.change == named
+    assert said.extent == pytest.approx(extent, rel=0.03)
+    assert abs(said.onset_index - CHANGED_AT) <= 8
+
+
+def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    first = 65536 - CHANGED_AT - 2
+    for k in range(30_000, first, 30_000):
+        device.sample(k, 0, 0)
+    ((_, said),) = diagnosed(device, u, y, first=first)
+    assert min(said.onset_index, 65536 - said.onset_index) <= 10
+
+
+def test_zero_of_the_force_is_taken_from_the_configuration(idle: Device) -> None:
+    idle.configure(Key.FORCE_ZERO, 1000.0)
+    idle.control(Command.START)
+    ((_, said),) = diagnosed(idle, *changed_codes({"M": 0.8}, zero=1000))
+    assert said.change == Change.MASS
+    assert said.extent == pytest.approx(0.8, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{Key.ISOLATION: 0.0}, {Key.TRIGGER: float(Trigger.PREDICTION_ERROR), Key.CEILING: 12.0}],
+    ids=["switched off", "no cumulative sum"],
+)
+def test_nothing_is_diagnosed_where_it_is_off_or_cannot_be(idle: Device, settings: dict[Key, float]) -> None:
+    for key, value in settings.items():
+        assert idle.configure(key, value).result == Result.APPLIED
+    assert idle.control(Command.START) == Result.APPLIED
+    assert diagnosed(idle, *changed_codes({"K": 0.8})) == []
+
+
+def test_skipped_sample_after_the_alarm_leaves_it_undiagnosed(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    answers = [message for k in range(len(u)) if k != CHANGED_AT + 8 for message in device.sample(k, u[k], y[k])]
+    assert of(Alarm, answers)[0].sample_index < CHANGED_AT + 8
+    assert of(Diagnosis, answers) == []
+
+
+def test_diagnosis_leaves_the_estimates_alone(idle: Device, device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    idle.configure(Key.ISOLATION, 0.0)
+    idle.control(Command.START)
+    with_it, without = ([m for k in range(len(u)) for m in each.sample(k, u[k], y[k])] for each in (device, idle))
+    assert of(Diagnosis, with_it)
+    assert np.array_equal(theta_of(with_it), theta_of(without))
+
+
+# ---- blocks
+
+
 def blocks(u: list[int], y: list[int], missing: list[bool], size: int) -> Iterator[SampleBlock]:
     for first in range(0, len(u), size):
         chosen = range(first, min(first + size, len(u)))
@@ -346,6 +440,8 @@ VALUES = {
     Key.WARM_UP_N: 50.0,
     Key.ABSOLUTE: 1.0,
     Key.RESET: 1.0,
+    Key.ISOLATION: 0.0,
+    Key.FORCE_ZERO: 341.25,
     Key.C1: -0.5,
     Key.C2: 0.25,
 }
@@ -405,6 +501,8 @@ def test_configuration_is_what_the_run_uses(idle: Device, estimator: Estimator) 
         (Key.RESET, 0.25),
         (Key.HOLD_OFF_N, 65536.0),
         (Key.C1, math.inf),
+        (Key.ISOLATION, 2.0),
+        (Key.FORCE_ZERO, 1.1e6),
     ],
 )
 def test_value_out_of_range_changes_nothing(idle: Device, key: Key, value: float) -> None:
@@ -559,5 +657,5 @@ def test_answers_do_not_depend_on_pieces_and_room() -> None:
     rng = random.Random(11)
     whole = answers_in_pieces(stream, rng, 65536)
     assert len(frame.FrameDecoder().feed(whole)) == 2 + 1 + 60 * 8 + len(Counter)
-    for room in (144, 145, 160, 1000):  # 144: DEVICE_ANSWER_MAX of this build
+    for room in (160, 161, 176, 1000):  # 160: DEVICE_ANSWER_MAX of this build
         assert answers_in_pieces(stream, rng, room) == whole

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tests.estimator_c.est_driver import Estimator
 
@@ -44,14 +44,23 @@ CONFIGURATIONS = st.fixed_dictionaries(
 
 
 def signal(kind: str, scale: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    if kind == "noise":
-        return np.asarray(rng.normal(size=N) * scale)
-    if kind == "square":
-        return np.where(np.arange(N) // 7 % 2, scale, -scale)
-    return np.full(N, {"zero": 0.0, "constant": scale, "denormal": 1e-42}[kind])
+    k = np.arange(N)
+    signs = rng.choice([-1.0, 1.0], N)
+    signals: dict[str, ArrayLike] = {
+        "noise": rng.normal(size=N) * scale,
+        "square": np.where(k // 7 % 2, scale, -scale),
+        "alternating": np.where(k % 2, scale, -scale),
+        "growing": np.geomspace(1e-6, 0.99e6, N) * (-1.0) ** (k // 5),
+        "logarithmic": signs * 10.0 ** rng.uniform(-6.0, 6.0, N),
+        "impulses": np.where(rng.random(N) < 0.02, 0.99e6 * signs, scale),
+        "zero": np.zeros(N),
+        "constant": np.full(N, scale),
+        "denormal": np.full(N, 1e-42),
+    }
+    return np.asarray(signals[kind])
 
 
-KINDS = st.sampled_from(["noise", "square", "zero", "constant", "denormal"])
+KINDS = st.sampled_from("noise square alternating growing logarithmic impulses zero constant denormal".split())
 
 
 @settings(

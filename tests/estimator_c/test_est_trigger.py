@@ -184,6 +184,32 @@ def test_gap_while_edges_are_in_doubt_raises_no_alarm(estimator: Estimator, slip
         assert result.counters["slips"] == 1
 
 
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+def test_gap_ends_the_doubt_in_favour_of_the_reading_that_explains_most(estimator: Estimator, slip: int) -> None:
+    """The edge that crosses has raised the statistic, not yet to its ceiling, when the gap comes."""
+    edges = np.arange(10.0, 1800.0, 50.0)
+    edges = edges + (edges - 900.0) * 20e-6 * slip
+    valid = np.ones(1800)
+    valid[914] = 0
+    u, y = suspension([(0, FRONT)], edges, 1800, 1.0, 1)
+    assert estimator.init(ceiling=1e6)
+    result = estimator.run(u, y, valid)
+    assert result.statistic[913] > 1000.0
+    assert result.statistic[915] < 1.0
+    assert result.counters["slips"] == 0
+
+
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+def test_edges_in_the_midst_of_a_doubt_join_it(estimator: Estimator, slip: int) -> None:
+    edges = np.arange(10.0, 1200.0, 10.0)
+    edges = edges + (edges - 900.0) * 20e-6 * slip
+    u, y = suspension([(0, FRONT)], edges, 1200, 1.0, 1)
+    assert estimator.init()
+    result = estimator.run(u, y)
+    assert len(result.alarms) == 0
+    assert result.counters["slips"] == 1
+
+
 @pytest.mark.parametrize("plant", [FRONT, (30.0, 2123.0, 20000.0)], ids=["front", "light"])
 @pytest.mark.parametrize("drift_ppm", [20.0, -20.0])
 def test_long_free_running_stretch_stays_quiet(estimator: Estimator, plant: Plant, drift_ppm: float) -> None:

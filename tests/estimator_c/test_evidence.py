@@ -1,4 +1,4 @@
-"""What static checkers say of the core: nothing but the deviations from MISRA C:2012 that MISRA.md explains."""
+"""What static checkers say of core and isolation: the deviations from MISRA C:2012 in MISRA.md, and no others."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import pytest
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 CORE = ESTIMATOR / "core"
-SOURCES = sorted(CORE.glob("*.c"))
+SOURCES = sorted(path for part in ("core", "isolation") for path in (ESTIMATOR / part).glob("*.c"))
+INCLUDE = f"-I{CORE}"
 
 BUILDS = [("-DEST_NC_MAX=0U",), ("-DEST_NC_MAX=2U",)]
 BUILD_IDS = ["usual", "extended least squares"]
@@ -28,9 +29,24 @@ def require(tool: str, package: str) -> None:
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
 def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_path: Path) -> None:
     require("gcc", "gcc")
-    command = ["gcc", "-std=c99", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", *options, "-c", str(source)]
+    command = ["gcc", "-std=c99", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", *options, INCLUDE]
+    command += ["-c", str(source)]
     done = subprocess.run([*command, "-o", str(tmp_path / "o")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("part", ["core", "isolation", "device"])
+def test_clang_tidy_finds_nothing(part: str) -> None:
+    """The checks are those of estimator_c/.clang-tidy."""
+    require("clang-tidy", "clang-tidy")
+    generated = ESTIMATOR.parent / "build" / "generated"
+    folders = [ESTIMATOR / name for name in ("core", "isolation", "device")]
+    options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, generated))]
+    sources = map(str, sorted((ESTIMATOR / part).glob("*.c")))
+    done = subprocess.run(
+        ["clang-tidy", "--quiet", *sources, "--", *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
 
 
 def deviations(text: str) -> set[str]:
@@ -41,7 +57,8 @@ def deviations(text: str) -> set[str]:
 def test_cppcheck_with_misra_finds_the_explained_deviations_and_no_others(tmp_path: Path) -> None:
     require("cppcheck", "cppcheck")
     command = ["cppcheck", "--quiet", "--addon=misra", "--enable=warning,style,performance,portability", "--std=c99"]
-    command += ["--template={id} {file}:{line} {message}", "-DEST_NC_MAX=2U", f"--cppcheck-build-dir={tmp_path}"]
+    command += ["--template={id} {file}:{line} {message}", "-DEST_NC_MAX=2U", INCLUDE]
+    command += [f"--cppcheck-build-dir={tmp_path}"]
     command += [f"--suppress={each}" for each in explained_findings()]
     done = subprocess.run([*command, *map(str, SOURCES)], capture_output=True, text=True, check=False, env=os.environ)
     assert done.returncode == 0, done.stdout + done.stderr

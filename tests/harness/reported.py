@@ -16,7 +16,7 @@ from scipy import signal
 
 from harness.plant import Plant
 from harness.run import Run
-from harness.verdict import SegmentEstimate, TweakVerdict, Verdict
+from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
 from tests.harness.runs import M_PER_CODE, N_PER_CODE, made_run
 
 SAMPLES = 1800
@@ -28,6 +28,9 @@ PLANTS = (
 )
 NOTICED, FALSE_ALARM = 1203, 700
 CLIPPED = slice(300, 320)
+
+
+SAID = DiagnosisVerdict("K", right=True, delay_n=17, bound_n=9, onset_error_n=-1, extent=0.75, extent_error=0.0208)
 
 
 def reported_run() -> Run:
@@ -51,7 +54,13 @@ def reported_verdict(run: Run) -> Verdict:
         outcome="failed",
         reasons=("missed 1 of 2 changes",),
         tweaks=(
-            TweakVerdict(1200, "K", {"K": 24500.0}, {"K": 18000.0}, latency_n=3, bound_n=2, deadline_n=20),
+            TweakVerdict(
+                *(1200, "K", {"K": 24500.0}, {"K": 18000.0}),
+                latency_n=3,
+                bound_n=2,
+                deadline_n=20,
+                diagnosis=SAID,
+            ),
             TweakVerdict(1500, "M", {"M": 115.0}, {"M": 30.0}, latency_n=None, bound_n=4, deadline_n=20),
         ),
         false_alarms=(FALSE_ALARM,),
@@ -110,9 +119,8 @@ class Page(HTMLParser):
             self.rows[-1][-1] += data
 
     def row(self, name: str) -> list[str]:
-        """The cells of the one row of all tables that begins with ``name``."""
-        (row,) = [row for row in self.rows if row[0] == name]
-        return row
+        """The cells of the first row of all tables that begins with ``name``."""
+        return next(row for row in self.rows if row[0] == name)
 
     def value(self, name: str) -> str:
         """What stands beside ``name`` in a table of two columns."""

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.catalogue import Change
 from harness.plant import Plant
 from harness.run import CHANNELS, Channel, Conditions, Run, Segment
 
@@ -22,13 +23,17 @@ def made_run(
     noise_lsb: float = 1.0,
     clipped: NDArray[np.bool_] | None = None,
     alarms: Sequence[int] = (),
+    diagnoses: Sequence[tuple[int, Change, int, float]] = (),
     expect: Mapping[str, float] | None = None,
     faults: tuple[str, ...] = (),
     samples_asked: int | None = None,
     theta: NDArray[np.floating] | None = None,
     estimator: Mapping[str, object] | None = None,
 ) -> Run:
-    """A run of the given force; ``clipped`` is the displacement's. Without ``theta`` all estimates are zero."""
+    """A run of the given force; ``clipped`` is the displacement's. Without ``theta`` all estimates are zero.
+
+    :param diagnoses: of each the sample after which it was said, what, the onset and the extent.
+    """
     n = len(force_n)
     channels = {
         "force": Channel(0.0, 10.0 / 4096, "N", 294.0, noise_lsb),
@@ -66,6 +71,10 @@ def made_run(
         alarm_index=np.array(alarms, np.int64),
         alarm_kind=np.full(count, 3, np.uint8),
         alarm_statistic=np.full(count, 12.0, np.float32),
+        diagnosis_index=np.array([said[0] for said in diagnoses], np.int64),
+        diagnosis_change=np.array([said[1] for said in diagnoses], np.uint8),
+        diagnosis_onset=np.array([said[2] for said in diagnoses], np.int64),
+        diagnosis_extent=np.array([said[3] for said in diagnoses], np.float32),
     )
 
 

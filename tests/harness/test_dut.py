@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from harness.catalogue import (
     CATALOGUE_HASH,
     Alarm,
+    Change,
     Configured,
     Controlled,
+    Diagnosis,
     Estimate,
     Firmware,
     Hello,
@@ -86,7 +88,7 @@ def reference() -> Replies:
 def assert_same(one: Replies, other: Replies) -> None:
     for name in ("theta", "innovation", "statistic", "flags"):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
-    assert one.alarms == other.alarms
+    assert (one.alarms, one.diagnoses) == (other.alarms, other.diagnoses)
 
 
 # ---- replies
@@ -107,6 +109,13 @@ def test_alarm_tells_its_sample(reference: Replies) -> None:
     (alarm,) = reference.alarms
     assert CHANGE_AT <= alarm.index < CHANGE_AT + 20
     assert alarm.statistic == reference.statistic[alarm.index] > 11.5
+
+
+def test_diagnosis_tells_its_sample_and_the_onset(reference: Replies) -> None:
+    """Another gain with the same poles is a change of M, B and K alike."""
+    ((alarm,), (said,)) = reference.alarms, reference.diagnoses
+    assert alarm.index < said.index < N
+    assert (said.change, said.onset, said.extent) == (Change.SEVERAL, alarm.index, 1.0)
 
 
 @pytest.mark.parametrize("kind", ["host", "inproc"])
@@ -143,6 +152,7 @@ def test_alarms_beyond_sample_65535_are_counted_on() -> None:
     assert [alarm.index - rest for alarm in replies.alarms if alarm.index - rest >= CHANGE_AT] != []
     assert all(rest <= alarm.index < rest + N for alarm in replies.alarms)
     assert replies.alarms[-1].index > 65536
+    assert [said.onset for said in replies.diagnoses] == [replies.alarms[-1].index]
 
 
 def test_skipped_indices_are_lost_samples_to_the_device() -> None:
@@ -509,6 +519,13 @@ def test_answer_that_was_not_due_is_told(line: FaultyLink) -> None:
     dut = started(line)
     line.from_device = about(Estimate, 81, lambda message: [Stepped(message.seq, 0, 81, 0.0)])
     with pytest.raises(DeviceError, match=r"^device bob: Estimate of THETA_0 for sample 81 was due, Stepped\(.*came$"):
+        feed(dut, 0, N)
+
+
+def test_diagnosis_of_nothing_is_told(line: FaultyLink) -> None:
+    dut = started(line)
+    line.from_device = about(Stepped, 81, lambda message: [Diagnosis(message.seq, Change.UNDECIDED, 80, 1.0)])
+    with pytest.raises(DeviceError, match=r"^device bob: Stepped for sample 81 was due, Diagnosis\(.*came$"):
         feed(dut, 0, N)
 
 

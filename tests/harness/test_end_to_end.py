@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -73,6 +74,16 @@ def test_run_finds_every_tweak_of_the_thesis(thesis: tuple[Path, dict[str, Any]]
     assert out["counters"]["alarms"] == 4
 
 
+def test_stiffness_and_damping_of_the_thesis_are_named_and_their_extent_told(
+    thesis: tuple[Path, dict[str, Any]],
+) -> None:
+    """The other two changes come within 100 samples of an alarm: nothing is said of them."""
+    _, out = thesis
+    said = [tweak["diagnosis"] for tweak in out["tweaks"]]
+    assert [each and (each["named"], each["right"]) for each in said] == [("K", True), ("B", True), None, None]
+    assert all(abs(each["extent_error"]) < 0.02 and each["delay_n"] < 60 for each in said if each)
+
+
 def test_estimates_are_the_plants_within_two_percent(thesis: tuple[Path, dict[str, Any]]) -> None:
     for segment in thesis[1]["estimates"]:
         assert segment["estimate"] == pytest.approx(segment["truth"], rel=0.02)
@@ -102,6 +113,7 @@ def test_table_names_outcome_latencies_and_report(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "PASSED" in done.stdout
     assert "K 24500 -> 18000 N/m" in done.stdout
+    assert re.search(r"^ +1200  K +yes +0\.7\d\d", done.stdout, re.MULTILINE)
     assert "build/run/report.html" in done.stdout
     assert done.stderr == ""
 

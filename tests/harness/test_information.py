@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
 from scipy.signal import cont2discrete
 
 from harness import information
@@ -85,3 +87,48 @@ def test_first_reaching_counts_from_one() -> None:
     assert information.first_reaching([0.0, 5.0, 5.0, 12.0], 5.0) == 2
     assert information.first_reaching([6.0], 5.0) == 1
     assert information.first_reaching([], 5.0) is None
+
+
+@pytest.mark.parametrize(
+    "after", [SOFT, Plant(92.0, 3021.0, 24500.0), Plant(115.0, 2400.0, 24500.0), Plant(115.0, 2400.0, 20000.0)], ids=str
+)
+def test_isolation_bound_is_where_the_best_rival_falls_behind_by_ln_20(after: Plant) -> None:
+    """Against scipy: the plants by expm, the best magnitude of each rival by a search of its own."""
+    force = np.where(np.arange(700) // 50 % 2, 2900.0, 0.0)
+    run = made_run(force_n=force, plants=[(0, FRONT), (420, after)])
+    (bound_n,) = information.isolation_bounds(run)
+    assert bound_n is not None
+    force_n = run.channel("force")
+    lsb_m = run.conditions.channels["displacement"].lsb
+
+    def course(plant: Plant, state: NDArray[np.float64], forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
+        step = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)[:2]
+        out = [state]
+        for each in forces:
+            out.append(step @ [*out[-1], each])
+        return np.array(out[1:])
+
+    state = course(FRONT, np.zeros(2), force_n[:420])[-1]
+    truth = course(after, state, force_n[420 : 420 + bound_n])[:, 0]
+
+    def divergence(factor: float, name: str, samples: int) -> float:
+        rival = course(FRONT.scaled(name, factor), state, force_n[420 : 420 + samples])[:, 0]
+        return float(np.sum(((rival - truth[:samples]) / lsb_m) ** 2) / (2.0 * (1.0 + 1.0 / 12.0)))
+
+    def least(samples: int) -> float:
+        rivals = [name for name in "MBK" if (name,) != tuple(FRONT.changes_to(after))]
+        searches = (
+            minimize_scalar(divergence, bounds=bounds, args=(name, samples), method="bounded", options={"xatol": 1e-6})
+            for name in rivals
+            for bounds in ((0.25, 1.0), (1.0, 4.0))
+        )
+        return min(float(search.fun) for search in searches)
+
+    assert least(bound_n) >= math.log(20.0) * 0.98
+    assert least(bound_n - 1) < math.log(20.0) * 1.02
+
+
+def test_change_of_an_unloaded_suspension_cannot_be_told_from_others() -> None:
+    run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
+    assert information.isolation_bounds(run) == [None]

@@ -16,6 +16,7 @@ from tests.harness.reported import (
     FALSE_ALARM,
     NOTICED,
     PLANTS,
+    SAID,
     SAMPLES,
     Page,
     empty_run,
@@ -109,6 +110,20 @@ def test_late_alarm_is_marked(run: Run) -> None:
     verdict = reported_verdict(run)
     late = replace(verdict.tweaks[0], latency_n=21)
     assert "LATE" in Page(render(run, replace(verdict, tweaks=(late,)))).row("1200")[-1]
+
+
+def test_diagnosis_is_listed_against_the_truth(run: Run, read: Page) -> None:
+    assert ["1200", "K", "K", "0.750", "+2.1%", "17", "9", "-1", "✓ right"] in read.rows
+    several = replace(SAID, named="several", right=False, extent=None, extent_error=None)
+    wrong = replace(reported_verdict(run).tweaks[0], diagnosis=several)
+    again = Page(render(run, replace(reported_verdict(run), tweaks=(wrong,))))
+    assert ["1200", "K", "several", "–", "–", "17", "9", "-1", "✗ WRONG"] in again.rows
+
+
+def test_device_that_names_no_change_is_said_to(run: Run) -> None:
+    silent = tuple(replace(tweak, diagnosis=None) for tweak in reported_verdict(run).tweaks)
+    read = Page(render(run, replace(reported_verdict(run), tweaks=silent)))
+    assert "The device did not say what had changed." in read.text
 
 
 def test_false_alarms_are_listed(read: Page) -> None:

@@ -8,18 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from harness.catalogue import Change
 from harness.errors import RecordingError
 from harness.plant import Plant
 from harness.run import Run
 from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)
+SAID = [(30, Change.STIFFNESS, 11, 0.75), (320, Change.SEVERAL, 300, 1.0)]
+DIAGNOSIS = ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")
 
 
 @pytest.fixture
 def run() -> Run:
     rng = np.random.default_rng(4)
-    return made_run(rng.uniform(0.0, 2900.0, 500), [(0, FRONT)], alarms=[17, 300], theta=rng.normal(size=(500, 6)))
+    return made_run(
+        rng.uniform(0.0, 2900.0, 500), [(0, FRONT)], alarms=[17, 300], diagnoses=SAID, theta=rng.normal(size=(500, 6))
+    )
 
 
 def test_saved_run_is_loaded_bit_for_bit(run: Run, tmp_path: Path) -> None:
@@ -27,7 +32,7 @@ def test_saved_run_is_loaded_bit_for_bit(run: Run, tmp_path: Path) -> None:
     again = Run.load(tmp_path / "deep" / "run.npz")
     assert again.conditions == run.conditions
     arrays = ("codes", "clipped", "theta", "innovation", "statistic", "flags")
-    for name in (*arrays, "alarm_index", "alarm_kind", "alarm_statistic"):
+    for name in (*arrays, "alarm_index", "alarm_kind", "alarm_statistic", *DIAGNOSIS):
         assert getattr(again, name).tobytes() == getattr(run, name).tobytes(), name
     assert again.theta_hash() == run.theta_hash()
 
@@ -106,11 +111,37 @@ def test_damaged_header_is_one_line(run: Run, tmp_path: Path, place: tuple[str |
 
 
 def test_arrays_that_do_not_fit_together_are_refused(run: Run, tmp_path: Path) -> None:
-    for name in ("theta", "flags", "alarm_kind"):
+    for name in ("theta", "flags", "alarm_kind", *DIAGNOSIS):
         run.save(tmp_path / "run.npz")
         rewritten(tmp_path / "run.npz", None, **{name: getattr(run, name)[:-1]})
         with pytest.raises(RecordingError, match="do not fit together"):
             Run.load(tmp_path / "run.npz")
+
+
+def test_recording_from_before_diagnoses_has_none(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    run.save(path)
+    with np.load(path) as file:
+        members = {name: file[name] for name in file.files if name not in DIAGNOSIS}
+    np.savez(path, allow_pickle=False, **members)
+    again = Run.load(path)
+    assert again.theta_hash() == run.theta_hash()
+    assert [len(getattr(again, name)) for name in DIAGNOSIS] == [0] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("diagnosis_index", np.array([30, 500])),
+        ("diagnosis_change", np.array([3, 9], np.uint8)),
+        ("diagnosis_change", np.array([3, Change.UNDECIDED], np.uint8)),
+    ],
+)
+def test_diagnosis_that_cannot_be_is_refused(run: Run, tmp_path: Path, name: str, values: np.ndarray) -> None:
+    run.save(tmp_path / "run.npz")
+    rewritten(tmp_path / "run.npz", None, **{name: values})
+    with pytest.raises(RecordingError, match="its diagnoses do not fit together"):
+        Run.load(tmp_path / "run.npz")
 
 
 def test_archive_that_would_swell_is_refused(run: Run, tmp_path: Path) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
+from harness.catalogue import Change
 from harness.plant import Plant
 from harness.run import LOST
-from harness.verdict import as_json, judge
+from harness.verdict import DiagnosisVerdict, as_json, judge
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)
@@ -138,3 +140,59 @@ def test_json_carries_what_the_documentation_promises() -> None:
     promised = {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}
     assert out["tweaks"][0].items() >= promised.items()
     assert {"outcome", "valid", "false_alarms", "estimates", "theta_hash", "arl0"} <= out.keys()
+
+
+# ---- diagnoses
+
+
+def told(
+    *diagnoses: tuple[int, Change, int, float], after: Plant = SOFT, alarms: Sequence[int] = (404,)
+) -> DiagnosisVerdict | None:
+    """What the verdict makes of them where the plant changes at sample 400 of an excited run."""
+    force = np.where(np.arange(800) // 50 % 2, 2900.0, 0.0)
+    verdict = judge(made_run(force, [(0, FRONT), (400, after)], alarms=alarms, diagnoses=diagnoses))
+    return verdict.tweaks[0].diagnosis
+
+
+def test_right_diagnosis_has_delay_extent_and_onset_against_the_truth() -> None:
+    said = told((420, Change.STIFFNESS, 398, 0.75))
+    assert said is not None
+    assert (said.named, said.right, said.delay_n, said.onset_error_n, said.extent) == ("K", True, 20, -2, 0.75)
+    assert said.extent_error == pytest.approx(0.75 / (18000.0 / 24500.0) - 1.0)
+    assert said.bound_n is not None
+    assert 2 < said.bound_n < 40
+
+
+def test_wrong_diagnosis_has_no_error_of_its_extent() -> None:
+    said = told((420, Change.MASS, 398, 1.3))
+    assert said is not None
+    assert (said.named, said.right, said.extent_error) == ("M", False, None)
+    assert said.extent == pytest.approx(1.3)
+
+
+def test_several_is_right_if_more_than_one_has_changed() -> None:
+    said = told((420, Change.SEVERAL, 404, 1.0), after=Plant(115.0, 2000.0, 18000.0))
+    assert said is not None
+    assert (said.named, said.right, said.extent, said.extent_error) == ("several", True, None, None)
+    said = told((420, Change.SEVERAL, 404, 1.0))
+    assert said is not None
+    assert (said.named, said.right) == ("several", False)
+
+
+def test_diagnosis_before_the_alarm_or_of_no_noticed_change_is_of_something_else() -> None:
+    assert told((403, Change.STIFFNESS, 395, 0.75)) is None
+    assert told((420, Change.STIFFNESS, 395, 0.75), alarms=()) is None
+    assert told() is None
+
+
+def test_wrong_diagnosis_does_not_fail_a_run() -> None:
+    run = made_run(LOADED, CHANGE, alarms=[404], diagnoses=[(420, Change.MASS, 398, 1.3)])
+    assert judge(run).outcome == "passed"
+
+
+def test_json_has_the_diagnosis_of_each_change() -> None:
+    run = made_run(LOADED, CHANGE, alarms=[404], diagnoses=[(420, Change.STIFFNESS, 398, 0.75)])
+    (tweak,) = as_json(judge(run))["tweaks"]
+    assert (tweak["diagnosis"]["named"], tweak["diagnosis"]["right"]) == ("K", True)
+    (tweak,) = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))["tweaks"]
+    assert tweak["diagnosis"] is None

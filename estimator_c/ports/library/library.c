@@ -2,13 +2,13 @@
 
 size_t library_size(void) { return sizeof(library_t); }
 
-void library_init(library_t* const self) { self->config = est_config_default(); }
+void library_init(library_t* const self) { self->settings = settings_default(); }
 
 settings_result_t library_set(library_t* const self, const uint8_t key, const float value) {
-    return settings_set(&self->config, key, value);
+    return settings_set(&self->settings, key, value);
 }
 
-bool library_start(library_t* const self) { return est_init(&self->estimator, &self->config); }
+bool library_start(library_t* const self) { return est_init(&self->estimator, &self->settings.estimator); }
 
 static void keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
     if (out->theta != 0) {

@@ -10,8 +10,8 @@
 #include <stddef.h>
 
 typedef struct {
-    est_config_t config;
-    est_t        estimator;
+    settings_t settings;
+    est_t      estimator;
 } library_t;
 
 /// What each of n samples gave. A null pointer: not wanted.

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.estimator_c import isolation
-from tests.estimator_c.est_driver import PREDICTION_ERROR, Estimator
+from tests.estimator_c.est_driver import GATHERING, ONSETS_N, PREDICTION_ERROR, REFUSED, Estimator
 from tests.estimator_c.isolation import Change
 from tests.estimator_c.performance import FULL, FULL_FREE, OWN_CLOCK, SHARED_CLOCK, Settings
 from tests.estimator_c.plants import FRONT, Excitation, random_plants, simulate
@@ -116,7 +117,123 @@ def test_offset_of_the_displacement_is_not_taken_for_stiffness(estimator: Estima
     assert (estimator.isolate(played.u, played.y + 2048.0, played.onset).change == "M").mean() > 0.9
 
 
+def test_zero_of_the_force_may_lie_anywhere_in_its_range(estimator: Estimator) -> None:
+    """As on a card from -1 to 11 V; were 0 taken for it, the force that a heavier mass feels would be another."""
+    played = isolation.play(FRONT, {"M": 0.8}, FULL, 60, seed=7)
+    assert estimator.init(**OWN_CLOCK)
+    found = estimator.isolate(played.u + 1000.0, played.y + 2048.0, played.onset, force_zero=1000.0)
+    assert (found.change == "M").mean() > 0.9
+    assert abs(found.extent[found.change == "M"].mean() - 0.8) < 0.01
+
+
 @pytest.mark.parametrize("settings", [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}], ids=str)
 def test_models_that_are_no_suspension_are_refused(estimator: Estimator, settings: Settings) -> None:
     assert estimator.init(**{"c": (0.0, 0.0), **settings})
     assert not estimator.can_isolate()
+
+
+# ---- steps made by hand: what est_isolation says of them, whatever an estimator would
+
+SETTLED_N = 100
+"""After a start or an alarm so many samples pass before theta is taken for the plant."""
+
+SUSPENSION = (-1.7, 0.74, 0.0, 0.02, 0.02, 0.0)
+
+
+def steps(quiet_n: int = SETTLED_N + 20, rising_n: int = 5, after_n: int = 30) -> NDArray[np.float64]:
+    """(n, 3): samples with statistic zero, some in which it rises to an alarm, and those after it."""
+    out = np.zeros((quiet_n + rising_n + after_n, 3))
+    out[quiet_n : quiet_n + rising_n, STATISTIC] = np.arange(1.0, rising_n + 1.0)
+    out[quiet_n + rising_n - 1, ALARM] = 1.0
+    return out
+
+
+STATISTIC, STATUS, ALARM = range(3)
+
+
+def alarm_at(played: NDArray[np.float64]) -> int:
+    return int(np.flatnonzero(played[:, ALARM])[0])
+
+
+@pytest.fixture
+def by_hand(estimator: Estimator) -> Estimator:
+    assert estimator.init()
+    return estimator
+
+
+def test_work_is_due_from_the_alarm_on_and_done_in_slices(by_hand: Estimator) -> None:
+    left = by_hand.diagnose(SUSPENSION, steps()).left
+    alarm = alarm_at(steps())
+    assert not left[:alarm].any()
+    assert (left[alarm : alarm + 5] > 0).all()
+    plenty = by_hand.diagnose(SUSPENSION, steps(), slices=1000)
+    assert (plenty.left[alarm + 1 :] == ONSETS_N - 1).all()
+    assert plenty.samples_n == 30
+
+
+@pytest.mark.parametrize(
+    ("a1", "a2"),
+    [
+        pytest.param(-0.4, -0.05, id="one pole is negative"),
+        pytest.param(-2.001, 1.011, id="it is not stable"),
+        pytest.param(-1.5, 0.5, id="it has no stiffness"),
+        pytest.param(-1.501, 0.5005, id="its stiffness is negative"),
+        pytest.param(1.6, 0.64, id="it swings with every sample"),
+        pytest.param(-1.02540195, 0.0254034959, id="its stiffness is lost in rounding"),
+    ],
+)
+def test_estimate_that_is_no_suspension_leaves_it_undecided(by_hand: Estimator, a1: float, a2: float) -> None:
+    assert not by_hand.diagnose((a1, a2, *SUSPENSION[2:]), steps()).left.any()
+
+
+@pytest.mark.parametrize(("a1", "a2"), [(-0.9, 0.01), (-0.2, 0.6)], ids=["overdamped", "hardly damped"])
+def test_fast_poles_are_a_suspension_too(by_hand: Estimator, a1: float, a2: float) -> None:
+    assert by_hand.diagnose((a1, a2, *SUSPENSION[2:]), steps()).left.any()
+
+
+def test_alarm_before_the_plant_was_ever_well_leaves_it_undecided(by_hand: Estimator) -> None:
+    assert not by_hand.diagnose(SUSPENSION, steps(quiet_n=SETTLED_N - 20)).left.any()
+
+
+def test_statistic_that_rises_for_hundreds_of_samples_is_no_obstacle(by_hand: Estimator) -> None:
+    assert by_hand.diagnose(SUSPENSION, steps(rising_n=300)).left.any()
+
+
+def test_alarm_right_after_a_gap_has_too_few_samples_before_it(by_hand: Estimator) -> None:
+    played = steps(rising_n=1)
+    played[alarm_at(played) - 2, STATUS] = GATHERING
+    assert not by_hand.diagnose(SUSPENSION, played).left.any()
+
+
+def test_refused_sample_after_the_alarm_leaves_it_undecided(by_hand: Estimator) -> None:
+    played = steps()
+    refused = alarm_at(played) + 10
+    played[refused, STATUS] = REFUSED
+    left = by_hand.diagnose(SUSPENSION, played).left
+    assert left[refused - 1] > 0
+    assert not left[refused:].any()
+
+
+def test_second_alarm_soon_after_the_first_ends_the_work_on_it(by_hand: Estimator) -> None:
+    played = steps()
+    second = alarm_at(played) + 10
+    played[second, ALARM] = 1.0
+    left = by_hand.diagnose(SUSPENSION, played).left
+    assert left[second - 1] > 0
+    assert not left[second:].any()
+
+
+def test_extent_is_refined_until_a_hundred_samples_after_the_alarm(by_hand: Estimator) -> None:
+    played = steps(after_n=150)
+    found = by_hand.diagnose(SUSPENSION, played, slices=1000)
+    assert found.samples_n == SETTLED_N - 1
+    assert not found.left[alarm_at(played) + SETTLED_N :].any()
+
+
+def test_mass_that_all_but_holds_the_plant_still_is_told_as_a_hundredfold(estimator: Estimator) -> None:
+    played = isolation.play(FRONT, {"M": 1000.0}, FULL, 20, seed=8)
+    assert estimator.init(**SHARED_CLOCK)
+    found = estimator.isolate(played.u, played.y, played.onset)
+    assert (found.change == "M").mean() > 0.5
+    assert (found.extent[found.change == "M"] <= 100.0).all()
+    assert (found.extent == 100.0).any()
