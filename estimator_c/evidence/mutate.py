@@ -1,7 +1,6 @@
 """Whether the tests of the core notice when it is wrong: every operator, constant, condition, statement, one at a time.
 
-`make mutate` makes each mutant, runs the tests on it until one fails, and prints those that no test notices.
-MUTATION.md
+`make mutate` makes each mutant, runs the tests on it until one fails, and prints those that none notices. MUTATION.md
 explains them; one that it does not explain, or an explanation whose mutant is noticed or gone, is a failure.
 ARGS="--sample 60" takes so many of them by chance, --seed 2 others.
 
