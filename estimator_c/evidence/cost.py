@@ -39,7 +39,7 @@ FLAGS = (
 )
 
 CLOCK_MHZ, CYCLES = 168.0, 1.5
-"""For estimates of time: the clock of a usual M4F, and cycles per instruction, which depend on its memory (1.2 to 2)."""
+"""For estimates of time: the clock of a usual M4F, and cycles per instruction (1.2 to 2, as its memory has it)."""
 
 EVEN = 1.2
 """The worst step may take so many times the instructions of a typical one."""

@@ -366,6 +366,15 @@ def test_message_that_comes_twice_is_obeyed_once(device: Device) -> None:
     assert device.counters()[Counter.MESSAGES_REPEATED] == 1  # RESET has cleared the first
 
 
+def test_message_that_comes_again_late_is_not_obeyed(device: Device) -> None:
+    first = device.seq
+    answers = [device.repeat(Control((first + i) % 256, Command.REPORT_INTERVAL, 1), advance=1) for i in range(40)]
+    assert [] not in answers
+    assert device.repeat(Control((first + 40 - 32) % 256, Command.RESET, 0)) == []
+    assert device.counters()[Counter.MESSAGES_REPEATED] == 1
+    assert device.repeat(Control((device.seq - 33) % 256, Command.STOP, 0)) != []  # cannot be told from a new one
+
+
 def test_skipped_samples_are_missing_to_the_estimator(device: Device, estimator: Estimator) -> None:
     u, y = codes(300)
     sent = [k for k in range(300) if k % 50 not in (20, 21, 22)]
