@@ -40,7 +40,8 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze fuzz faults wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults \
+        wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -97,6 +98,12 @@ bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every com
 
 analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer, cppcheck with MISRA, clang-tidy
 	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
+
+eva: $(PRODUCTS) ## Frama-C over the core, each shape of the model: nothing undefined can happen; an hour
+	@$(BIN)/python -m estimator_c.evidence.eva
+
+mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sample 60" takes so many mutants; build/mutation.json
+	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

@@ -25,6 +25,7 @@ from harness.catalogue import (
     Controlled,
     Diagnosis,
     Estimate,
+    Firmware,
     Hello,
     Identify,
     Key,
@@ -464,6 +465,50 @@ def test_command_that_the_device_obeys_again_is_told(line: FaultyLink) -> None:
     line.to_device = obey_again
     with pytest.raises(DeviceError, match="^device bob: Controlled came too late$"):
         started(line)
+
+
+def test_sample_that_the_line_has_kept_since_the_run_before_is_not_taken(line: FaultyLink, reference: Replies) -> None:
+    """It comes at the very moment when it would fit."""
+    kept: list[Message] = []
+
+    def keep(message: Message) -> list[Message]:
+        kept.append(message)
+        return []
+
+    dut = started(line)
+    line.to_device = about(Sample, 81, keep)
+    feed(dut, 0, N)
+    dut.stop()
+    dut.start()
+    line.to_device = about(Sample, 81, lambda message: [kept.pop(), message])
+    assert_same(feed(dut, 0, N), reference)
+    assert dut.stop()["samples_of_other_runs"] == 1
+
+
+@pytest.mark.parametrize(("window", "room", "most"), [(4, 2, 2), (3, 200, 3), (4, 0, 1)])
+def test_no_more_blocks_are_on_their_way_than_the_device_can_hold(
+    line: FaultyLink, reference: Replies, window: int, room: int, most: int
+) -> None:
+    unanswered: list[int] = []
+    most_unanswered = 0
+
+    def to_device(message: Message) -> list[Message]:
+        nonlocal most_unanswered
+        if isinstance(message, SampleBlock):
+            unanswered.append(message.sample_index + message.flags % 16 - 1)
+            most_unanswered = max(most_unanswered, len(unanswered))
+        return [message]
+
+    def from_device(message: Message) -> list[Message]:
+        if isinstance(message, Firmware):
+            return [message._replace(input_blocks=room)]
+        if isinstance(message, Stepped) and message.sample_index == unanswered[0]:
+            unanswered.pop(0)
+        return [message]
+
+    line.to_device, line.from_device = to_device, from_device
+    assert_same(feed(started(line, exchange="stream", window=window), 0, N), reference)
+    assert most_unanswered == most
 
 
 @pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81 and Hello")])
