@@ -16,6 +16,7 @@ from tests.harness.fault_runs import (
     play,
     steps,
 )
+from tests.harness.firmware import needs_firmware
 
 
 def test_every_fault_is_documented() -> None:
@@ -49,7 +50,10 @@ def test_as_many_lost_answers_as_there_are_sequence_numbers_are_noticed(first: i
 PLACES: tuple[tuple[Direction, str, int], ...] = (("to", "handshake", 0), ("to", "samples", 5), ("from", "samples", 40))
 """Direction, step, and which of the frames of that step."""
 SOME = ("flip", "drop", "duplicate", "disconnect", "hang", "wrong-baud", "reset")
-REAL = [("host", kind) for kind in KINDS if kind != "delay"] + [("qemu-m4", kind) for kind in SOME]
+REAL = [
+    *(("host", kind) for kind in KINDS if kind != "delay"),
+    *(pytest.param("qemu-m4", kind, marks=needs_firmware) for kind in SOME),
+]
 
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: f"{place[0]}-{place[1]}")
