@@ -8,6 +8,8 @@ JOBS ?= 2
 ARGS ?=
 PYTEST_ARGS ?=
 FUZZ_S ?= 60
+FAULTS_N ?= 100000
+FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
@@ -38,7 +40,8 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults \
+        wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -49,7 +52,7 @@ setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every oth
 run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="--seed 7" goes to analogrig run
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
-test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
+test: check firmware ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 check: lint strict ## linters, types, and the C with every warning an error
@@ -78,13 +81,11 @@ $(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/
 	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) $(filter %.S,$^) $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c)) \
 	    $(BUILD)/generated/*.c -lgcc -o $@
 
-fuzz: ## libFuzzer over core and isolation, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
-	@mkdir -p $(BUILD)/fuzz/corpus
-	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
-	    -DEST_NC_MAX=2U -Iestimator_c/core -Iestimator_c/isolation estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c \
-	    estimator_c/isolation/*.c -o $(BUILD)/fuzz/fuzz_est
-	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
-	    then grep "^stat::" log; else tail -60 log; exit 1; fi
+fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
+	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
+
+faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
+	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
 
 coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage
@@ -97,6 +98,12 @@ bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every com
 
 analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer, cppcheck with MISRA, clang-tidy
 	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
+
+eva: $(PRODUCTS) ## Frama-C over the core, each shape of the model: nothing undefined can happen; an hour
+	@$(BIN)/python -m estimator_c.evidence.eva
+
+mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sample 60" takes so many mutants; build/mutation.json
+	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist

@@ -400,11 +400,12 @@ static void put_counter(device_t* const self, answer_t* const answer) {
 
 // ---------------------------------------------        MESSAGES        ---------------------------------------------
 
-/// Every message is numbered. One with the number of the last is a repetition, which must not be obeyed twice; false for
-/// that. Identify begins a conversation, so its number is any.
+/// Every message is numbered. One with the number of any of the last ones is a repetition, which must not be obeyed twice;
+/// false for that. Identify begins a conversation, so its number is any.
 static bool sequence_allows(device_t* const self, const uint8_t id, const uint8_t seq) {
-    const bool begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
-    if (!begins && (seq == (uint8_t)(self->seq_expected - 1U))) {
+    const bool    begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
+    const uint8_t behind = (uint8_t)(self->seq_expected - seq);
+    if (!begins && (behind >= 1U) && (behind <= DEVICE_LATE_MAX)) {
         add(&self->counters.messages_repeated, 1U);
         return false;
     }

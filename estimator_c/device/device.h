@@ -38,6 +38,9 @@ extern "C" {
 /// the time that one message may take.
 #define DEVICE_GAP_MAX 1024U
 
+/// A message that comes again, however late, must not be obeyed twice: one with a sequence number so far behind is one.
+#define DEVICE_LATE_MAX 32U
+
 /// Slices of work on a diagnosis with each sample. A sample takes EST_ISOLATION_ONSETS_N of them, and at the alarm up to 24
 /// are waiting: with twice as many the diagnosis comes 0.7 samples later than with all of them at once.
 #define DEVICE_ISOLATION_SLICES (2U * EST_ISOLATION_ONSETS_N)
@@ -53,7 +56,7 @@ typedef struct {
 /// Counters since device_init() or RESET. They saturate, they do not wrap.
 typedef struct {
     uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
-    uint32_t messages_repeated;      ///< messages with the sequence number of the last; ignored
+    uint32_t messages_repeated;      ///< messages with one of the last DEVICE_LATE_MAX sequence numbers; ignored
     uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
     uint32_t samples_lost;           ///< skipped indices
     uint32_t samples_ignored;        ///< samples that came again or late

@@ -180,3 +180,24 @@ def test_prediction_at_any_order_and_scale_is_that_of_extended_precision(
     assert (result.status[3:] == UPDATED).all()
     error = ((result.theta - exact.theta) * exact.phi).sum(axis=1)
     assert np.abs(error).max() <= 1e-5 * np.abs(exact.y).max()
+
+
+def test_a_c_is_taken_iff_its_zeros_are_inside_the_unit_circle(estimator: Estimator) -> None:
+    """Those closer to the circle than 0.02 are left out: double zeros there would filter the data into overflow."""
+    for c1 in np.linspace(-2.3, 2.3, 47):
+        for c2 in np.linspace(-1.2, 1.2, 25):
+            radius = np.abs(np.roots([1.0, c1, c2])).max()
+            if abs(radius - 1.0) > 0.02:
+                assert estimator.init(c=(float(c1), float(c2))) == (radius < 1.0), (c1, c2)
+
+
+def test_extended_least_squares_finds_a_c_of_one_element(estimator: Estimator) -> None:
+    """40,000 samples: the standard error of c1 is 0.005."""
+    rng = np.random.default_rng(1)
+    u = np.where(rng.random(40_000) < 0.5, -500.0, 500.0)
+    e = rng.normal(0.0, 20.0, len(u))
+    a, b, c = [1.0, -1.5, 0.7], [0.0, 0.2], [1.0, 0.5]
+    y = lfilter(b, a, u) + lfilter(c, a, e)
+    assert estimator.init(na=2, nb=1, nk=1, nc=1, offset=0, c=(0.0, 0.0), kind=NONE, forgetting=1.0, refresh_n=0)
+    theta = estimator.run(u, y).theta[-1]
+    assert theta[:4] == pytest.approx([a[1], a[2], b[1], c[1]], abs=0.03)

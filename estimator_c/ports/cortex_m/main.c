@@ -27,6 +27,7 @@ typedef struct {
 #define CONTROL_RECEIVE 0x2U
 #define CONTROL_TRANSMIT_INTERRUPT 0x4U
 #define CONTROL_RECEIVE_INTERRUPT 0x8U
+#define CONTROL_USUAL (CONTROL_TRANSMIT | CONTROL_RECEIVE | CONTROL_RECEIVE_INTERRUPT)
 #define INTERRUPT_TRANSMIT 0x1U
 #define INTERRUPT_RECEIVE 0x2U
 #define DIVIDER 217U  ///< 25 MHz / 115,200
@@ -48,17 +49,20 @@ static struct {
 void uart_receive_interrupt(void);
 void uart_transmit_interrupt(void);
 
+/// The UART holds one byte: the next one has an interrupt of its own.
 void uart_receive_interrupt(void) {
-    UART->interrupts = INTERRUPT_RECEIVE;
-    if ((UART->state & STATE_RECEIVE_OVERRUN) != 0U) {
+    UART->interrupts     = INTERRUPT_RECEIVE;
+    const uint32_t state = UART->state;
+    const uint32_t to    = ring.to;
+    if ((state & STATE_RECEIVE_OVERRUN) != 0U) {
         UART->state = STATE_RECEIVE_OVERRUN;
         ring.lost++;
     }
-    while ((UART->state & STATE_RECEIVE_FULL) != 0U) {
+    if ((state & STATE_RECEIVE_FULL) != 0U) {
         const uint8_t byte = (uint8_t)UART->data;
-        if ((ring.to - ring.from) < RING_SIZE) {
-            ring.bytes[ring.to % RING_SIZE] = byte;
-            ring.to++;
+        if ((to - ring.from) < RING_SIZE) {
+            ring.bytes[to % RING_SIZE] = byte;
+            ring.to                    = to + 1U;
         } else {
             ring.lost++;
         }
@@ -66,7 +70,10 @@ void uart_receive_interrupt(void) {
 }
 
 /// There is room again: that it wakes the processor is all.
-void uart_transmit_interrupt(void) { UART->interrupts = INTERRUPT_TRANSMIT; }
+void uart_transmit_interrupt(void) {
+    UART->control    = CONTROL_USUAL;
+    UART->interrupts = INTERRUPT_TRANSMIT;
+}
 
 uint32_t port_boot_nonce(void) { return semihosting_argument(); }
 
@@ -99,6 +106,9 @@ bool port_idle(const bool wants_input, const bool has_output) {
     const bool has_input = ring.from != ring.to;
     const bool has_room  = (UART->state & STATE_TRANSMIT_FULL) == 0U;
     if (!(wants_input && has_input) && !(has_output && has_room)) {
+        if (has_output) {
+            UART->control = CONTROL_USUAL | CONTROL_TRANSMIT_INTERRUPT;
+        }
         __asm volatile("wfi" ::: "memory");
     }
     __asm volatile("cpsie i" ::: "memory");
@@ -107,7 +117,7 @@ bool port_idle(const bool wants_input, const bool has_output) {
 
 int main(void) {
     UART->divider = DIVIDER;
-    UART->control = CONTROL_TRANSMIT | CONTROL_RECEIVE | CONTROL_TRANSMIT_INTERRUPT | CONTROL_RECEIVE_INTERRUPT;
+    UART->control = CONTROL_USUAL;
     (void)UART->data;  // QEMU begins to receive after the first read
     NVIC_ENABLE   = NVIC_UART;
     device_loop((uint8_t)FIRMWARE_ID, (uint32_t)ANALOGRIG_CATALOGUE_HASH);

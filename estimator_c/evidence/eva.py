@@ -1,0 +1,126 @@
+"""That nothing undefined can happen in the core: Frama-C's Eva, an abstract interpreter, over eva.c. `make eva`.
+
+For every shape of the model, any configuration and any samples: no access outside an array or by a stale pointer, no
+read of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the infinities are
+numbers here: samples may be such. What keeps them out of the state is asked of est_invariants_hold() after every step
+of the fuzzer and of the tests; intervals cannot show it, since they know of no relation between P, theta and the data.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["DEFAULT", "SHAPES", "Analysis", "Shape", "analysed", "main"]
+
+HERE = Path(__file__).parent
+CORE = HERE.parent / "core"
+THETA_MAX, NC_MAX = 6, 2
+
+OPTIONS = (
+    "-eva",
+    "-main=main",
+    "-eva-precision=2",
+    "-eva-split-return=auto",
+    "-eva-no-memexec",
+    "-warn-special-float=none",
+)
+"""States are told apart by what functions return: only then does est_init() == true mean a valid configuration."""
+
+SIZES = re.compile(r"^(\s*(?:const )?(?:float|est_past_t)\s+\w+)((?:\[[^]]*\])+)", re.MULTILINE)
+"""Of the arrays that are declared."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The orders of the model."""
+
+    na: int
+    nb: int
+    nk: int
+    nc: int
+    offset: int
+
+    @property
+    def defines(self) -> list[str]:
+        """As eva.c wants it."""
+        orders = {"NA": self.na, "NB": self.nb, "NK": self.nk, "NC": self.nc, "OFFSET": self.offset}
+        return [f"-DEST_NC_MAX={NC_MAX}U", *(f"-D{name}={value}U" for name, value in orders.items())]
+
+
+DEFAULT = Shape(2, 3, 0, 0, 1)
+SHAPES = tuple(
+    shape
+    for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), (0, 1), range(NC_MAX + 1), (0, 1)))
+    if shape.na + shape.nb + shape.nc + shape.offset <= THETA_MAX
+)
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What Eva says."""
+
+    alarms: tuple[str, ...]
+    reached: float
+    """Part of the statements, of the functions that were reached."""
+
+
+def _literal(sizes: re.Match[str]) -> str:
+    """Frama-C 25 stops at the size of an array that is not a literal."""
+
+    def value(size: re.Match[str]) -> str:
+        expression = re.sub(r"\((.*) \? (.*) : (.*)\)", r"(\2) if (\1) else (\3)", size[1].replace("U", ""))
+        return f"[{int(eval(expression.replace('/', '//')))}]"  # noqa: S307 - of our own header
+
+    return sizes[1] + re.sub(r"\[([^]]*)\]", value, sizes[2])
+
+
+def _preprocessed(source: Path, folder: Path, shape: Shape) -> Path:
+    share = subprocess.run(["frama-c", "-print-share-path"], check=True, capture_output=True, text=True).stdout.strip()
+    options = ["-E", "-nostdinc", f"-I{share}/libc", f"-I{CORE}", "-D__FC_MACHDEP_X86_64", "-U__GNUC__", "-DNDEBUG"]
+    done = subprocess.run(["gcc", *options, *shape.defines, source], check=True, capture_output=True, text=True)
+    out = folder / f"{source.stem}.i"
+    out.write_text(SIZES.sub(_literal, done.stdout))
+    return out
+
+
+def analysed(shape: Shape) -> Analysis:
+    """Runs Eva; RuntimeError if it comes to no end."""
+    with tempfile.TemporaryDirectory() as scratch:
+        sources = [HERE / "eva.c", *sorted(CORE.glob("*.c"))]
+        files = [_preprocessed(source, Path(scratch), shape) for source in sources]
+        done = subprocess.run(["frama-c", *OPTIONS, *files], cwd=scratch, capture_output=True, text=True, check=False)
+    count = re.search(r"^  (\d+) alarms? generated", done.stdout, re.MULTILINE)
+    statements = re.search(r"(\d+) statements reached \(out of (\d+)\)", done.stdout)
+    if done.returncode != 0 or count is None or statements is None:
+        raise RuntimeError(f"frama-c came to no end: {done.stdout[-2000:]}{done.stderr}")
+    alarms = tuple(re.findall(r"^\[eva:alarm\] (.*?)(?=^\[)", done.stdout, re.MULTILINE | re.DOTALL))
+    if len(alarms) < int(count[1]):
+        raise RuntimeError(f"{count[1]} alarms, of which {len(alarms)} were understood")
+    return Analysis(alarms, int(statements[1]) / int(statements[2]))
+
+
+def main() -> int:
+    """Prints a line for each shape; the exit status is 1 if there is an alarm."""
+    if shutil.which("frama-c") is None:
+        sys.stderr.write("make eva needs Frama-C: apt-get install frama-c-base\n")
+        return 2
+    alarms = 0
+    with ThreadPoolExecutor(2) as pool:
+        for shape, found in zip(SHAPES, pool.map(analysed, SHAPES), strict=True):
+            print(f"{shape}: {len(found.alarms)} alarms, {100 * found.reached:.0f} % of the statements", flush=True)
+            print("".join(found.alarms), end="")
+            alarms += len(found.alarms)
+    print(f"{alarms} alarms in {len(SHAPES)} shapes")
+    return 1 if alarms else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,427 @@
+"""Whether the tests of the core notice when it is wrong: every operator, constant, condition, statement, one at a time.
+
+`make mutate` makes each mutant, runs the tests on it until one fails, and prints those that none notices. MUTATION.md
+explains them; one that it does not explain, or an explanation whose mutant is noticed or gone, is a failure.
+ARGS="--sample 60" takes so many of them by chance, --seed 2 others.
+
+The tests are loaded once and forked for each mutant, and what they simulate is kept: two to ten seconds a mutant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import functools
+import hashlib
+import importlib
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+from hypothesis import Phase
+
+__all__ = ["EXPLAINED", "Mutant", "Outcome", "explained", "main", "mutants", "sampled", "tried"]
+
+ROOT = Path(__file__).parents[2]
+CORE = ROOT / "estimator_c" / "core"
+EXPLAINED = ROOT / "estimator_c" / "evidence" / "MUTATION.md"
+GENERATED = ROOT / "build" / "generated"
+
+QUICK = ("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py")
+SEARCHING = (
+    *("tests/harness/test_twin.py", "tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_numerics.py"),
+    "tests/estimator_c/test_est_adversarial.py",
+)
+"""Left out where not even a bit is different in the 129,600 steps of bit_exact.c."""
+
+LONG = "not ten_million and not long_free_running and not rarer_than_promised"
+DEADLINE_S = 60.0
+"""A mutant may not come to an end."""
+
+FLAGS = (
+    *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
+    *(f"-I{path}" for path in (CORE.parent / "device", CORE.parent / "isolation", GENERATED)),
+)
+"""One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""
+
+TESTED, HASHED = (), ("-DEST_THETA_MAX=8U",)
+"""How the core is built for the tests, and for bit_exact.c."""
+
+AROUND = {
+    TESTED: (
+        ROOT / "tests" / "estimator_c" / "est_driver.c",
+        *(CORE.parent / "ports" / "library").glob("*.c"),
+        *(CORE.parent / "isolation").glob("*.c"),
+        CORE.parent / "device" / "settings.c",
+    ),
+    HASHED: (CORE.parent / "evidence" / "bit_exact.c", *(CORE.parent / "isolation").glob("*.c")),
+}
+"""What calls the core."""
+
+SWAPS = {
+    "<": ("<=", ">="),
+    ">": (">=", "<="),
+    "<=": ("<", ">"),
+    ">=": (">", "<"),
+    "==": ("!=",),
+    "!=": ("==",),
+    "+": ("-",),
+    "-": ("+",),
+    "*": ("/",),
+    "/": ("*",),
+    "&&": ("||",),
+    "||": ("&&",),
+    "+=": ("-=",),
+    "-=": ("+=",),
+    "*=": ("/=",),
+}
+OPERATOR = re.compile(rf"(?<= )({'|'.join(re.escape(op) for op in sorted(SWAPS, key=len, reverse=True))})(?= )")
+"""The layout of the sources puts blanks around binary operators, and around no other."""
+
+NOT = re.compile(r"!(?=[\w(])")
+MINUS = re.compile(r"(?<=[(?:,=] )-(?=[\w(])|(?<=\()-(?=[\w(])")
+WHOLE = re.compile(r"\b(\d+)U\b")
+REAL = re.compile(r"\b(\d+\.\d+(?:e-?\d+)?)F\b")
+CONDITION = re.compile(r"\b(?:if|while) \((.*)\) \{$")
+STATEMENT = re.compile(r"^ +(?!return|break|const|static|float|bool|u?int\w*_t|est_\w+_t |\(void\))[\w*(][^;]*;$")
+DEFINITION = re.compile(r"^(?!#|typedef|static const)\w[\w* ]*?\b(\w+)\(")
+CONSTANT = re.compile(r"^#define (\w+) \S*\d")
+SETTING = re.compile(r"EST_(?:N[ABCK]|THETA)_MAX|EST_VERSION|EST_WITH|EST_FIXED")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One line, altered."""
+
+    file: str
+    line: int
+    function: str
+    """Or the macro."""
+    before: str
+    after: str
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What it is called, wherever the line has moved to."""
+        return self.file, self.function, self.before.strip(), self.after.strip()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a mutant."""
+
+    mutant: Mutant
+    fate: str
+    """killed, survived, equivalent (the same machine code), or invalid (it does not compile)."""
+    by: str = ""
+    """The test that noticed it."""
+
+
+def altered(line: str) -> Iterator[str]:
+    """The line with each alteration in turn."""
+    code = line.split("//", maxsplit=1)[0]
+
+    def put(start: int, end: int, text: str) -> str:
+        return line[:start] + text + line[end:]
+
+    for match in OPERATOR.finditer(code):
+        yield from (put(*match.span(), other) for other in SWAPS[match[0]])
+    for pattern in (NOT, MINUS):
+        yield from (put(*match.span(), "") for match in pattern.finditer(code))
+    for match in WHOLE.finditer(code):
+        number = int(match[1])
+        yield from (put(*match.span(), f"{other}U") for other in (number + 1, number - 1) if other >= 0)
+    for match in REAL.finditer(code):
+        others = ("1.0F",) if float(match[1]) == 0.0 else (f"({match[0]} + 1.0F)", f"(-{match[0]})")
+        yield from (put(*match.span(), other) for other in others)
+    if condition := CONDITION.search(code.rstrip()):
+        yield from (put(*condition.span(1), truth) for truth in ("true", "false"))
+    if STATEMENT.match(code.rstrip()):
+        yield line[: len(line) - len(line.lstrip())] + ";"
+
+
+def mutants() -> list[Mutant]:
+    """All of the core, in the order of the sources."""
+    return [mutant for path in sorted(CORE.glob("*.[ch]")) for mutant in _mutants_of(path)]
+
+
+def _mutants_of(path: Path) -> Iterator[Mutant]:
+    function = ""
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        constant, definition = CONSTANT.match(line), DEFINITION.match(line)
+        if definition:
+            function = definition[1]
+        if constant and not SETTING.search(constant[1]):
+            yield from (Mutant(path.name, number, constant[1], line, after) for after in altered(line))
+        elif function and not line.startswith("#") and "EST_ASSERT" not in line:
+            yield from (Mutant(path.name, number, function, line, after) for after in altered(line))
+        if (line.rstrip().endswith("}") and (line.startswith("}") or definition)) or line.endswith(");"):
+            function = function if line.startswith(" ") else ""
+
+
+def sampled(every: Sequence[Mutant], count: int, seed: int = 1) -> list[Mutant]:
+    """So many by chance: the same ones wherever their lines have moved to, and whatever else has come or gone."""
+    return sorted(every, key=lambda mutant: hashlib.sha256(repr((seed, mutant.key)).encode()).digest())[:count]
+
+
+def shown(key: tuple[str, str, str, str]) -> str:
+    """As MUTATION.md has it."""
+    file, function, before, after = key
+    return f"@ {file} {function}\n- {before}\n+ {after}"
+
+
+def explained() -> dict[tuple[str, str, str, str], str]:
+    """The mutants of MUTATION.md, and the heading that each stands under."""
+    found, heading, where = {}, "", ("", "")
+    before = ""
+    for line in EXPLAINED.read_text().splitlines():
+        if line.startswith("## "):
+            heading = line[3:]
+        elif match := re.match(r"@ (\S+) (\S+)$", line):
+            where = (match[1], match[2])
+        elif line.startswith("- "):
+            before = line[2:]
+        elif line.startswith("+ "):
+            found[*where, before, line[2:]] = heading
+    return found
+
+
+# ---- the tests, loaded once
+
+
+_library = Path()
+
+
+def _kept(simulate: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
+    """A simulation whose results are kept: tests may write into what they get."""
+    known: dict[Any, tuple[Any, Any]] = {}
+
+    def kept(plants: list[Any], edges: Any, *rest: Any) -> tuple[Any, Any]:
+        key = (tuple(plants), edges.tobytes(), rest)
+        if key not in known:
+            known[key] = simulate(plants, edges, *rest)
+        u, y = known[key]
+        return u.copy(), y.copy()
+
+    return kept
+
+
+def _load_tests() -> None:
+    """Makes every test use the library of the mutant, and runs them all once on the core as it is."""
+    sys.path.insert(0, str(ROOT))
+    hypothesis.settings.register_profile(
+        "mutants",
+        phases=(Phase.explicit, Phase.generate),  # the smallest example is not wanted
+    )
+    hypothesis.settings.load_profile("mutants")
+    driver = importlib.import_module("tests.estimator_c.est_driver")
+    driver.compile_driver = lambda _: _library  # type: ignore[attr-defined]
+    trigger = importlib.import_module("tests.estimator_c.test_est_trigger")
+    trigger.suspension = _kept(trigger.suspension)  # type: ignore[attr-defined]
+    estimator = importlib.import_module("harness.estimator").Estimator
+    start = estimator.__init__
+
+    @functools.wraps(start)
+    def start_mutant(self: Any, config: Any = None) -> None:
+        start(self, config, library=_library)
+
+    estimator.__init__ = start_mutant
+
+
+class _Reporter:
+    """Remembers the first test that fails."""
+
+    failed = ""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed and not self.failed:
+            self.failed = report.nodeid.rsplit("/", 1)[-1]
+
+
+def _first_failure(tests: Sequence[str]) -> str:
+    reporter = _Reporter()
+    options = [
+        "-x",
+        "-q",
+        "--assert=plain",
+        "-p",
+        "no:xdist",
+        "-p",
+        "no:cacheprovider",
+        "-o",
+        "timeout=0",
+        "-s",
+        "-k",
+        LONG,
+    ]
+    status = pytest.main([*options, f"--rootdir={ROOT}", *tests], plugins=[reporter])
+    return reporter.failed or ("" if status == 0 else f"status {int(status)}")
+
+
+def _in_a_fork(tests: Sequence[str]) -> str:
+    """The first failure on the present library; a crash, or no end, counts as one."""
+    receiver, sender = os.pipe()
+    child = os.fork()
+    if child == 0:
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, 1)
+        os.dup2(nothing, 2)
+        os.write(sender, _first_failure(tests).encode())
+        os._exit(0)
+    os.close(sender)
+    deadline = time.monotonic() + DEADLINE_S
+    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            os.close(receiver)
+            return "no end"
+        time.sleep(0.01)
+    with os.fdopen(receiver) as pipe:
+        return pipe.read() if ended[1] == 0 else f"crash: {ended[1]}"
+
+
+# ---- the mutants
+
+
+class _Build:
+    """The core in a folder, with all that calls it; only what a mutant alters is compiled again."""
+
+    def __init__(self, folder: Path, options: tuple[str, ...]) -> None:
+        self._folder, self._options = folder, options
+        shutil.copytree(CORE, folder)
+        (folder / "around").mkdir()
+        self._sources = sorted(path.name for path in folder.glob("*.c"))
+        self._compile(self._sources)
+        generated = sorted(GENERATED.glob("*.c")) if options == TESTED else []
+        for path in (*AROUND[options], *generated):
+            self._object(path, folder / "around")
+
+    def copy(self, folder: Path) -> _Build:
+        """Another, so that a mutant leaves nothing behind."""
+        other = copy.copy(self)
+        other._folder = shutil.copytree(self._folder, folder)  # noqa: SLF001 - of its own kind
+        return other
+
+    def _object(self, source: Path, into: Path) -> Path:
+        out = into / f"{source.stem}.o"
+        command = ["gcc", f"-I{self._folder}", *FLAGS, *self._options, "-c", str(source), "-o", str(out)]
+        subprocess.run(command, check=True, capture_output=True)
+        return out
+
+    def _compile(self, names: Sequence[str]) -> bytes:
+        """The machine code of these files."""
+        return b"".join(self._object(self._folder / name, self._folder).read_bytes() for name in names)
+
+    def differs(self, mutant: Mutant) -> bool:
+        """Puts the mutant in; false if the machine code is as before. CalledProcessError if it does not compile."""
+        names = [mutant.file] if mutant.file.endswith(".c") else self._sources
+        before = b"".join((self._folder / name).with_suffix(".o").read_bytes() for name in names)
+        lines = (CORE / mutant.file).read_text().splitlines()
+        lines[mutant.line - 1] = mutant.after
+        (self._folder / mutant.file).write_text("\n".join(lines) + "\n")
+        return self._compile(names) != before
+
+    def linked(self, *options: str) -> Path:
+        """The library or the program."""
+        out = self._folder / "out"
+        objects = sorted(self._folder.rglob("*.o"))
+        subprocess.run(["gcc", *options, *map(str, objects), "-o", str(out)], check=True, capture_output=True)
+        return out
+
+
+def _hash(program: Path) -> str:
+    done = subprocess.run([program], capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    return done.stdout + str(done.returncode)
+
+
+def _try(mutant: Mutant, plain: tuple[_Build, _Build], expected: str) -> Outcome:
+    global _library  # noqa: PLW0603 - the tests, in a fork of this process, look there
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            tested = plain[0].copy(Path(scratch, "tested"))
+            if not tested.differs(mutant):
+                return Outcome(mutant, "equivalent")
+            _library = tested.linked("-shared")
+        except subprocess.CalledProcessError:
+            return Outcome(mutant, "invalid")
+        failed = _in_a_fork(QUICK)
+        if failed:
+            return Outcome(mutant, "killed", failed)
+        hashed = plain[1].copy(Path(scratch, "hashed"))
+        hashed.differs(mutant)
+        try:
+            same = _hash(hashed.linked()) == expected
+        except subprocess.TimeoutExpired:
+            same = False
+        failed = "" if same else _in_a_fork(SEARCHING)
+        return Outcome(mutant, "killed" if failed else "survived", failed or ("same bits" if same else "other bits"))
+
+
+def tried(chosen: Sequence[Mutant], jobs: int = 2) -> Iterator[Outcome]:
+    """What becomes of each, in their order; RuntimeError if the tests fail on the core as it is."""
+    global _library  # noqa: PLW0603
+    os.chdir(ROOT)
+    with tempfile.TemporaryDirectory() as scratch:
+        plain = (_Build(Path(scratch, "tested"), TESTED), _Build(Path(scratch, "hashed"), HASHED))
+        _library = plain[0].linked("-shared")
+        expected = _hash(plain[1].linked())
+        _load_tests()
+        with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
+            failed = _first_failure((*QUICK, *SEARCHING))
+        if failed:
+            raise RuntimeError(f"the tests fail on the core as it is: {failed}")
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+            work = functools.partial(_try, plain=plain, expected=expected)
+            yield from pool.map(work, chosen, chunksize=1)
+
+
+def main() -> int:
+    """Prints what survived; the exit status is 1 if something is unexplained."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sample", type=int, help="so many mutants, by chance")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default="", help="mutants of the files whose name contains this")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "mutation.json")
+    arguments = parser.parse_args()
+    every = [mutant for mutant in mutants() if arguments.only in mutant.file]
+    chosen = every
+    if arguments.sample is not None:
+        chosen = sampled(every, arguments.sample, arguments.seed)
+    known = explained()
+    outcomes = []
+    for outcome in tried(chosen, arguments.jobs):
+        outcomes.append(outcome)
+        if outcome.fate == "survived" and outcome.mutant.key not in known:
+            print(shown(outcome.mutant.key), flush=True)
+    fates = Counter(outcome.fate for outcome in outcomes)
+    print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
+    survivors = {outcome.mutant.key for outcome in outcomes if outcome.fate == "survived"}
+    stale = known.keys() - survivors if chosen == every and not arguments.only else set()
+    for key in sorted(stale):
+        print(f"explained, but noticed or gone:\n{shown(key)}")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    record = {"fates": fates, "mutants": [asdict(outcome) for outcome in outcomes]}
+    arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+    return 1 if stale or survivors - known.keys() else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
