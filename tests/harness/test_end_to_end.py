@@ -183,6 +183,12 @@ def test_generator_of_any_period_wants_its_own_setting(tmp_path: Path) -> None:
 # ---- what goes wrong
 
 
+def test_faults_of_the_line_are_asked_for_by_name(tmp_path: Path) -> None:
+    out = run_json("run", "--dut", "inproc", "--wire-faults", "reset@to:100", cwd=tmp_path, status=3)
+    assert "it was reset after the handshake" in out["reasons"][0]
+    assert "'flop@2' is not KIND@to:FRAME" in refusal("run", "--wire-faults", "flop@2", cwd=tmp_path)
+
+
 def test_place_that_cannot_hold_the_results_is_found_before_the_run(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "--out file/run: Not a directory" in refusal("run", "--out", "file/run", cwd=tmp_path)

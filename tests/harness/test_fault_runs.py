@@ -1,0 +1,65 @@
+"""What becomes of a run over a line with faults: what harness/README.md says, and never a wrong estimate."""
+
+from __future__ import annotations
+
+import pytest
+
+from harness.devices import describe
+from harness.wire_faults import DIRECTIONS, KINDS, Direction, WireFault, WireFaults
+from tests.harness.fault_runs import (
+    EXCHANGES,
+    Case,
+    ExchangeKind,
+    documented,
+    outcomes_by_chance,
+    outcomes_everywhere,
+    play,
+    steps,
+)
+from tests.harness.firmware import needs_firmware
+
+
+def test_every_fault_is_documented() -> None:
+    assert {*documented()} == {(kind, direction) for kind in KINDS for direction in DIRECTIONS}
+
+
+@pytest.mark.parametrize("exchange", EXCHANGES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_fault_at_every_step_leads_to_what_is_documented(kind: str, exchange: ExchangeKind) -> None:
+    assert outcomes_everywhere(kind, exchange, stride=12).total() > 20
+
+
+@pytest.mark.parametrize("first", range(0, 3000, 500))
+def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
+    assert outcomes_by_chance(range(first, first + 500)).total() == 500
+
+
+@pytest.mark.parametrize("first", [1 + 8 * 56, 1 + 8 * 224])
+def test_as_many_lost_answers_as_there_are_sequence_numbers_are_noticed(first: int) -> None:
+    """16 blocks are answered by 7 times 256 messages: the next one has the number that is due, if there is one."""
+    first += steps("stream")["from"].index("samples")
+    faults = WireFaults(tuple(WireFault("drop", "from", number) for number in range(first, first + 7 * 256)))
+    played = play(Case(faults, "stream", samples=448))
+    assert played.outcome == "inconclusive"
+    assert "the device took in 448 samples, where 224 were heard of" in played.why
+
+
+# ---- over a real line
+
+
+PLACES: tuple[tuple[Direction, str, int], ...] = (("to", "handshake", 0), ("to", "samples", 5), ("from", "samples", 40))
+"""Direction, step, and which of the frames of that step."""
+SOME = ("flip", "drop", "duplicate", "disconnect", "hang", "wrong-baud", "reset")
+REAL = [
+    *(("host", kind) for kind in KINDS if kind != "delay"),
+    *(pytest.param("qemu-m4", kind, marks=needs_firmware) for kind in SOME),
+]
+
+
+@pytest.mark.parametrize("place", PLACES, ids=lambda place: f"{place[0]}-{place[1]}")
+@pytest.mark.parametrize(("device", "kind"), REAL)
+def test_fault_leads_to_the_same_over_a_real_line(device: str, kind: str, place: tuple[Direction, str, int]) -> None:
+    direction, step, nth = place
+    number = steps("sample")[direction].index(step) + nth
+    played = play(Case(WireFaults((WireFault(kind, direction, number),))), describe(device).wire, timeout_s=1.0)
+    assert played.outcome in documented()[kind, direction][step], played.why
