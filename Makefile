@@ -8,6 +8,8 @@ JOBS ?= 2
 ARGS ?=
 PYTEST_ARGS ?=
 FUZZ_S ?= 60
+FAULTS_N ?= 100000
+FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
@@ -19,13 +21,27 @@ NATIVE_SOURCES := $(wildcard emulator/*.[ch] harness/*.c estimator_c/*/*.[ch] es
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
+# The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
+CORES := m0 m3 m4 m7
+FIRMWARE := $(CORES:%=$(BUILD)/firmware/analogrig-%.elf)
+CPU_m0 := -mcpu=cortex-m0 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_BOARD_CHOICE
+CPU_m3 := -mcpu=cortex-m3 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M3_CHOICE
+CPU_m4 := -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M4_CHOICE
+CPU_m7 := -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M7_CHOICE
+FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation device ports/loop ports/cortex_m)
+FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -fno-tree-loop-distribute-patterns -ffunction-sections -DNDEBUG \
+    -Wall -Wextra -Wdouble-promotion -Wno-type-limits -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/cortex_m/include \
+    -I$(BUILD)/generated
+FIRMWARE_LDFLAGS := -nostdlib -nostartfiles -Wl,--gc-sections,-z,noexecstack -T estimator_c/ports/cortex_m/mps2.ld
+
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench cost coverage bit-exact analyze eva fuzz wheel lock clean distclean
+.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults \
+        wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -36,7 +52,7 @@ setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every oth
 run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="--seed 7" goes to analogrig run
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
-test: check ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
+test: check firmware ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 check: lint strict ## linters, types, and the C with every warning an error
@@ -55,13 +71,21 @@ format: $(PRODUCTS) ## lay out the Python sources
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
 
-fuzz: ## libFuzzer over core and isolation, with sanitizers, for FUZZ_S seconds; what it finds stays in build/fuzz
-	@mkdir -p $(BUILD)/fuzz/corpus
-	@clang -std=c99 -g -O1 -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=undefined -ffp-contract=off \
-	    -DEST_NC_MAX=2U -Iestimator_c/core -Iestimator_c/isolation estimator_c/fuzz/fuzz_est.c estimator_c/core/*.c \
-	    estimator_c/isolation/*.c -o $(BUILD)/fuzz/fuzz_est
-	@cd $(BUILD)/fuzz && if ./fuzz_est -max_total_time=$(FUZZ_S) -max_len=512 -print_final_stats=1 corpus 2>log; \
-	    then grep "^stat::" log; else tail -60 log; exit 1; fi
+firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F and M7, into build/firmware; needs gcc-arm-none-eabi
+	@arm-none-eabi-size $(FIRMWARE)
+
+$(BUILD)/firmware/analogrig-m0.elf: estimator_c/ports/cortex_m0/float.S
+
+$(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/mps2.ld $(PRODUCTS)
+	@mkdir -p $(@D)
+	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) $(filter %.S,$^) $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c)) \
+	    $(BUILD)/generated/*.c -lgcc -o $@
+
+fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
+	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
+
+faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
+	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
 
 coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage

@@ -216,6 +216,9 @@ def _add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
     )
     command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
     command.add_argument(
+        "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
+    )
+    command.add_argument(
         "--report-interval", type=int, metavar="N", help="the device reports its estimate every N samples"
     )
     command.add_argument(
@@ -269,6 +272,7 @@ def _changes(arguments: argparse.Namespace) -> dict[str, Any]:
         "exchange": arguments.exchange or in_real_time,
         "baud": arguments.baud,
         "report_interval_n": arguments.report_interval,
+        "wire_faults": arguments.wire_faults,
     }
 
 

@@ -89,12 +89,13 @@ class Conversation:
         return self.answer(request, kind, self.send(request))
 
     def answer(
-        self, request: Message, kind: type[Answer], deadline_s: float, *, only: tuple[type[Message], ...] | None = None
+        self, request: Message, kind: type[Answer], deadline_s: float, *, after_anything: bool = False
     ) -> Answer:
-        """The next answer to ``request``. What an earlier run that ended badly has left in the line is passed over.
+        """The next answer to ``request``. It may come ``after_anything`` that an earlier run has left in the line, or
+        else after nothing but answers to those who asked for the identity several times.
 
         :raises LinkTimeout: none came in time.
-        :raises DeviceError: a message of another type than those of ``only`` came first.
+        :raises DeviceError: something else came first: the device has obeyed what it was not told now.
         """
         while True:
             message = self.receive(deadline_s)
@@ -105,7 +106,7 @@ class Conversation:
                 )
             if isinstance(message, kind) and message.answers == request.seq:
                 return message
-            if only is not None and not isinstance(message, only):
+            if not after_anything and not isinstance(message, Hello | Firmware):
                 raise DeviceError(f"device {self.name}: {_brief(message)} came too late")
 
     def _named(self, error: LinkError) -> LinkError:

@@ -22,6 +22,7 @@ from harness.estimator_config import EstimatorConfig
 from harness.link import FramedLink, Link
 from harness.timed_wire import TimedWire
 from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire, Wire
+from harness.wire_faults import FaultyWire, WireFaults
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
@@ -53,6 +54,8 @@ class DeviceDescription:
     """A run in which more samples were lost on the way to the device is INCONCLUSIVE."""
     timeout_s: float = DEFAULT_TIMEOUT_S
     """For the answers to one message."""
+    wire_faults: str = ""
+    """What shall go wrong on the line (``WireFaults.parse``)."""
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
 
     def __post_init__(self) -> None:
@@ -60,6 +63,10 @@ class DeviceDescription:
             raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
         if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
             raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+        try:
+            WireFaults.parse(self.wire_faults)
+        except ConfigurationError as error:
+            raise ValueError(str(error)) from error
         for name, least, most in (("window", 1, 255), ("report_interval_n", 1, 65535), ("most_lost_n", 0, 2**31)):
             if not least <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
@@ -79,7 +86,7 @@ class DeviceDescription:
 
         :raises LinkError: it cannot be reached.
         """
-        wire = self.wire()
+        wire = FaultyWire(self.wire, WireFaults.parse(self.wire_faults)) if self.wire_faults else self.wire()
         return FramedLink(wire if self.baud is None else TimedWire(wire, self.baud))
 
     def wire(self) -> Wire:

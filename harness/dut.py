@@ -32,7 +32,6 @@ from harness.catalogue import (
     FirmwareId,
     Hello,
     Identify,
-    Message,
     Result,
     Status,
 )
@@ -233,7 +232,7 @@ class Dut:
     def _is_there(self) -> None:
         """That the device is who it was, and has said nothing that was not heard."""
         try:
-            self._same(self._call(only=(Hello, Firmware)))
+            self._same(self._call())
         except (LinkClosed, LinkTimeout):
             raise
         except LinkError:
@@ -251,28 +250,29 @@ class Dut:
     def _identify(self) -> Identity:
         """Whatever is in the line from before."""
         self._talk.begin()
-        return self._call()
+        return self._call(after_anything=True)
 
-    def _call(self, *, only: tuple[type[Message], ...] | None = None) -> Identity:
+    def _call(self, *, after_anything: bool = False) -> Identity:
         """Ask who is there until there is an answer; what came before the first question does not matter."""
         deadline_s = self._talk.clock() + self._talk.timeout_s
         while True:
             try:
-                return self._ask_identity(min(deadline_s, self._talk.clock() + _HELLO_AGAIN_S), only)
+                again_s = self._talk.clock() + _HELLO_AGAIN_S
+                return self._ask_identity(min(deadline_s, again_s), after_anything=after_anything)
             except LinkTimeout:
                 if self._talk.clock() >= deadline_s:
                     raise
 
-    def _ask_identity(self, deadline_s: float, only: tuple[type[Message], ...] | None) -> Identity:
+    def _ask_identity(self, deadline_s: float, *, after_anything: bool) -> Identity:
         request = Identify(self._talk.next_seq())
         self._talk.send(request)
-        hello = self._talk.answer(request, Hello, deadline_s, only=only)
+        hello = self._talk.answer(request, Hello, deadline_s, after_anything=after_anything)
         if hello.catalogue_hash != CATALOGUE_HASH:
             raise CatalogueMismatch(
                 f"device {self.name}: it speaks catalogue {hello.catalogue_hash:#010x}, this harness"
                 f" {CATALOGUE_HASH:#010x}: build both from the same analogrig.dbc"
             )
-        firmware = self._talk.answer(request, Firmware, deadline_s, only=only)
+        firmware = self._talk.answer(request, Firmware, deadline_s, after_anything=after_anything)
         return Identity(
             firmware=_word(FirmwareId, firmware.firmware_id),
             catalogue_hash=hello.catalogue_hash,

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import config, information
-from harness.catalogue import Change
+from harness.catalogue import Change, SteppedFlag
 from harness.plant import PARAMETERS, physical_parameters
-from harness.run import Run
+from harness.run import LOST, Run
 
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
@@ -309,6 +309,10 @@ def _losses(run: Run) -> list[str]:
     missed = run.conditions.counters.get("samples_lost", known)
     if missed != known:
         reasons.append(f"the device never saw {missed} samples, where {known} are known to be lost")
+    heard_of = int(((run.flags & (LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)) == 0).sum())
+    taken_in = run.conditions.counters.get("updated", heard_of)
+    if taken_in != heard_of:
+        reasons.append(f"the device took in {taken_in} samples, where {heard_of} were heard of")
     return reasons
 
 

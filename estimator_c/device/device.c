@@ -4,8 +4,12 @@
 #include "settings.h"
 
 #ifndef DEVICE_ASSERT
+#ifdef NDEBUG  // a freestanding compiler has no assert.h
+#define DEVICE_ASSERT(x) ((void)0)
+#else
 #include <assert.h>
 #define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
 #endif
 
 #if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
@@ -396,11 +400,12 @@ static void put_counter(device_t* const self, answer_t* const answer) {
 
 // ---------------------------------------------        MESSAGES        ---------------------------------------------
 
-/// Every message is numbered. One with the number of the last is a repetition, which must not be obeyed twice; false for
-/// that. Identify begins a conversation, so its number is any.
+/// Every message is numbered. One with the number of any of the last ones is a repetition, which must not be obeyed twice;
+/// false for that. Identify begins a conversation, so its number is any.
 static bool sequence_allows(device_t* const self, const uint8_t id, const uint8_t seq) {
-    const bool begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
-    if (!begins && (seq == (uint8_t)(self->seq_expected - 1U))) {
+    const bool    begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
+    const uint8_t behind = (uint8_t)(self->seq_expected - seq);
+    if (!begins && (behind >= 1U) && (behind <= DEVICE_LATE_MAX)) {
         add(&self->counters.messages_repeated, 1U);
         return false;
     }
@@ -476,6 +481,11 @@ device_run(device_t* const self, const uint8_t* const in, const size_t in_n, uin
         progress.given += answer.n;
     }
     return progress;
+}
+
+void device_overrun(device_t* const self, const uint32_t lost_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.receive_overruns, lost_n);
 }
 
 bool device_is_busy(const device_t* const self) {

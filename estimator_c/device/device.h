@@ -38,6 +38,9 @@ extern "C" {
 /// the time that one message may take.
 #define DEVICE_GAP_MAX 1024U
 
+/// A message that comes again, however late, must not be obeyed twice: one with a sequence number so far behind is one.
+#define DEVICE_LATE_MAX 32U
+
 /// Slices of work on a diagnosis with each sample. A sample takes EST_ISOLATION_ONSETS_N of them, and at the alarm up to 24
 /// are waiting: with twice as many the diagnosis comes 0.7 samples later than with all of them at once.
 #define DEVICE_ISOLATION_SLICES (2U * EST_ISOLATION_ONSETS_N)
@@ -53,7 +56,7 @@ typedef struct {
 /// Counters since device_init() or RESET. They saturate, they do not wrap.
 typedef struct {
     uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
-    uint32_t messages_repeated;      ///< messages with the sequence number of the last; ignored
+    uint32_t messages_repeated;      ///< messages with one of the last DEVICE_LATE_MAX sequence numbers; ignored
     uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
     uint32_t samples_lost;           ///< skipped indices
     uint32_t samples_ignored;        ///< samples that came again or late
@@ -109,6 +112,9 @@ void device_init(device_t* self, const device_identity_t* identity);
 /// Cost: per byte O(1); per sample one est_step() and its answers; a gap at most DEVICE_GAP_MAX missing samples on top,
 /// for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
 device_progress_t device_run(device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
+
+/// So many bytes came that the port could not keep. The harness can ask for their sum.
+void device_overrun(device_t* self, uint32_t lost_n);
 
 /// Whether answers to input already taken are still to come.
 bool device_is_busy(const device_t* self);

@@ -1,8 +1,12 @@
 #include "frame.h"
 
 #ifndef FRAME_ASSERT
+#ifdef NDEBUG  // a freestanding compiler has no assert.h
+#define FRAME_ASSERT(x) ((void)0)
+#else
 #include <assert.h>
 #define FRAME_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
 #endif
 
 #if ANALOGRIG_LENGTH_MAX > 248

@@ -23,6 +23,9 @@ HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
 FLOAT_ROUTINES = HERE.parent / "ports" / "cortex_m0" / "float.S"
 ISOLATION = HERE.parent / "isolation"
+DEVICE = HERE.parent / "device"
+LIBC = HERE.parent / "ports" / "cortex_m" / "include"
+CODECS = Path("build/generated")
 RESULTS = Path("build/cost.json")
 
 COMPILER = "arm-none-eabi-gcc"
@@ -34,6 +37,9 @@ FLAGS = (
     *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are one byte here
     *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}"),
 )
+
+CLOCK_MHZ, CYCLES = 168.0, 1.5
+"""For estimates of time: the clock of a usual M4F, and cycles per instruction (1.2 to 2, as its memory has it)."""
 
 EVEN = 1.2
 """The worst step may take so many times the instructions of a typical one."""
@@ -276,6 +282,15 @@ class Bench:
         entered = count_steps(image, processor.machine, *calls[1:], calls[0])
         yield Steps(f"{processor.name}, isolation, a sample entered", entered)
 
+    def device(self, processor: Processor) -> Steps:
+        """The steps of the device: a frame decoded, a sample entered, its answers encoded."""
+        sources = [HERE / "image.c", HERE / "subject_device.c", *all_sources()]
+        sources += [*sorted(DEVICE.glob("*.c")), *sorted(CODECS.glob("*.c"))]
+        folders = [f"-I{folder}" for folder in (DEVICE, CODECS, LIBC)]
+        image = link(self._folder / "image.elf", sources, ("-O2", *processor.flags, *folders))
+        counts = count_steps(image, processor.machine, "device_step", "between_steps")
+        return Steps(f"{processor.name}, the whole device, n = 6", counts)
+
     def _steps(
         self, name: str, processor: Processor, sources: Sequence[Path], flags: Sequence[str], step: str
     ) -> Steps:
@@ -312,6 +327,16 @@ def costs(folder: Path) -> Iterator[Cost]:
     state_bytes = bench.state_bytes("estimator")
     yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
     yield from isolation(bench)
+    for processor in (M4F, M3):
+        yield from device(bench.device(processor))
+
+
+def device(steps: Steps) -> Iterator[Cost]:
+    """A sample's frame in, the eight frames of its answer out; and the time that this may take."""
+    yield Cost(steps.name, steps.typical, "instructions")
+    yield Cost(f"{steps.name}, worst", max(steps.counts), "instructions")
+    estimate_us = steps.typical * CYCLES / CLOCK_MHZ
+    yield Cost(f"{steps.name}, an estimate of its time at {CLOCK_MHZ:g} MHz", round(estimate_us, 1), "us")
 
 
 def isolation(bench: Bench) -> Iterator[Cost]:

@@ -59,7 +59,7 @@ def measured(pytest_arguments: tuple[str, ...] = ()) -> Coverage:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         tests = sorted(str(path) for path in (ROOT / "tests" / "estimator_c").glob("test_est_*.py"))
-        slow = ("test_est_fuzz.py", "test_est_builds.py")  # builds of their own
+        slow = ("test_fuzz.py", "test_est_builds.py")  # builds of their own
         chosen = [path for path in tests if not path.endswith(slow)]
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *pytest_arguments]
         environment = os.environ | {"EST_COVERAGE": str(folder)}

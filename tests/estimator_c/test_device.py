@@ -244,6 +244,13 @@ def test_change_is_diagnosed_once(device: Device, change: isolation.Change, name
     assert abs(said.onset_index - CHANGED_AT) <= 8
 
 
+def test_onset_lies_before_the_alarm(device: Device) -> None:
+    u, y = changed_codes({"K": 0.8})
+    answers = [message for k in range(len(u)) for message in device.sample(k, u[k], y[k])]
+    ((alarm, *_), (said,)) = of(Alarm, answers), of(Diagnosis, answers)
+    assert said.onset_index < alarm.sample_index
+
+
 def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
     u, y = changed_codes({"K": 0.8})
     first = 65536 - CHANGED_AT - 2
@@ -256,8 +263,8 @@ def test_onset_is_told_across_the_end_of_the_index(device: Device) -> None:
 def test_zero_of_the_force_is_taken_from_the_configuration(idle: Device) -> None:
     idle.configure(Key.FORCE_ZERO, 1000.0)
     idle.control(Command.START)
-    ((_, said),) = diagnosed(idle, *changed_codes({"M": 0.8}, zero=1000))
-    assert said.change == Change.MASS
+    ((_, said),) = diagnosed(idle, *changed_codes({"K": 0.8}, zero=1000))
+    assert said.change == Change.STIFFNESS
     assert said.extent == pytest.approx(0.8, rel=0.03)
 
 
@@ -357,6 +364,15 @@ def test_message_that_comes_twice_is_obeyed_once(device: Device) -> None:
     assert device.repeat(start, advance=1) != []
     assert device.repeat(start) == []
     assert device.counters()[Counter.MESSAGES_REPEATED] == 1  # RESET has cleared the first
+
+
+def test_message_that_comes_again_late_is_not_obeyed(device: Device) -> None:
+    first = device.seq
+    answers = [device.repeat(Control((first + i) % 256, Command.REPORT_INTERVAL, 1), advance=1) for i in range(40)]
+    assert [] not in answers
+    assert device.repeat(Control((first + 40 - 32) % 256, Command.RESET, 0)) == []
+    assert device.counters()[Counter.MESSAGES_REPEATED] == 1
+    assert device.repeat(Control((device.seq - 33) % 256, Command.STOP, 0)) != []  # cannot be told from a new one
 
 
 def test_skipped_samples_are_missing_to_the_estimator(device: Device, estimator: Estimator) -> None:

@@ -118,12 +118,12 @@ def test_offset_of_the_displacement_is_not_taken_for_stiffness(estimator: Estima
 
 
 def test_zero_of_the_force_may_lie_anywhere_in_its_range(estimator: Estimator) -> None:
-    """As on a card from -1 to 11 V; were 0 taken for it, the force that a heavier mass feels would be another."""
-    played = isolation.play(FRONT, {"M": 0.8}, FULL, 60, seed=7)
+    """As on a card from -1 to 11 V; were 0 taken for it, the spring would carry another force."""
+    played = isolation.play(FRONT, {"K": 0.8}, FULL, 60, seed=7)
     assert estimator.init(**OWN_CLOCK)
     found = estimator.isolate(played.u + 1000.0, played.y + 2048.0, played.onset, force_zero=1000.0)
-    assert (found.change == "M").mean() > 0.9
-    assert abs(found.extent[found.change == "M"].mean() - 0.8) < 0.01
+    assert (found.change == "K").mean() > 0.9
+    assert abs(found.extent[found.change == "K"].mean() - 0.8) < 0.01
 
 
 @pytest.mark.parametrize("settings", [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}], ids=str)

@@ -11,12 +11,14 @@ import pytest
 from harness.devices import FIRMWARE, QEMU
 
 CORES = ("m3", "m4", "m7")
+"""Those that QEMU has a board of."""
 
 FOLDER = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
 
 needs_firmware = [
     pytest.mark.skipif(shutil.which(QEMU) is None, reason=f"no {QEMU}: apt-get install qemu-system-arm"),
     pytest.mark.skipif(
-        not all((FOLDER / f"analogrig-{core}.elf").exists() for core in CORES), reason="no firmware: make firmware"
+        not all((FOLDER / f"analogrig-{core}.elf").exists() for core in ("m0", *CORES)),
+        reason="no firmware: make firmware",
     ),
 ]

@@ -18,12 +18,17 @@ from harness.catalogue import (
     CATALOGUE_HASH,
     Alarm,
     Change,
+    Command,
+    Configure,
     Configured,
+    Control,
     Controlled,
     Diagnosis,
     Estimate,
+    Firmware,
     Hello,
     Identify,
+    Key,
     Message,
     Sample,
     SampleBlock,
@@ -418,8 +423,7 @@ def test_counters_are_those_of_the_run(line: FaultyLink) -> None:
     assert dut.stop()["samples_lost"] == 0
 
 
-def test_sample_that_comes_after_it_was_given_up_ends_the_run(line: FaultyLink) -> None:
-    """The device has entered it, which was not to be."""
+def test_sample_that_comes_after_it_was_given_up_stays_lost(line: FaultyLink) -> None:
     kept: list[Message] = []
 
     def hold_back(message: Message) -> list[Message]:
@@ -430,8 +434,81 @@ def test_sample_that_comes_after_it_was_given_up_ends_the_run(line: FaultyLink) 
 
     dut = started(line)
     line.to_device = hold_back
-    with pytest.raises(DeviceError, match=r"Estimate of THETA_0 for sample 82 was due, Estimate\(.*sample_index=81"):
-        feed(dut, 0, N)
+    assert_same_but_for_the_loss(feed(dut, 0, N), [81])
+    counters = dut.stop()
+    assert counters["messages_repeated"] == counters["samples_lost"] == 1
+
+
+def test_command_that_comes_again_late_is_not_obeyed(line: FaultyLink, reference: Replies) -> None:
+    """A RESET after half of the configuration would leave the other half at its defaults."""
+    kept: list[Message] = []
+
+    def come_again(message: Message) -> list[Message]:
+        if isinstance(message, Control) and message.command == Command.RESET:
+            kept.append(message)
+        return [message, *kept] if isinstance(message, Configure) and message.key == Key.CEILING else [message]
+
+    line.to_device = come_again
+    dut = started(line)
+    assert_same(feed(dut, 0, N), reference)
+    assert dut.stop()["messages_repeated"] == 0  # RESET came before the run
+
+
+def test_command_that_the_device_obeys_again_is_told(line: FaultyLink) -> None:
+    """As if it had come so late that the device takes it for a new one."""
+
+    def obey_again(message: Message) -> list[Message]:
+        if isinstance(message, Configure) and message.key == Key.CEILING:
+            line.inner.send([Control((message.seq - 100) % 256, Command.RESET, 0)])
+        return [message]
+
+    line.to_device = obey_again
+    with pytest.raises(DeviceError, match="^device bob: Controlled came too late$"):
+        started(line)
+
+
+def test_sample_that_the_line_has_kept_since_the_run_before_is_not_taken(line: FaultyLink, reference: Replies) -> None:
+    """It comes at the very moment when it would fit."""
+    kept: list[Message] = []
+
+    def keep(message: Message) -> list[Message]:
+        kept.append(message)
+        return []
+
+    dut = started(line)
+    line.to_device = about(Sample, 81, keep)
+    feed(dut, 0, N)
+    dut.stop()
+    dut.start()
+    line.to_device = about(Sample, 81, lambda message: [kept.pop(), message])
+    assert_same(feed(dut, 0, N), reference)
+    assert dut.stop()["samples_of_other_runs"] == 1
+
+
+@pytest.mark.parametrize(("window", "room", "most"), [(4, 2, 2), (3, 200, 3), (4, 0, 1)])
+def test_no_more_blocks_are_on_their_way_than_the_device_can_hold(
+    line: FaultyLink, reference: Replies, window: int, room: int, most: int
+) -> None:
+    unanswered: list[int] = []
+    most_unanswered = 0
+
+    def to_device(message: Message) -> list[Message]:
+        nonlocal most_unanswered
+        if isinstance(message, SampleBlock):
+            unanswered.append(message.sample_index + message.flags % 16 - 1)
+            most_unanswered = max(most_unanswered, len(unanswered))
+        return [message]
+
+    def from_device(message: Message) -> list[Message]:
+        if isinstance(message, Firmware):
+            return [message._replace(input_blocks=room)]
+        if isinstance(message, Stepped) and message.sample_index == unanswered[0]:
+            unanswered.pop(0)
+        return [message]
+
+    line.to_device, line.from_device = to_device, from_device
+    assert_same(feed(started(line, exchange="stream", window=window), 0, N), reference)
+    assert most_unanswered == most
 
 
 @pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81 and Hello")])

@@ -22,6 +22,7 @@ from harness.config import locate
 from harness.devices import HOST_PROGRAM
 from harness.plant import Plant
 from harness.run import Run
+from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import descendants
 from tests.harness.runs import made_run
 
@@ -99,6 +100,15 @@ def test_same_seed_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict
     _, out = thesis
     assert run_json("run", "--seed", "3", cwd=tmp_path)["theta_hash"] == out["theta_hash"]
     assert run_json("run", "--seed", "4", cwd=tmp_path)["theta_hash"] != out["theta_hash"]
+
+
+@pytest.mark.parametrize("dut", ["inproc", *(pytest.param(f"qemu-{core}", marks=needs_firmware) for core in CORES)])
+def test_every_device_gives_the_same_estimates_bit_for_bit(
+    thesis: tuple[Path, dict[str, Any]], tmp_path: Path, dut: str
+) -> None:
+    out = run_json("run", "--seed", "3", "--dut", dut, cwd=tmp_path)
+    assert out["theta_hash"] == thesis[1]["theta_hash"]
+    assert out["dut"]["kind"] == dut
 
 
 def test_replay_gives_the_same_estimates_bit_for_bit(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -367,6 +377,19 @@ def test_absurd_values_are_one_line(tmp_path: Path) -> None:
             (tmp_path / "absurd.toml").write_text(text.replace(old, new))
             assert "absurd.toml" in refusal("run", option[kind], "absurd.toml", cwd=tmp_path)
     assert "File name too long" in refusal("run", "--scenario", "x" * 300, cwd=tmp_path)
+
+
+def test_real_time_and_baud_are_options(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    """Slow enough for any machine that tests run on: 1800 samples in 1.8 s."""
+    out = run_json("run", "--seed", "3", "--real-time", "20", cwd=tmp_path)
+    assert (out["theta_hash"], out["real_time"]) == (thesis[1]["theta_hash"], 20.0)
+    assert out["dut"]["exchange"] == "stream"
+    timed = run_json("run", "--seed", "3", "--baud", "115200", cwd=tmp_path)
+    assert timed["line_s"] == pytest.approx(1800 * 144 * 10 / 115_200, rel=0.001)
+    line = refusal("run", "--seed", "3", "--baud", "115200", "--real-time", cwd=tmp_path)
+    assert "real time does not fit its line" in line
+    assert "--real-time" in refusal("run", "--real-time", "0", cwd=tmp_path)
+    assert "baud must be 1" in refusal("run", "--baud", "0", cwd=tmp_path)
 
 
 def test_wrong_option_is_a_usage_error(tmp_path: Path) -> None:

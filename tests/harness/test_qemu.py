@@ -6,6 +6,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,8 @@ from tests.harness.firmware import CORES, FOLDER, needs_firmware
 from tests.harness.processes import descendants
 
 pytestmark = needs_firmware
+
+GCC = "arm-none-eabi-gcc"
 
 LONGEST = 450
 """Samples of a scenario that a test plays under QEMU, at a thousand a second."""
@@ -61,18 +64,33 @@ def reference(request: pytest.FixtureRequest) -> tuple[Scenario, Run]:
     return scenario, play(InprocDevice(name="bob"), scenario)
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"inproc", "serial"}))
+DEVICES = [
+    *({"kind": kind} for kind in KINDS if kind not in ("inproc", "serial")),
+    {"kind": "qemu-m3", "firmware": str(FOLDER / "analogrig-m0.elf")},
+]
+
+
+@pytest.mark.parametrize("device", DEVICES, ids=lambda device: "-".join(Path(word).stem for word in device.values()))
 @pytest.mark.parametrize("exchange", ["sample", "stream"])
 def test_every_scenario_gives_the_same_bits_on_every_device(
-    reference: tuple[Scenario, Run], kind: str, exchange: str
+    reference: tuple[Scenario, Run], device: dict[str, str], exchange: str
 ) -> None:
+    """Of M0 the image, on an M3: there is no board of its own."""
     scenario, expected = reference
-    run = play(from_table({"name": kind, "kind": kind, "exchange": exchange}, kind), scenario)
+    run = play(from_table({"name": "bob", "exchange": exchange, **device}, "bob"), scenario)
     assert run.conditions.faults == ()
     assert run.theta_hash() == expected.theta_hash()
     assert (run.statistic == expected.statistic).all()
     assert (run.flags == expected.flags).all()
     assert run.alarm_index.tolist() == expected.alarm_index.tolist()
+
+
+def test_firmware_of_the_m0_gives_the_same_bits_on_the_board_of_the_m3() -> None:
+    """QEMU has no board of this kind with an M0, whose instructions are some of an M3's."""
+    scenario = shortened("thesis")
+    run = play(describe(f"qemu-m3:{FOLDER}/analogrig-m0.elf"), scenario)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == play(InprocDevice(name="bob"), scenario).theta_hash()
 
 
 def test_shortened_scenarios_still_have_alarms() -> None:
@@ -133,6 +151,21 @@ def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> Non
     (tmp_path / "nothing.elf").write_bytes(b"")
     with pytest.raises(LinkError, match=r"QEMU \(mps2-an386\) ended with status -6: qemu: fatal: Lockup"):
         connect(describe(f"qemu-m4:{tmp_path}/nothing.elf"))
+
+
+@pytest.mark.skipif(shutil.which(GCC) is None, reason=f"no {GCC}: apt-get install gcc-arm-none-eabi")
+def test_hard_fault_is_told_in_the_words_of_the_firmware(tmp_path: Path) -> None:
+    """The project's own start-up code, and a program that writes where nothing is."""
+    (tmp_path / "main.c").write_text("int main(void) { *(volatile int*)0xE0200000 = 1; return 0; }\n")
+    port = Path(__file__).parents[2] / "estimator_c" / "ports" / "cortex_m"
+    sources = [str(path) for path in (tmp_path / "main.c", port / "start.c", port / "semihosting.c")]
+    (tmp_path / "vectors.c").write_text("void uart_receive_interrupt(void) {}\nvoid uart_transmit_interrupt(void) {}\n")
+    image = str(tmp_path / "faulty.elf")
+    options = ["-mcpu=cortex-m4", "-mthumb", "-ffreestanding", "-nostdlib", "-nostartfiles"]
+    paths = [f"-I{port}", f"-I{port / 'include'}", "-T", str(port / "mps2.ld"), str(tmp_path / "vectors.c")]
+    subprocess.run([GCC, *options, *paths, *sources, "-lgcc", "-o", image], check=True)
+    with pytest.raises(LinkClosed, match=r"QEMU \(mps2-an386\) ended with status \d+: analogrig: hard fault"):
+        connect(describe(f"qemu-m4:{image}"))
 
 
 def test_absent_firmware_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

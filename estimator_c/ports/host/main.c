@@ -4,7 +4,7 @@
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
-#include "device.h"
+#include "device_loop.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -17,10 +17,6 @@
 #include <unistd.h>
 
 #define EXIT_USAGE 2
-
-/// A burst of blocks and all their answers; when either is full the line waits.
-#define INPUT_SIZE 4096U
-#define OUTPUT_SIZE 16384U
 
 static const char usage_text[] =
     "usage: analogrig-device [--catalogue-hash HEX] [PATH]\n"
@@ -37,16 +33,11 @@ typedef struct {
     uint32_t    catalogue_hash;
 } options_t;
 
-/// The line, and what is on its way from and to it.
-typedef struct {
-    int     fd;
-    uint8_t input[INPUT_SIZE];
-    size_t  input_from;
-    size_t  input_to;
-    uint8_t output[OUTPUT_SIZE];
-    size_t  output_from;
-    size_t  output_to;
-} line_t;
+/// The line to the harness.
+static struct {
+    int  fd;
+    bool lost;  ///< errno says why
+} line;
 
 static int fail(const char* const what, const char* const name) {
     (void)fprintf(stderr, "analogrig-device: %s %s: %s\n", what, name, strerror(errno));
@@ -142,53 +133,49 @@ static int open_terminal(void) {
 
 static bool is_transient(void) { return (errno == EAGAIN) || (errno == EWOULDBLOCK) || (errno == EINTR); }
 
-/// False iff the line is gone.
-static bool receive(line_t* const line) {
-    const ssize_t n = read(line->fd, line->input, sizeof(line->input));
-    if (n > 0) {
-        line->input_from = 0U;
-        line->input_to   = (size_t)n;
-        return true;
-    }
-    if (n == 0) {
-        errno = EIO;  // the end of a serial device is no success
-        return false;
-    }
-    return is_transient();
+// ---------------------------------------------        THE PORT        ---------------------------------------------
+
+static void lose(const int reason) {
+    line.lost = true;
+    errno     = reason;
 }
 
-/// False iff the line is gone.
-static bool transmit(line_t* const line) {
-    const ssize_t n = write(line->fd, &line->output[line->output_from], line->output_to - line->output_from);
-    if (n >= 0) {
-        line->output_from += (size_t)n;
-        return true;
+uint32_t port_boot_nonce(void) {
+    uint32_t      nonce = 0U;
+    const int     fd    = open("/dev/urandom", O_RDONLY);
+    const ssize_t n     = (fd >= 0) ? read(fd, &nonce, sizeof(nonce)) : -1;
+    if (fd >= 0) {
+        (void)close(fd);
     }
-    return is_transient();
+    if (n != (ssize_t)sizeof(nonce)) {
+        (void)fail("cannot read", "/dev/urandom");
+        exit(EXIT_FAILURE);
+    }
+    return nonce;
 }
 
-#define WAIT_FOR_EVER (-1)
-
-// ---------------------------------------------        THE LOOP        ---------------------------------------------
-
-/// Lets the device work on what has come, as far as its answers have room.
-static void work(device_t* const device, line_t* const line) {
-    if (line->output_from == line->output_to) {
-        line->output_from = 0U;
-        line->output_to   = 0U;
+size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) {
+    (void)lost;  // what is not read waits in the line
+    const ssize_t received = read(line.fd, bytes, n);
+    if (received > 0) {
+        return (size_t)received;
     }
-    const device_progress_t progress =
-        device_run(device, &line->input[line->input_from], line->input_to - line->input_from,
-                   &line->output[line->output_to], sizeof(line->output) - line->output_to);
-    line->input_from += progress.taken;
-    line->output_to += progress.given;
+    if (received == 0) {
+        lose(EIO);  // the end of a serial device is no success
+    } else if (!is_transient()) {
+        lose(errno);
+    } else {
+        // nothing has come
+    }
+    return 0U;
 }
 
-static bool has_output(const line_t* const line) { return line->output_from != line->output_to; }
-
-/// New input is read only when the old is done with: until then it waits in the line, and its sender with it.
-static bool wants_input(const device_t* const device, const line_t* const line) {
-    return (line->input_from == line->input_to) && !device_is_busy(device);
+size_t port_transmit(const uint8_t* const bytes, const size_t n) {
+    const ssize_t sent = write(line.fd, bytes, n);
+    if ((sent < 0) && !is_transient()) {
+        lose(errno);
+    }
+    return (sent > 0) ? (size_t)sent : 0U;
 }
 
 /// True iff standard input has ended. What it says before does not matter.
@@ -202,73 +189,45 @@ static bool parent_is_gone(const short events) {
 }
 
 /// Hung up, and nothing left to read.
-static bool is_lost(const short events) {
+static bool has_hung_up(const short events) {
     return ((events & (POLLHUP | POLLERR | POLLNVAL)) != 0) && ((events & POLLIN) == 0);
 }
 
-/// One turn: wait, move bytes, work. Returns false when it is over, with *ok telling whether that is well.
-static bool turn(device_t* const device, line_t* const line, bool* const ok) {
-    const short   in     = wants_input(device, line) ? POLLIN : 0;
-    const short   out    = has_output(line) ? POLLOUT : 0;
+#define WAIT_FOR_EVER (-1)
+
+bool port_idle(const bool wants_input, const bool has_output) {
+    const short   in     = wants_input ? POLLIN : 0;
+    const short   out    = has_output ? POLLOUT : 0;
     struct pollfd fds[2] = {
         { .fd = STDIN_FILENO, .events = POLLIN },
-        { .fd = line->fd, .events = (short)(in | out) },
+        { .fd = line.fd, .events = (short)(in | out) },
     };
-    // Work that is left over while the output is empty waits for nobody.
-    const int timeout_ms = ((in == 0) && (out == 0)) ? 0 : WAIT_FOR_EVER;
-    if (poll(fds, 2, timeout_ms) < 0) {
-        *ok = errno == EINTR;
-        return *ok;
+    if (line.lost) {
+        return false;
+    }
+    if (poll(fds, 2, WAIT_FOR_EVER) < 0) {
+        if (errno != EINTR) {
+            lose(errno);
+        }
+        return !line.lost;
     }
     if (parent_is_gone(fds[0].revents)) {
         return false;
     }
-    if (is_lost(fds[1].revents)) {
-        errno = EIO;
-        *ok   = false;
-        return false;
+    if (has_hung_up(fds[1].revents)) {
+        lose(EIO);
     }
-    if ((fds[1].revents & POLLOUT) != 0) {
-        *ok = transmit(line);
-    }
-    if (*ok && (in != 0) && ((fds[1].revents & POLLIN) != 0)) {
-        *ok = receive(line);
-    }
-    work(device, line);
-    if (*ok && has_output(line) && (out == 0)) {
-        *ok = transmit(line);  // at once, without another poll: the line is nearly always ready
-    }
-    return *ok;
-}
-
-static bool draw_nonce(uint32_t* const nonce) {
-    const int     fd = open("/dev/urandom", O_RDONLY);
-    const ssize_t n  = (fd >= 0) ? read(fd, nonce, sizeof(*nonce)) : -1;
-    if (fd >= 0) {
-        (void)close(fd);
-    }
-    return n == (ssize_t)sizeof(*nonce);
+    return !line.lost;
 }
 
 static int serve(const options_t* const options) {
-    static device_t   device;
-    static line_t     line;
-    const char*       name     = (options->path != NULL) ? options->path : "a pseudo-terminal";
-    device_identity_t identity = { .catalogue_hash = options->catalogue_hash,
-                                   .input_blocks   = INPUT_SIZE / FRAME_SIZE(ANALOGRIG_SAMPLE_BLOCK_LENGTH),
-                                   .firmware_id    = ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE };
-    if (!draw_nonce(&identity.boot_nonce)) {
-        return fail("cannot read", "/dev/urandom");
-    }
-    line.fd = (options->path != NULL) ? open_serial(options->path) : open_terminal();
+    const char* name = (options->path != NULL) ? options->path : "a pseudo-terminal";
+    line.fd          = (options->path != NULL) ? open_serial(options->path) : open_terminal();
     if (line.fd < 0) {
         return fail("cannot open", name);
     }
-    device_init(&device, &identity);
-    bool ok = true;
-    while (turn(&device, &line, &ok)) {
-    }
-    return ok ? EXIT_SUCCESS : fail("lost", name);
+    device_loop(ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
+    return line.lost ? fail("lost", name) : EXIT_SUCCESS;
 }
 
 int main(int argc, char* argv[]) {

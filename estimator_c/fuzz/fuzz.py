@@ -1,0 +1,61 @@
+"""libFuzzer over the C, with address and undefined-behaviour sanitizers: `make fuzz`, and a test.
+
+Every target is linked against all of the C that knows no operating system.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ESTIMATOR = Path(__file__).parents[1]
+GENERATED = ESTIMATOR.parent / "build" / "generated"
+PARTS = (ESTIMATOR / "core", ESTIMATOR / "isolation", ESTIMATOR / "device", GENERATED)
+
+LONGEST_INPUT = {"fuzz_est": 512, "fuzz_device": 2048}
+"""By target, in bytes: some hundred samples."""
+
+_SANITIZED = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined")
+_FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *(f"-I{part}" for part in PARTS))
+
+
+def build(target: str, folder: Path) -> Path:
+    """The program of a target, in ``folder``.
+
+    :raises subprocess.CalledProcessError: it does not compile.
+    """
+    program = folder / target
+    sources = [ESTIMATOR / "fuzz" / f"{target}.c", *(path for part in PARTS for path in sorted(part.glob("*.c")))]
+    subprocess.run(["clang", *_FLAGS, *map(str, sources), "-o", str(program)], check=True)
+    return program
+
+
+def fuzz(program: Path, seconds: int, *options: str) -> tuple[int, str]:
+    """Run it; its corpus is beside it. How many inputs it tried (0: it found something), and its log."""
+    corpus = program.with_name(f"corpus_{program.name}")
+    corpus.mkdir(exist_ok=True)
+    limits = [f"-max_total_time={seconds}", f"-max_len={LONGEST_INPUT[program.name]}", "-rss_limit_mb=1024"]
+    command = [str(program), *limits, "-print_final_stats=1", *options, corpus.name]
+    done = subprocess.run(command, cwd=program.parent, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
+    executed = re.search(r"number_of_executed_units: (\d+)", done.stderr)
+    return int(executed[1]) if executed is not None and done.returncode == 0 else 0, done.stderr
+
+
+def main() -> int:
+    """Fuzz every target in the folder that is the first argument."""
+    folder, seconds = Path(sys.argv[1]).resolve(), int(os.environ["FUZZ_S"])
+    folder.mkdir(parents=True, exist_ok=True)
+    for target in LONGEST_INPUT:
+        tried, log = fuzz(build(target, folder), seconds)
+        if not tried:
+            print(log[-4000:])
+            return 1
+        print(f"{target}: {tried} inputs in {seconds} s, nothing found")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

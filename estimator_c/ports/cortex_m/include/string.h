@@ -1,0 +1,11 @@
+/// A bare compiler has no C library: what the generated codecs ask of one. start.c has it.
+
+#ifndef STRING_H_INCLUDED
+#define STRING_H_INCLUDED
+
+#include <stddef.h>
+
+void* memset(void* to, int value, size_t n);
+void* memcpy(void* restrict to, const void* restrict from, size_t n);
+
+#endif  // STRING_H_INCLUDED

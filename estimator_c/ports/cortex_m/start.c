@@ -1,0 +1,91 @@
+/// From reset to main(): the vector table, the memory as C expects it, the floating-point unit. For any Cortex-M.
+
+#include "semihosting.h"
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define FAULT_STATUS 70U  ///< EX_SOFTWARE of sysexits.h
+
+int main(void);
+
+/// Set by mps2.ld.
+extern uint32_t data_begin;
+extern uint32_t data_end;
+extern const uint32_t data_image;
+extern uint32_t bss_begin;
+extern uint32_t bss_end;
+extern uint32_t stack_top;
+
+/// The port has them.
+void uart_receive_interrupt(void);
+void uart_transmit_interrupt(void);
+
+void start(void);
+
+/// Before any code that the compiler may have given floating-point instructions.
+__attribute__((naked)) void start_reset(void) {
+#ifdef __ARM_FP
+    __asm volatile("ldr r0, =0xE000ED88\n"
+                   "ldr r1, [r0]\n"
+                   "orr r1, r1, #0xF00000\n"
+                   "str r1, [r0]\n"
+                   "dsb\n"
+                   "isb\n");
+#endif
+    __asm volatile("ldr r0, =start\n"
+                   "bx r0\n"
+                   ".ltorg\n");
+}
+
+void start(void) {
+    const uint32_t* from = &data_image;
+    for (uint32_t* to = &data_begin; to < &data_end; to++) {
+        *to = *from++;
+    }
+    for (uint32_t* to = &bss_begin; to < &bss_end; to++) {
+        *to = 0U;
+    }
+    (void)main();
+    semihosting_end("analogrig: the device has ended\n", 0U);
+}
+
+static void fault(void) { semihosting_end("analogrig: hard fault\n", FAULT_STATUS); }
+
+static void unexpected(void) { semihosting_end("analogrig: an interrupt that nobody asked for\n", FAULT_STATUS); }
+
+typedef void (*handler_t)(void);
+
+/// Armv6-M and Armv7-M: 16 of the processor, then those of the board.
+__attribute__((section(".vectors"), used)) static const struct {
+    const uint32_t* stack;
+    handler_t       system[15];
+    handler_t       board[32];
+} vectors = {
+    .stack  = &stack_top,
+    .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
+                NULL, unexpected, unexpected },
+    .board  = { uart_receive_interrupt, uart_transmit_interrupt },
+};
+
+// What the compiler calls on its own. Not through their own loops: -fno-tree-loop-distribute-patterns.
+
+void* memset(void* to, int value, size_t n);
+void* memcpy(void* restrict to, const void* restrict from, size_t n);
+
+void* memset(void* const to, const int value, const size_t n) {
+    uint8_t* const bytes = to;
+    for (size_t i = 0U; i < n; i++) {
+        bytes[i] = (uint8_t)value;
+    }
+    return to;
+}
+
+void* memcpy(void* const restrict to, const void* const restrict from, const size_t n) {
+    uint8_t* const       bytes  = to;
+    const uint8_t* const source = from;
+    for (size_t i = 0U; i < n; i++) {
+        bytes[i] = source[i];
+    }
+    return to;
+}

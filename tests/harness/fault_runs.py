@@ -1,0 +1,357 @@
+"""Runs over a line with faults, in one process and in virtual time, each held against what may have come of it.
+
+`make faults` plays every fault at every frame, and FAULTS_N runs with faults from a seed; `make test` some of both.
+"""
+
+# ruff: noqa: S311 - the faults are drawn from a seed; they are no secret
+
+from __future__ import annotations
+
+import functools
+import itertools
+import re
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.excitation import Excitation
+from harness.bench import Bench
+from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag, unpack
+from harness.devices import InprocDevice
+from harness.dut import Dut, Replies
+from harness.errors import AnalogrigError
+from harness.estimator_config import EstimatorConfig
+from harness.frame import FrameDecoder
+from harness.link import FramedLink
+from harness.rig import Block, Performance
+from harness.run import CHANNELS, Channel, Run
+from harness.scenario import Scenario
+from harness.verdict import judge
+from harness.wire import MemoryWire, Wire
+from harness.wire_faults import DIRECTIONS, KINDS, PASSING, Direction, FaultyWire, WireFault, WireFaults
+
+N = 60
+MOST_N = 480
+CHANGE_AT = 40
+RIG_BLOCK = 112
+"""A whole number of messages."""
+TIMEOUT_S = 2.0
+LONGEST_RUN_S = 60.0
+"""Of virtual time, whatever happens: ten silences of two seconds each, delays, and the talk before and after."""
+MOST_WAITING = 20_000
+"""Messages, or bytes, that may be kept anywhere on the way."""
+
+ESTIMATOR = EstimatorConfig(forgetting=0.97, p0=1000.0, refresh_n=10, warm_up_n=20, edge_codes=32.0)
+"""Not the default, and yet as many parameters: a device that has lost its configuration looks like any other."""
+
+STEPS = ("handshake", "configuration", "start", "samples", "stop")
+
+ExchangeKind = Literal["sample", "block", "stream"]
+README = Path(__file__).parents[2] / "harness" / "README.md"
+DOCUMENTED_AS = {"same": "as without", "LOST": "lost", "INCONCLUSIVE": "inconclusive"}
+
+EXCHANGES: tuple[ExchangeKind, ...] = ("sample", "block", "stream")
+
+
+def signals() -> NDArray[np.uint16]:
+    """(MOST_N, 4) codes of a second-order system whose gain grows at CHANGE_AT; velocity and net force are zero."""
+    rng = np.random.default_rng(7)
+    codes = np.zeros((MOST_N, len(CHANNELS)))
+    u = np.where((np.arange(MOST_N) // 8) % 2, 3900.0, 150.0)
+    y = np.zeros(MOST_N)
+    for k in range(2, MOST_N):
+        gain = 1.0 if k < CHANGE_AT else 1.4
+        y[k] = 1.5 * y[k - 1] - 0.54 * y[k - 2] + gain * (0.01 * u[k - 1] + 0.02 * u[k - 2])
+    codes[:, CHANNELS.index("force")] = u
+    codes[:, CHANNELS.index("displacement")] = np.clip(np.round(y + rng.normal(size=MOST_N)), 0, 4095)
+    return codes.astype(np.uint16)
+
+
+CODES = signals()
+FORCE, DISPLACEMENT = (CODES[:, CHANNELS.index(name)] for name in ("force", "displacement"))
+
+
+class SignalsRig:
+    """Plays CODES, whatever the scenario."""
+
+    capabilities: frozenset[str] = frozenset()
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002
+        channels = {name: Channel(0.0, 1.0, "code", 1.0, 1.0) for name in CHANNELS}
+        return Performance(5e-5, 200.0, channels, (), self._blocks(scenario.samples))
+
+    def _blocks(self, n: int) -> Iterator[Block]:
+        for first in range(0, n, RIG_BLOCK):
+            codes = CODES[first : min(n, first + RIG_BLOCK)]
+            yield Block(first, codes.astype(np.float64), codes, np.zeros(codes.shape, bool))
+
+    def description(self) -> Mapping[str, Any]:
+        return {"name": "signals"}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing is held."""
+
+
+EXCITATION = Excitation(low_v=0.0, high_v=1.0, frequency_hz=200.0)
+"""Of no account: the rig plays CODES."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run to be played."""
+
+    faults: WireFaults
+    exchange: ExchangeKind = "sample"
+    first_seq: int = 0
+    """Of the harness's messages; the device's wrap around several times in any run."""
+    samples: int = N
+    most_lost_n: int = MOST_N
+
+
+@dataclass
+class Played:
+    """What came of it."""
+
+    outcome: str
+    """``as without``: valid, nothing is lost. ``lost``: valid, some samples were lost. ``inconclusive``. Or the type of
+    the error that was raised before the first sample."""
+    why: str = ""
+    run: Run | None = None
+    took_s: float = 0.0
+    frames: Mapping[Direction, int] = field(default_factory=dict)
+
+
+def play(case: Case, open_wire: Callable[[], Wire] | None = None, timeout_s: float = TIMEOUT_S) -> Played:
+    """Play it, by default with a device in this process and in virtual time.
+
+    :raises AssertionError: a wrong estimate counts as valid, or it took too long or too much.
+    """
+    nonces = itertools.count(1)
+    wire = FaultyWire(open_wire or (lambda: MemoryWire(next(nonces))), case.faults)
+    clock, started_s = wire.clock, wire.clock()
+    link = FramedLink(wire)
+    description = InprocDevice(
+        name="bob",
+        exchange=case.exchange,
+        timeout_s=timeout_s,
+        most_lost_n=case.most_lost_n,
+        estimator=ESTIMATOR,
+    )
+    played = _play(link, description, case)
+    link.close()
+    played.took_s, played.frames = clock() - started_s, wire.frames
+    assert played.took_s < LONGEST_RUN_S, f"{case}: it took {played.took_s:.1f} s"
+    waiting = len(link._messages) + len(link._decoder._begun) + sum(len(lane.queue) for lane in wire._lanes.values())
+    assert waiting < MOST_WAITING, f"{case}: {waiting} wait"
+    if played.run is not None and played.outcome in {"as without", "lost"}:
+        _check_estimates(played.run, case)
+    return played
+
+
+def _play(link: FramedLink, description: InprocDevice, case: Case) -> Played:
+    dut = Dut(link, description)
+    dut._talk._seq = case.first_seq
+    scenario = Scenario(samples=case.samples, excitation=EXCITATION, name="faults")
+    try:
+        dut.handshake()
+        dut.configure()
+        run = Bench(SignalsRig(), dut).play(scenario, seed=0)
+    except AnalogrigError as error:
+        return Played(type(error).__name__, str(error))
+    verdict = judge(run)
+    if not verdict.valid:
+        return Played("inconclusive", "; ".join(verdict.reasons), run)
+    return Played("lost" if run.lost.any() else "as without", "", run)
+
+
+@functools.lru_cache(maxsize=4096)
+def reference(samples: int, lost: tuple[int, ...]) -> Replies:
+    """What a device says without any fault, which is told that these samples are missing."""
+    missing = np.zeros(samples, bool)
+    missing[list(lost)] = True
+    dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob", exchange="block", estimator=ESTIMATOR))
+    dut.handshake()
+    dut.configure()
+    dut.start()
+    return dut.feed(0, FORCE[:samples], DISPLACEMENT[:samples], missing)
+
+
+def _check_estimates(run: Run, case: Case) -> None:
+    """A run that counts as valid has the estimates, to the bit, of one without faults."""
+    expected = reference(case.samples, tuple(np.flatnonzero(run.lost).tolist()))
+    known = ~run.lost
+    assert np.array_equal(run.theta.view(np.uint32), expected.theta.view(np.uint32)), f"{case}: another theta"
+    for name in ("innovation", "statistic"):
+        same = getattr(run, name)[known].view(np.uint32) == getattr(expected, name)[known].view(np.uint32)
+        assert same.all(), f"{case}: another {name}"
+    assert np.array_equal(run.flags[known], expected.flags[known]), f"{case}: other flags"
+    assert ((run.flags[run.lost] & SteppedFlag.MISSING) != 0).all(), f"{case}: a lost sample is not missing"
+    assert run.alarm_index.tolist() == [alarm.index for alarm in expected.alarms], f"{case}: other alarms"
+
+
+# ---- every fault at every step
+
+
+class _Tap:
+    """A wire that notes what passes."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.name, self.clock = wire.name, wire.clock
+        self._wire = wire
+        self.passed: dict[Direction, bytes] = {"to": b"", "from": b""}
+
+    def write(self, sent: bytes) -> None:
+        self.passed["to"] += sent
+        self._wire.write(sent)
+
+    def read(self, timeout_s: float) -> bytes:
+        received = self._wire.read(timeout_s)
+        self.passed["from"] += received
+        return received
+
+    def close(self) -> None:
+        self._wire.close()
+
+
+@functools.cache
+def steps(exchange: ExchangeKind) -> dict[Direction, list[str]]:
+    """Of a run without faults, to which of STEPS each frame belongs."""
+    tap = _Tap(MemoryWire(1))
+    description = InprocDevice(name="bob", exchange=exchange, estimator=ESTIMATOR)
+    played = _play(FramedLink(tap), description, Case(WireFaults(), exchange))
+    assert played.outcome == "as without"
+    sent = _messages(tap.passed["to"])
+    out: dict[Direction, list[str]] = {"to": [], "from": []}
+    step = iter(STEPS)
+    now = next(step)
+    owner: dict[int, str] = {}
+    for message in sent:
+        is_next = {
+            "handshake": isinstance(message, Configure),
+            "configuration": isinstance(message, Control),
+            "start": isinstance(message, Sample | SampleBlock),
+            "samples": not isinstance(message, Sample | SampleBlock),
+            "stop": False,
+        }
+        if is_next[now]:
+            now = next(step)
+        out["to"].append(now)
+        owner[message.seq] = now
+    now = STEPS[0]
+    for message in _messages(tap.passed["from"]):
+        answers = getattr(message, "answers", None)
+        now = "samples" if answers is None else owner[answers]
+        out["from"].append(now)
+    return out
+
+
+def _messages(passed: bytes) -> list[Message]:
+    return [message for packet in FrameDecoder().feed(passed) if (message := unpack(packet)) is not None]
+
+
+def everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Iterator[tuple[str, Direction, Case]]:
+    """A fault at every frame, or at every so many from each step's first: the step, the direction, the run."""
+    for direction, names in steps(exchange).items():
+        for step in STEPS:
+            numbers = [number for number, name in enumerate(names) if name == step]
+            for number in {*numbers[:2], *numbers[::stride], *numbers[-2:]}:
+                fault = WireFault(kind, direction, number)
+                yield step, direction, Case(WireFaults((fault,), seed=number), exchange)
+
+
+@functools.cache
+def documented() -> dict[tuple[str, Direction], dict[str, set[str]]]:
+    """The table of harness/README.md: by kind and direction, for each of STEPS, what may come of it."""
+    table: dict[tuple[str, Direction], dict[str, set[str]]] = {}
+    for kinds, way, cells in re.findall(
+        r"^\| (`[a-z`, -]+`) (to|from|both) \|(.*)\|$", README.read_text(), re.MULTILINE
+    ):
+        outcomes = [{DOCUMENTED_AS.get(word, word) for word in re.findall(r"\w+", cell)} for cell in cells.split("|")]
+        for kind in re.findall(r"[a-z-]+", kinds):
+            for direction in DIRECTIONS:
+                if way in {direction, "both"}:
+                    table[kind, direction] = dict(zip(STEPS, outcomes, strict=True))
+    return table
+
+
+def outcomes_everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Counter[str]:
+    """Play a fault everywhere; how often each outcome came.
+
+    :raises AssertionError: one is not documented, or ``play`` did.
+    """
+    counted: Counter[str] = Counter()
+    for step, direction, case in everywhere(kind, exchange, stride):
+        played = play(case)
+        assert played.outcome in documented()[kind, direction][step], f"{step}: {case}: {played.outcome}: {played.why}"
+        counted[played.outcome] += 1
+    return counted
+
+
+# ---- by chance
+
+
+def by_chance(seed: int) -> Case:
+    """One to four faults anywhere, or a line that is bad all the time."""
+    rng = Random(seed)
+    exchange: ExchangeKind = rng.choice(EXCHANGES)
+    frames = {direction: len(names) for direction, names in steps(exchange).items()}
+    in_samples = {
+        direction: [i for i, name in enumerate(names) if name == "samples"]
+        for direction, names in steps(exchange).items()
+    }
+    at: list[WireFault] = []
+    rates: dict[str, float] = {}
+    if rng.random() < 0.8:
+        for _ in range(rng.choice((1, 1, 2, 3, 4))):
+            direction = rng.choice(DIRECTIONS)
+            kind = rng.choice(KINDS if rng.random() < 0.3 else PASSING)
+            number = rng.choice(in_samples[direction]) if rng.random() < 0.7 else rng.randrange(frames[direction])
+            at.append(WireFault(kind, direction, number))
+    else:
+        rates = {rng.choice(PASSING): 10 ** rng.uniform(-4.0, -2.0) for _ in range(rng.randint(1, 3))}
+    first_seq = rng.choice((0, 250, rng.randrange(256)))
+    return Case(WireFaults(tuple(at), rates, seed), exchange, first_seq, most_lost_n=rng.choice((0, 3, N)))
+
+
+def outcomes_by_chance(seeds: range) -> Counter[str]:
+    """Play them all; how often each outcome came. Errors as ``play``."""
+    return Counter(play(by_chance(seed)).outcome for seed in seeds)
+
+
+def main() -> int:
+    """Play as many as the first argument says, from the seed that the second one is."""
+    n, first = int(sys.argv[1]), int(sys.argv[2])
+    started_s = time.monotonic()
+    total: Counter[str] = Counter()
+    chunks = [range(start, min(start + 500, first + n)) for start in range(first, first + n, 500)]
+    each = list(itertools.product(KINDS, EXCHANGES))
+    with ProcessPoolExecutor(2) as pool:
+        for counted in pool.map(outcomes_everywhere, *zip(*each, strict=True)):
+            total += counted
+        print(f"every fault at every frame: {total.total()} runs, all as documented")
+        for counted in pool.map(outcomes_by_chance, chunks):
+            total += counted
+    for outcome, count in total.most_common():
+        print(f"{count:8d}  {outcome}")
+    took_s = time.monotonic() - started_s
+    print(f"and {n} runs by chance from seed {first}, {took_s:.0f} s: no wrong estimate, no hang")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
