@@ -271,7 +271,8 @@ def everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Iterator[t
             numbers = [number for number, name in enumerate(names) if name == step]
             for number in {*numbers[:2], *numbers[::stride], *numbers[-2:]}:
                 fault = WireFault(kind, direction, number)
-                yield step, direction, Case(WireFaults((fault,), seed=number), exchange)
+                first_seq = 250 if number % 2 else 0  # which wraps around in the handshake
+                yield step, direction, Case(WireFaults((fault,), seed=number), exchange, first_seq)
 
 
 @functools.cache
