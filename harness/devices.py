@@ -41,6 +41,8 @@ class DeviceDescription:
     """What every device is described by: a file of fixtures/devices, or as much as the command line says."""
 
     kind: ClassVar[str]
+    starting_s: ClassVar[float] = 0.0
+    """It may take so long to start, before it hears anything."""
     name: str
     exchange: Literal["sample", "block", "stream"] = "sample"
     """Samples go one at a time, in blocks, or in blocks before the last one is answered. The answers are the same."""
@@ -148,6 +150,7 @@ class InprocDevice(DeviceDescription):
 class QemuDevice(DeviceDescription):
     """Cortex-M firmware on a board that QEMU emulates."""
 
+    starting_s: ClassVar[float] = 5.0
     core: ClassVar[str]
     machine: ClassVar[str]
     firmware: str | None = None

@@ -132,7 +132,7 @@ class Dut:
         :raises LinkTimeout: nobody answers.
         :raises CatalogueMismatch: it speaks another catalogue.
         """
-        self._identity = self._identify()
+        self._identity = self._identify(starting_s=self._description.starting_s)
         self._control(Command.RESET)
         self._control(Command.REPORT_INTERVAL, self._description.report_interval_n)
         return self._identity
@@ -247,14 +247,14 @@ class Dut:
             )
         return identity
 
-    def _identify(self) -> Identity:
+    def _identify(self, *, starting_s: float = 0.0) -> Identity:
         """Whatever is in the line from before."""
         self._talk.begin()
-        return self._call(after_anything=True)
+        return self._call(after_anything=True, starting_s=starting_s)
 
-    def _call(self, *, after_anything: bool = False) -> Identity:
+    def _call(self, *, after_anything: bool = False, starting_s: float = 0.0) -> Identity:
         """Ask who is there until there is an answer; what came before the first question does not matter."""
-        deadline_s = self._talk.clock() + self._talk.timeout_s
+        deadline_s = self._talk.clock() + starting_s + self._talk.timeout_s
         while True:
             try:
                 again_s = self._talk.clock() + _HELLO_AGAIN_S

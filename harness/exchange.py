@@ -191,7 +191,6 @@ class Exchange:
         """It names no sample: the next Stepped does."""
         self._silences = 0
         self.next_index = 0
-        self.taken = 0
 
     def enter(
         self,

@@ -7,6 +7,8 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,6 +38,8 @@ pytestmark = needs_firmware
 
 GCC = "arm-none-eabi-gcc"
 
+LONG_S = 20.0
+"""For what comes at once unless something is broken."""
 LONGEST = 450
 """Samples of a scenario that a test plays under QEMU, at a thousand a second."""
 
@@ -111,16 +115,22 @@ def test_firmware_says_which_it_is_and_every_boot_has_its_number(core: str) -> N
 # ---- failures
 
 
+def new_qemu(before: set[int]) -> int:
+    """The one that we have started since; the tether takes a moment to become it."""
+    deadline_s = time.monotonic() + LONG_S
+    while time.monotonic() < deadline_s:
+        for pid in set(descendants(os.getpid())) - before:
+            if Path(f"/proc/{pid}/comm").read_text().startswith("qemu"):
+                return pid
+    raise AssertionError("no QEMU has been started")
+
+
 @pytest.fixture
 def started() -> Iterator[tuple[Dut, int]]:
     """A device that is about to run, and the number of the QEMU that it runs in."""
     before = set(descendants(os.getpid()))
     with connect(QemuM4(name="bob", timeout_s=0.3)) as dut:
-        (pid,) = (
-            pid
-            for pid in set(descendants(os.getpid())) - before
-            if Path(f"/proc/{pid}/comm").read_text().startswith("qemu")
-        )
+        pid = new_qemu(before)
         dut.start()
         yield dut, pid
         dut.close()
@@ -137,6 +147,20 @@ def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Dut, int]) -
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(LinkClosed, match=r"^device bob: QEMU \(mps2-an386\) ended with status -9"):
         dut.status()
+
+
+def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
+    """A busy machine; here it is stopped for longer than the time-out of any answer."""
+    before = set(descendants(os.getpid()))
+    description = QemuM4(name="bob", timeout_s=0.3)
+    link = description.open()
+    pid = new_qemu(before)
+    os.kill(pid, signal.SIGSTOP)
+    timer = threading.Timer(1.0, os.kill, (pid, signal.SIGCONT))
+    timer.start()
+    with Dut(link, description) as dut:
+        assert dut.handshake().firmware == "QEMU_M4"
+    timer.join()
 
 
 def test_qemu_that_hangs_is_told_and_ended(started: tuple[Dut, int]) -> None:

@@ -1,0 +1,44 @@
+"""The tests of the core notice what is wrong with it: a few mutants by chance; `make mutate` tries all."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from estimator_c.evidence import mutate
+
+
+def test_explanations_are_of_mutants_that_there_are() -> None:
+    assert mutate.explained().keys() <= {mutant.key for mutant in mutate.mutants()}
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("    if (a < b) {", ["    if (a <= b) {", "    if (a >= b) {", "    if (true) {", "    if (false) {"]),
+        ("    x += 2U;  // 3U", ["    x -= 2U;  // 3U", "    x += 3U;  // 3U", "    x += 1U;  // 3U", "    ;"]),
+        ("    const float x = -y * 0.0F;", ["    const float x = -y / 0.0F;", "    const float x = y * 0.0F;"]),
+        ("    return !a && b;", ["    return !a || b;", "    return a && b;"]),
+        ("    float* const x = y;", []),
+    ],
+    ids=["condition", "statement", "sign", "logic", "declaration"],
+)
+def test_operators_constants_conditions_and_statements_are_altered(line: str, expected: list[str]) -> None:
+    altered = list(mutate.altered(line))
+    assert set(expected) <= set(altered)
+    assert len(altered) == len(set(altered))
+    assert bool(altered) == bool(expected)
+
+
+@pytest.mark.timeout(900)
+def test_mutants_by_chance_are_noticed_or_explained(tmp_path: Path) -> None:
+    """In a process of its own: every test there has the library of a mutant."""
+    out = tmp_path / "mutation.json"
+    command = [sys.executable, "-m", "estimator_c.evidence.mutate", "--sample", "12", "--out", str(out)]
+    done = subprocess.run(command, cwd=mutate.ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(out.read_text())["fates"]["killed"] >= 6
