@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import select
 import subprocess
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -57,13 +58,17 @@ class Child:
 
         :raises LinkError: nothing in time, or it has ended.
         """
-        stdout = self._process.stdout
-        if stdout is None or not select.select([stdout], [], [], START_TIMEOUT_S)[0]:
-            raise LinkError(f"{self._what} said nothing within {START_TIMEOUT_S} s of its start")
-        line = stdout.readline().decode(errors="replace").strip()
-        if not line:
-            raise LinkClosed(self.obituary())
-        return line
+        stdout, line = self._process.stdout, b""
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        while not line.endswith(b"\n"):
+            left_s = max(0.0, deadline_s - time.monotonic())
+            if stdout is None or not select.select([stdout], [], [], left_s)[0]:
+                raise LinkError(f"{self._what} said nothing within {START_TIMEOUT_S} s of its start")
+            said = stdout.read(1)
+            if not said:
+                raise LinkClosed(self.obituary())
+            line += said
+        return line.decode(errors="replace").strip()
 
     def obituary(self) -> str:
         """How it ended, with its last complaint, or whatever it said last."""

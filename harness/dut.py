@@ -254,13 +254,16 @@ class Dut:
 
     def _call(self, *, after_anything: bool = False, starting_s: float = 0.0) -> Identity:
         """Ask who is there until there is an answer; what came before the first question does not matter."""
-        deadline_s = self._talk.clock() + starting_s + self._talk.timeout_s
+        within_s = starting_s + self._talk.timeout_s
+        deadline_s = self._talk.clock() + within_s
         while True:
             try:
                 again_s = self._talk.clock() + _HELLO_AGAIN_S
                 return self._ask_identity(min(deadline_s, again_s), after_anything=after_anything)
-            except LinkTimeout:
+            except LinkTimeout as error:
                 if self._talk.clock() >= deadline_s:
+                    if starting_s:
+                        raise LinkTimeout(f"{error}; it had {within_s:g} s to start and answer") from error
                     raise
 
     def _ask_identity(self, deadline_s: float, *, after_anything: bool) -> Identity:

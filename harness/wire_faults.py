@@ -67,6 +67,10 @@ class WireFaults:
             elif (match := _FAULT.fullmatch(word)) and match[1] in KINDS:
                 if match[2]:
                     at.append(WireFault(match[1], "to" if match[2] == "to" else "from", int(match[3])))
+                    if len({(fault.direction, fault.frame) for fault in at}) < len(at):
+                        raise ConfigurationError(f"wire faults: {word!r}: that frame has a fault already")
+                elif match[1] in rates:
+                    raise ConfigurationError(f"wire faults: {word!r}: {match[1]} has a probability already")
                 else:
                     rates[match[1]] = _probability(match[4], word)
             else:
@@ -126,6 +130,8 @@ _SPOILT: Mapping[str, Callable[[bytes, Random], bytes]] = {
 class _Lane:
     """One direction."""
 
+    rng: Random
+    """Its own: which of the two speaks first is a matter of timing."""
     frames: int = 0
     begun: bytes = b""
     """Of a frame that is not complete."""
@@ -174,10 +180,11 @@ class FaultyWire:
         self._wire = open_wire()
         self.name = self._wire.name
         self.clock = self._wire.clock
-        self._rng = Random(faults.seed)
         self._at = {(fault.direction, fault.frame): fault.kind for fault in faults.at}
         self._rates = dict(faults.rates)
-        self._lanes: dict[Direction, _Lane] = {direction: _Lane() for direction in DIRECTIONS}
+        self._lanes: dict[Direction, _Lane] = {
+            direction: _Lane(Random(f"{faults.seed} {direction}")) for direction in DIRECTIONS
+        }
         self._is_closed = self._is_silent = self._is_garbled = self._is_stranger = False
 
     @property
@@ -211,7 +218,7 @@ class FaultyWire:
             raise LinkClosed(f"{self.name}: the line is cut")
         sent = self._lanes["to"].due(self.clock())
         if self._lanes["to"].babbles:
-            sent += self._rng.randbytes(_BABBLE_BYTES)
+            sent += self._lanes["to"].rng.randbytes(_BABBLE_BYTES)
         if sent and not self._is_silent:
             self._wire.write(sent)
 
@@ -224,7 +231,7 @@ class FaultyWire:
         """Noise without end; what the line can carry, if time is virtual."""
         if isinstance(self.clock, VirtualClock):
             self.clock.advance(_BABBLE_BYTES * BITS_PER_BYTE / DEFAULT_BAUD)
-        return self._rng.randbytes(_BABBLE_BYTES)
+        return self._lanes["from"].rng.randbytes(_BABBLE_BYTES)
 
     # ---- frame by frame
 
@@ -233,22 +240,22 @@ class FaultyWire:
         for each in lane.split(sent):
             if direction == "from" and wire is not self._wire:
                 break  # of a device that has been reset meanwhile
-            kind = self._due_kind(direction, lane.frames)
+            kind = self._due_kind(direction, lane)
             lane.frames += 1
             passed = self._changed(lane, each)
             if kind is None or not passed:
                 lane.put(passed, self.clock())
             elif kind in _SPOILT:
-                lane.put(_SPOILT[kind](passed, self._rng), self.clock())
+                lane.put(_SPOILT[kind](passed, lane.rng), self.clock())
             else:
                 self.HAPPENS[kind](self, lane, passed)
             lane.release(self.clock())
 
-    def _due_kind(self, direction: Direction, number: int) -> str | None:
-        kind = self._at.get((direction, number))
+    def _due_kind(self, direction: Direction, lane: _Lane) -> str | None:
+        kind = self._at.get((direction, lane.frames))
         if kind is not None:
             return kind
-        return next((kind for kind, rate in self._rates.items() if self._rng.random() < rate), None)
+        return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
 
     def _changed(self, lane: _Lane, sent: bytes) -> bytes:
         """By what lasts."""
@@ -258,21 +265,21 @@ class FaultyWire:
             lane.lost_n -= 1
             return b""
         if self._is_garbled:
-            return self._rng.randbytes(self._rng.randint(1, 2 * len(sent)))
+            return lane.rng.randbytes(lane.rng.randint(1, 2 * len(sent)))
         return _strange(sent) if self._is_stranger else sent
 
     def _lose_many(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002 - it is lost
-        lane.lost_n = int(MOST_FRAMES_OUT ** self._rng.random())
+        lane.lost_n = int(MOST_FRAMES_OUT ** lane.rng.random())
 
     def _reorder(self, lane: _Lane, sent: bytes) -> None:
-        lane.held.append((1 + self._rng.randint(1, 3), sent))
+        lane.held.append((1 + lane.rng.randint(1, 3), sent))
 
     def _repeat(self, lane: _Lane, sent: bytes) -> None:
         lane.put(sent, self.clock())
-        lane.held.append((1 + self._rng.randint(1, MOST_FRAMES_LATE), sent))
+        lane.held.append((1 + lane.rng.randint(1, MOST_FRAMES_LATE), sent))
 
     def _delay(self, lane: _Lane, sent: bytes) -> None:
-        lane.stalled_s = self.clock() + self._rng.random() * LONGEST_DELAY_S
+        lane.stalled_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S
         lane.put(sent, self.clock())
 
     def _start_babble(self, lane: _Lane, sent: bytes) -> None:

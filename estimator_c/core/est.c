@@ -547,6 +547,11 @@ float est_noise_variance(const est_t* const self) {
     return self->noise_variance;
 }
 
+float est_prefilter(const est_t* const self, const uint8_t index) {
+    EST_ASSERT((self != 0) && (index < EST_NA_MAX));
+    return self->whitener.c[index];
+}
+
 est_counters_t est_counters(const est_t* const self) {
     EST_ASSERT(self != 0);
     return self->counters;

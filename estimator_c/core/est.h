@@ -296,6 +296,9 @@ float est_variance(const est_t* self, uint8_t index);
 /// The variance of the noise [codes^2]: as configured, or as estimated.
 float est_noise_variance(const est_t* self);
 
+/// One coefficient of the prefilter C; index in [0, EST_NA_MAX), asserted. Zero beyond the order of A.
+float est_prefilter(const est_t* self, uint8_t index);
+
 est_counters_t est_counters(const est_t* self);
 
 /// True iff the state is one that est_init() and est_step() can produce: every d positive and finite, theta finite,

@@ -15,7 +15,6 @@ EST_INLINE float est_limited(const float d, const float upper) {
     return (positive < upper) ? positive : upper;
 }
 
-/// P := P0.
 /// The variance of parameter j before anything is known, and at most.
 EST_INLINE float est_factors_prior(const est_config_t* const config, const est_shape_t shape, const uint_fast8_t j) {
     return (((j + 1U) == est_shape_count(shape)) && shape.offset) ? config->p0_offset : config->p0;

@@ -165,7 +165,9 @@ enter_sample(device_t* const self, answer_t* const answer, const uint16_t index,
         self->alarm_index = self->next_index;
         put_alarm(self, answer, stepped.statistic);
     }
-    isolate(self, answer);
+    if (self->isolating) {
+        isolate(self, answer);
+    }
     report(self, answer, stepped.innovation);
     put_stepped(self, answer, &stepped, est_counters(&self->estimator).restarts != restarts);
     self->next_index++;

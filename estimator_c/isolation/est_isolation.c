@@ -392,8 +392,8 @@ static void take_theta(est_isolation_t* const self, const est_t* const estimator
     for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
         self->believed.theta[i] = est_theta(estimator, i);
     }
-    self->believed.c[0] = estimator->whitener.c[0];
-    self->believed.c[1] = estimator->whitener.c[1];
+    self->believed.c[0] = est_prefilter(estimator, 0U);
+    self->believed.c[1] = est_prefilter(estimator, 1U);
 }
 
 static void enter_quiet(est_isolation_t* const self, const est_t* const estimator, const est_step_t step) {

@@ -60,32 +60,39 @@ SIZES = [f"M4F, code of the core at -Os, {what}" for what in ("everything", "tri
 LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
-    "M4F, n = 4, edges locked, fixed": "358 instructions",
-    "M4F, n = 4, edges locked, fixed, trigger alone": "306 instructions",
-    "M4F, n = 4, edges locked, worst": "1.31 times the typical step: C is taken from A",
-    "M4F, n = 4, edges locked, fixed, worst": "1.31 times the typical step: the same",
-    "M4F, n = 6, edges locked, worst": "1.22 times the typical step: the same",
-    "M4F, n = 6, edges locked, fixed, worst": "1.22 times the typical step: the same",
-    "M4F, n = 6, edges may slip, worst": "1.65 times the typical step: a doubt about an edge",
-    "M4F, n = 6, edges may slip, fixed, worst": "1.68 times the typical step: a doubt about an edge",
-    "M3, n = 4, edges locked, worst": "1.23 times the typical step: C is taken from A",
-    "M0, n = 4, edges locked, worst": "1.22 times the typical step: the same",
-    "M4F, code of the core at -Os, everything": "4522 B",
-    "M4F, code of the core at -Os, trigger alone": "2368 B",
+    "M4F, n = 4, edges locked, fixed": 358,
+    "M4F, n = 4, edges locked, fixed, trigger alone": 306,
+    "M4F, n = 4, edges locked, worst": 526,
+    "M4F, n = 4, edges locked, fixed, worst": 478,
+    "M4F, n = 6, edges locked, worst": 699,
+    "M4F, n = 6, edges locked, fixed, worst": 640,
+    "M4F, n = 6, edges may slip, worst": 913,
+    "M4F, n = 6, edges may slip, fixed, worst": 857,
+    "M3, n = 4, edges locked, worst": 7900,
+    "M0, n = 4, edges locked, worst": 6930,
+    "M4F, code of the core at -Os, everything": 4522,
+    "M4F, code of the core at -Os, trigger alone": 2368,
 }
-"""What the core still misses, as measured; a limit that it comes to keep must be taken off this list."""
+"""What the core still misses, and may not exceed; a limit that it comes to keep must be taken off this list.
+
+The longest steps take C from A (1.2 to 1.3 times the typical one) or have an edge in doubt (1.6 times)."""
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.xfail(reason=BEYOND[name], strict=True) if name in BEYOND else ())
+        pytest.param(name, marks=pytest.mark.xfail(reason=f"{BEYOND[name]}", strict=True) if name in BEYOND else ())
         for name in LIMITED
     ],
 )
 def test_cost_is_within_its_limit(name: str, costs: Mapping[str, cost.Cost]) -> None:
     limit = costs[name].limit
     assert limit is not None and costs[name].value <= limit
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_cost_beyond_its_limit_does_not_grow(name: str, costs: Mapping[str, cost.Cost]) -> None:
+    assert costs[name].value <= BEYOND[name]
 
 
 def test_isolation_costs_what_its_header_says(costs: Mapping[str, cost.Cost]) -> None:

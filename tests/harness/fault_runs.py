@@ -42,7 +42,7 @@ from harness.wire_faults import DIRECTIONS, KINDS, PASSING, Direction, FaultyWir
 
 N = 60
 MOST_N = 480
-CHANGE_AT = 40
+CHANGE_AT, BACK_AT = 40, 456
 RIG_BLOCK = 112
 """A whole number of messages."""
 TIMEOUT_S = 2.0
@@ -64,13 +64,14 @@ EXCHANGES: tuple[ExchangeKind, ...] = ("sample", "block", "stream")
 
 
 def signals() -> NDArray[np.uint16]:
-    """(MOST_N, 4) codes of a second-order system whose gain grows at CHANGE_AT; velocity and net force are zero."""
+    """(MOST_N, 4) codes of a second-order system whose gain grows at CHANGE_AT and is as before from BACK_AT on,
+    long enough for a diagnosis; velocity and net force are zero."""
     rng = np.random.default_rng(7)
     codes = np.zeros((MOST_N, len(CHANNELS)))
     u = np.where((np.arange(MOST_N) // 8) % 2, 3900.0, 150.0)
     y = np.zeros(MOST_N)
     for k in range(2, MOST_N):
-        gain = 1.0 if k < CHANGE_AT else 1.4
+        gain = 1.4 if CHANGE_AT <= k < BACK_AT else 1.0
         y[k] = 1.5 * y[k - 1] - 0.54 * y[k - 2] + gain * (0.01 * u[k - 1] + 0.02 * u[k - 2])
     codes[:, CHANNELS.index("force")] = u
     codes[:, CHANNELS.index("displacement")] = np.clip(np.round(y + rng.normal(size=MOST_N)), 0, 4095)
@@ -202,6 +203,9 @@ def _check_estimates(run: Run, case: Case) -> None:
     assert np.array_equal(run.flags[known], expected.flags[known]), f"{case}: other flags"
     assert ((run.flags[run.lost] & SteppedFlag.MISSING) != 0).all(), f"{case}: a lost sample is not missing"
     assert run.alarm_index.tolist() == [alarm.index for alarm in expected.alarms], f"{case}: other alarms"
+    said = zip(*(getattr(run, f"diagnosis_{name}").tolist() for name in ("index", "change", "onset")), strict=True)
+    due = [(each.index, each.change, each.onset) for each in expected.diagnoses]
+    assert list(said) == due, f"{case}: other diagnoses"
 
 
 # ---- every fault at every step

@@ -145,6 +145,12 @@ def test_program_that_says_nothing_is_ended(tmp_path: Path, monkeypatch: pytest.
         host_wire(program=program(tmp_path, "read end"))
 
 
+def test_program_that_says_half_a_line_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(child_module, "START_TIMEOUT_S", 0.2)
+    with pytest.raises(LinkError, match="said nothing within"):
+        host_wire(program=program(tmp_path, "printf half; read end"))
+
+
 def test_of_a_program_that_never_stops_talking_the_last_words_are_kept() -> None:
     """More than any pipe holds: it must neither block nor be remembered."""
     child = Child(["sh", "-c", "seq 1 200000 >&2; exit 3"], "the babbler")

@@ -7,13 +7,16 @@ import pytest
 from harness.devices import describe
 from harness.wire_faults import DIRECTIONS, KINDS, Direction, WireFault, WireFaults
 from tests.harness.fault_runs import (
+    BACK_AT,
     EXCHANGES,
+    MOST_N,
     Case,
     ExchangeKind,
     documented,
     outcomes_by_chance,
     outcomes_everywhere,
     play,
+    reference,
     steps,
 )
 from tests.harness.firmware import needs_firmware
@@ -42,6 +45,19 @@ def test_as_many_lost_answers_as_there_are_sequence_numbers_are_noticed(first: i
     played = play(Case(faults, "stream", samples=448))
     assert played.outcome == "inconclusive"
     assert "the device took in 448 samples, where 224 were heard of" in played.why
+
+
+@pytest.mark.parametrize("kind", ["drop", "duplicate", "reorder", "repeat", "flip"])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind: str, direction: Direction) -> None:
+    """play() compares them; the plant is as before from BACK_AT on, which is diagnosed some samples later."""
+    ((said),) = reference(MOST_N, ()).diagnoses
+    assert BACK_AT < said.index < BACK_AT + 20
+    per_sample = {"to": 1, "from": 8}[direction]
+    first = steps("sample")[direction].index("samples")
+    for number in range(first + (BACK_AT - 2) * per_sample, first + (said.index + 3) * per_sample):
+        faults = WireFaults((WireFault(kind, direction, number),), seed=number)
+        assert play(Case(faults, samples=MOST_N)).outcome in {"as without", "lost", "inconclusive"}
 
 
 # ---- over a real line

@@ -141,6 +141,15 @@ def test_same_seed_gives_the_same_faults() -> None:
     assert sent_through(text) != sent_through(f"{text},seed=1")
 
 
+def test_faults_of_one_direction_are_the_same_whenever_the_other_speaks() -> None:
+    line, wire = faulty("flip@0.3")
+    for each in FRAMES:
+        line.said.append(each)
+        wire.write(each)
+        wire.read(0.1)
+    assert line.written == sent_through("flip@0.3")
+
+
 # ---- how they are named
 
 
@@ -155,6 +164,12 @@ def test_faults_are_words_between_commas() -> None:
 )
 def test_wrong_word_is_named(text: str) -> None:
     with pytest.raises(ConfigurationError, match=re.escape(f"'{text}'")):
+        WireFaults.parse(text)
+
+
+@pytest.mark.parametrize("text", ["drop@to:3,flip@to:3", "flip@0.1,flip@0.2"])
+def test_fault_that_would_hide_another_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^wire faults: {re.escape(repr(text.split(',')[1]))}: .* already$"):
         WireFaults.parse(text)
 
 

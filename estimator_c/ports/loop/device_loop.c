@@ -8,8 +8,8 @@
 
 #define INPUT_BLOCKS (DEVICE_LOOP_INPUT_SIZE / FRAME_SIZE(ANALOGRIG_SAMPLE_BLOCK_LENGTH))
 
-#if INPUT_BLOCKS < 1
-#error "DEVICE_LOOP_INPUT_SIZE must hold a SampleBlock"
+#if (INPUT_BLOCKS < 1) || (INPUT_BLOCKS > 255)
+#error "DEVICE_LOOP_INPUT_SIZE must hold 1 to 255 SampleBlocks"
 #endif
 
 /// What is on its way from and to the line.
