@@ -57,6 +57,7 @@ OTHER_SOURCES = (
 ROOM = ("-DEST_NC_MAX=2U",)
 BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
 SHARED = ("-shared", "-fPIC")
+HOST_ROOM = ("-DDEVICE_LOOP_INPUT_SIZE=18360U",)  # 255 blocks, 0.18 s of real time: as long as the harness may be late
 POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals, processes; no part of the device but its port may know them
 
 
@@ -98,7 +99,7 @@ class BuildProducts(Command):
         include = (*ROOM, *(f"-I{path}" for path in folders))
         compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
         compile_c(destination / DEVICE, (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
-        compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *include))
+        compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
         compile_c(destination / TETHER, sources(TETHER_SOURCES), POSIX)
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)

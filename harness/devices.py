@@ -31,7 +31,7 @@ QEMU = "qemu-system-arm"
 _NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
 
 DEFAULT_TIMEOUT_S = 2.0
-DEFAULT_WINDOW = 32
+DEFAULT_WINDOW = 255
 LONGEST_TIMEOUT_S = 3600.0
 MOST_BAUD = 100_000_000
 

@@ -61,7 +61,7 @@ def overruns(duration_s: float) -> Pace:
             return paces[-1]
 
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=round(duration_s * 20_000))
-    with open_rig("emulator") as rig, connect(HostDevice(name="host", exchange="stream", window=56)) as dut:
+    with open_rig("emulator") as rig, connect(HostDevice(name="host", exchange="stream")) as dut:
         Watched(rig, dut, real_time=1.0).play(scenario, seed=1)
     return paces[0]
 
