@@ -29,7 +29,7 @@ CPU_m3 := -mcpu=cortex-m3 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M3_C
 CPU_m4 := -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M4_CHOICE
 CPU_m7 := -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M7_CHOICE
 FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation device ports/loop ports/cortex_m)
-FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -fno-tree-loop-distribute-patterns -ffunction-sections -DNDEBUG \
+FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -ffunction-sections -DNDEBUG \
     -Wall -Wextra -Wdouble-promotion -Wno-type-limits -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/cortex_m/include \
     -I$(BUILD)/generated
 FIRMWARE_LDFLAGS := -nostdlib -nostartfiles -Wl,--gc-sections,-z,noexecstack -T estimator_c/ports/cortex_m/mps2.ld

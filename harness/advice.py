@@ -15,6 +15,9 @@ from harness.verdict import Verdict
 NOISE_MARGIN = 1.05
 """The device may be set for this much less noise than there is before it matters."""
 
+WARM_UP_EDGES = 2
+"""Without so many the estimate knows next to nothing of the plant."""
+
 MOST_EDGE_SHIFT = 1.5e-3
 """From one edge to the next, in samples: 30 ppm of drift at an edge every 50 samples."""
 
@@ -27,6 +30,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_overloads(verdict),
         *_noise(run),
         *_edges(run),
+        *_warm_up(run),
         *_false_alarms(verdict),
         *_unseen(verdict),
         *_unidentified(verdict),
@@ -66,6 +70,20 @@ def _edges(run: Run) -> Iterator[str]:
         yield (
             "the edges of the excitation do not come a whole number of samples apart: false alarms are to be expected"
             ' until the device is set to edge_instants = "anywhere" (as the device any-edges is)'
+        )
+
+
+def _warm_up(run: Run) -> Iterator[str]:
+    warm_up_n = run.conditions.dut["estimator"].get("warm_up_n")
+    if "excitation" not in run.conditions.scenario or warm_up_n is None:
+        return
+    excitation = config.build(Excitation, run.conditions.scenario["excitation"], "the recorded excitation")
+    rate_hz = 1.0 / run.conditions.sample_period_s
+    instants = excitation.edges(0, _SAMPLES_LOOKED_AT * TICKS_PER_SAMPLE, rate_hz).ticks[1:] / TICKS_PER_SAMPLE
+    if len(instants) < WARM_UP_EDGES or instants[WARM_UP_EDGES - 1] >= warm_up_n:
+        yield (
+            f"the device's warm-up of {warm_up_n} samples ends before {WARM_UP_EDGES} edges of the excitation came:"
+            " false alarms are to be expected at the first ones until its warm_up_n is longer"
         )
 
 

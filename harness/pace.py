@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from harness import frame
 from harness.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from harness.devices import DeviceDescription
@@ -48,9 +50,11 @@ def check_line(device: DeviceDescription, period_s: float) -> None:
     back = frame.size(Stepped) + elements * frame.size(Estimate) / device.report_interval_n
     needed = BITS_PER_BYTE * max(there, back) / period_s
     if needed > device.baud:
+        unreported = BITS_PER_BYTE * max(there, frame.size(Stepped)) / period_s
+        thinner = ", or more samples for each report" if unreported < device.baud else ""
         raise ConfigurationError(
             f"device {device.name}: real time does not fit its line: {1.0 / period_s:g} samples/s of {there:.4g} bytes"
             f" to the device and {back:.4g} bytes back ({elements} estimates every {device.report_interval_n} samples)"
-            f" are {needed:.0f} bit/s, the line has {device.baud} baud; {needed / device.baud:.1f} times slower would"
-            " fit, or more samples for each report"
+            f" are {needed:.0f} bit/s, the line has {device.baud} baud;"
+            f" {math.ceil(10.0 * needed / device.baud) / 10.0:g} times slower would fit{thinner}"
         )

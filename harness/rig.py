@@ -342,13 +342,10 @@ class RecordingRig:
         return {**self.run.conditions.rig, "name": self._name}
 
     def scenario(self) -> Scenario:
-        """The scenario that was recorded, as long as the recording is."""
+        """The scenario that was recorded. If the recording ended before its time, so does what is played of it: its run
+        is then not valid either."""
         scenario = Scenario.from_table(self.run.conditions.scenario, self._name)
-        return dataclasses.replace(
-            scenario,
-            samples=self.run.samples,
-            tweaks=tuple(tweak for tweak in scenario.tweaks if tweak.sample < self.run.samples),
-        )
+        return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked)
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         conditions = self.run.conditions

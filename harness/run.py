@@ -26,6 +26,9 @@ from harness.storage import replacing
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
 
+_FAR = 1e9
+"""Beyond any unit, time or noise that is one."""
+
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """Order of the columns of ``Run.codes`` and ``Run.clipped``."""
 
@@ -212,6 +215,8 @@ class Run:
 
         :raises RecordingError: the file is absent, truncated, damaged, or not a recording of this format.
         """
+        if path.exists() and not path.is_file():
+            raise RecordingError(f"{path}: not a file")
         try:
             with path.open("rb") as raw:
                 _check_archive(raw)
@@ -240,7 +245,13 @@ class Run:
             and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
             "channels": set(conditions.channels) == set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
-            "sample times": conditions.sample_period_s > 0.0 and conditions.time_scale > 0.0,
+            "sample times": all(0.0 < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale)),
+            "number of samples": n <= conditions.samples_asked,
+            "units": all(
+                0.0 < channel.lsb_v < _FAR and 0.0 < abs(channel.unit_per_v) < _FAR and 0.0 <= channel.noise_lsb < _FAR
+                for channel in conditions.channels.values()
+            ),
+            "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
             "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
             "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
@@ -268,8 +279,8 @@ def _check_archive(raw: BinaryIO) -> None:
 def _parameters(estimator: Any) -> int | None:
     """How many elements theta has."""
     try:
-        return int(estimator["na"]) + int(estimator["nb"]) + int(estimator["offset"])
-    except (KeyError, TypeError, ValueError):
+        return sum(int(estimator[key]) for key in ("na", "nb", "offset")) + int(estimator.get("nc", 0))
+    except (AttributeError, KeyError, TypeError, ValueError):
         return None
 
 

@@ -366,9 +366,12 @@ static void zero(float* const x, const uint_fast8_t n) {
     }
 }
 
+/// Data beyond all measure can drive theta to where its products overflow. So does the statistic then, and nothing of the
+/// estimate is worth keeping.
 static void estimate_afresh(est_t* const self) {
-    if (self->config->trigger.reset == EST_RESET_ALL) {
+    if ((self->config->trigger.reset == EST_RESET_ALL) || !(self->trigger.statistic < FLT_MAX)) {
         zero(self->theta, self->count);
+        est_factors_reset(&self->factors, self->config);
     }
     self->refresh_in = self->config->refresh_n;
     self->renewal     = EST_RENEWAL_RESET;

@@ -3,6 +3,8 @@
 #include "est_edges.h"
 #include "est_shape.h"
 
+#include <float.h>
+
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
 /// once in exp(h) samples on average: the ceiling is ln(ARL0) without any asymptotics.
@@ -10,6 +12,14 @@
 #define CUSUM_DRIFT 0.69314718F
 
 static float magnitude(const float x) { return (x < 0.0F) ? -x : x; }
+
+/// No plant with codes below EST_CODE_LIMIT has such an innovation: theta has overflowed, or is about to.
+#define INNOVATION_LIMIT 1.0e15F
+
+/// Where there is none: beyond every ceiling if the innovation is beyond all measure, or is not a number.
+static float no_statistic(const float innovation) {
+    return (magnitude(innovation) < INNOVATION_LIMIT) ? 0.0F : FLT_MAX;
+}
 
 /// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
 static float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
@@ -29,7 +39,7 @@ static float custom(est_trigger_t* const              self,
     return config->custom(config->context, innovation, variance, anew);
 }
 
-/// Of the triggers that know nothing of edges.
+/// Of the triggers that know nothing of edges; the one that is not named is the caller's.
 static float other_statistic(est_trigger_t* const              self,
                              const est_trigger_config_t* const config,
                              const float                       innovation,
@@ -39,18 +49,19 @@ static float other_statistic(est_trigger_t* const              self,
         return magnitude(innovation);
     case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
         return mean_between_faults(self, config->absolute, innovation);
-    case EST_TRIGGER_CUSTOM:
-        return custom(self, config, innovation, 1.0F / precision);
     case EST_TRIGGER_NONE:
+        return no_statistic(innovation);
+    case EST_TRIGGER_CUSTOM:
     case EST_TRIGGER_CUSUM:
     default:
-        return 0.0F;
+        return custom(self, config, innovation, 1.0F / precision);
     }
 }
 
+/// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
 EST_OUTLINE float cusum(const float before, const float innovation, const float precision) {
     const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
-    return (sum > 0.0F) ? sum : 0.0F;
+    return (sum <= 0.0F) ? 0.0F : sum;
 }
 
 /// The statistic of the other reading that explains the innovations better.
@@ -67,10 +78,10 @@ find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const
     if (self->statistic < ceiling) {
         return EST_QUIET;
     }
-    if (best_rival(self) >= ceiling) {
-        return EST_ALARM;
+    if (best_rival(self) < ceiling) {
+        return expires ? EST_SLIP : EST_QUIET;
     }
-    return expires ? EST_SLIP : EST_QUIET;
+    return EST_ALARM;
 }
 
 bool est_trigger_config_valid(const est_trigger_config_t* const config) {
@@ -123,9 +134,8 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
                                const uint16_t                    doubt_n) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
-        return EST_QUIET;
-    }
-    if (config->kind == EST_TRIGGER_CUSUM) {
+        self->statistic = no_statistic(readings[0]);
+    } else if (config->kind == EST_TRIGGER_CUSUM) {
         self->statistic = cusum(self->statistic, readings[0], precision);
         if (EST_WITH_EDGES && (doubt_n > 0U)) {
             return find_in_doubt(self, config->ceiling, readings, precision, doubt_n >= EST_DOUBT_N);
@@ -135,5 +145,5 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
     } else {
         // no trigger
     }
-    return (self->statistic >= config->ceiling) ? EST_ALARM : EST_QUIET;
+    return (self->statistic < config->ceiling) ? EST_QUIET : EST_ALARM;
 }

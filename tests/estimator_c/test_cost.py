@@ -61,17 +61,17 @@ LIMITED = [*STEPS, *(f"{name}, worst" for name in STEPS), *SIZES]
 
 BEYOND = {
     "M4F, n = 4, edges locked, fixed": 358,
-    "M4F, n = 4, edges locked, fixed, trigger alone": 306,
-    "M4F, n = 4, edges locked, worst": 526,
-    "M4F, n = 4, edges locked, fixed, worst": 478,
-    "M4F, n = 6, edges locked, worst": 699,
-    "M4F, n = 6, edges locked, fixed, worst": 640,
-    "M4F, n = 6, edges may slip, worst": 913,
+    "M4F, n = 4, edges locked, fixed, trigger alone": 307,
+    "M4F, n = 4, edges locked, worst": 528,
+    "M4F, n = 4, edges locked, fixed, worst": 480,
+    "M4F, n = 6, edges locked, worst": 701,
+    "M4F, n = 6, edges locked, fixed, worst": 642,
+    "M4F, n = 6, edges may slip, worst": 915,
     "M4F, n = 6, edges may slip, fixed, worst": 857,
     "M3, n = 4, edges locked, worst": 7900,
-    "M0, n = 4, edges locked, worst": 6930,
-    "M4F, code of the core at -Os, everything": 4522,
-    "M4F, code of the core at -Os, trigger alone": 2368,
+    "M0, n = 4, edges locked, worst": 6940,
+    "M4F, code of the core at -Os, everything": 4600,
+    "M4F, code of the core at -Os, trigger alone": 2470,
 }
 """What the core still misses, and may not exceed; a limit that it comes to keep must be taken off this list.
 

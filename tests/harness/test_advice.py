@@ -67,3 +67,12 @@ def test_change_that_could_not_be_seen_is_named() -> None:
 
 def test_estimate_that_is_no_suspension_is_named() -> None:
     assert "samples 0-799 describes no mass" in advised(made_run(LOADED, [(0, FRONT)]))
+
+
+@pytest.mark.parametrize(("frequency_hz", "told"), [(20.0, True), (200.0, False)])
+def test_warm_up_that_ends_before_the_second_edge_is_told(frequency_hz: float, told: bool) -> None:  # noqa: FBT001
+    run = excited(clock="card", frequency_hz=frequency_hz)
+    estimator = {**run.conditions.dut["estimator"], "warm_up_n": 150}
+    dut = {**run.conditions.dut, "estimator": estimator}
+    run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, dut=dut))
+    assert ("warm-up of 150 samples ends before 2 edges" in advised(run)) == told

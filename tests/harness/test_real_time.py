@@ -120,8 +120,7 @@ def test_real_time_that_does_not_fit_the_line_is_refused_with_the_arithmetic() -
         play(InprocDevice(name="bob", exchange="stream", baud=921_600), 1.0)
     assert str(caught.value) == (
         "device bob: real time does not fit its line: 20000 samples/s of 5.143 bytes to the device and 128 bytes back"
-        " (7 estimates every 1 samples) are 25600000 bit/s, the line has 921600 baud; 27.8 times slower would fit,"
-        " or more samples for each report"
+        " (7 estimates every 1 samples) are 25600000 bit/s, the line has 921600 baud; 27.8 times slower would fit"
     )
 
 
@@ -188,3 +187,8 @@ def test_time_of_the_line_is_the_same_every_time_and_for_every_device() -> None:
     (only,) = line_s
     assert only == pytest.approx(600 * (16 + 128) * 10 / 115_200)
     assert play(InprocDevice(name="bob")).conditions.line_s == 0.0
+
+
+def test_more_samples_for_each_report_are_advised_where_they_would_do() -> None:
+    with pytest.raises(ConfigurationError, match=r"\d times slower would fit, or more samples for each report$"):
+        play(InprocDevice(name="bob", exchange="stream", baud=4_000_000), 1.0)

@@ -68,13 +68,14 @@ __attribute__((section(".vectors"), used)) static const struct {
     .board  = { uart_receive_interrupt, uart_transmit_interrupt },
 };
 
-// What the compiler calls on its own. Not through their own loops: -fno-tree-loop-distribute-patterns.
+// What the compiler calls on its own. Volatile, or it might take their loops for calls of themselves.
 
 void* memset(void* to, int value, size_t n);
 void* memcpy(void* restrict to, const void* restrict from, size_t n);
+void* memmove(void* to, const void* from, size_t n);
 
 void* memset(void* const to, const int value, const size_t n) {
-    uint8_t* const bytes = to;
+    volatile uint8_t* const bytes = to;
     for (size_t i = 0U; i < n; i++) {
         bytes[i] = (uint8_t)value;
     }
@@ -82,10 +83,22 @@ void* memset(void* const to, const int value, const size_t n) {
 }
 
 void* memcpy(void* const restrict to, const void* const restrict from, const size_t n) {
-    uint8_t* const       bytes  = to;
-    const uint8_t* const source = from;
+    volatile uint8_t* const bytes  = to;
+    const uint8_t* const    source = from;
     for (size_t i = 0U; i < n; i++) {
         bytes[i] = source[i];
+    }
+    return to;
+}
+
+void* memmove(void* const to, const void* const from, const size_t n) {
+    volatile uint8_t* const bytes  = to;
+    const uint8_t* const    source = from;
+    if ((uintptr_t)to < (uintptr_t)from) {
+        return memcpy(to, from, n);
+    }
+    for (size_t i = n; i > 0U; i--) {
+        bytes[i - 1U] = source[i - 1U];
     }
     return to;
 }
