@@ -1,6 +1,6 @@
 """The kinds of devices: what each needs to be told, how the command line names it, and how it is reached.
 
-A kind is one class, in the registry ``KINDS``; nothing else knows what kinds there are.
+A kind is one class, in the registry ``KINDS``; only the help of the command names them again.
 """
 
 from __future__ import annotations

@@ -18,8 +18,6 @@ static est_config_t config;
 static est_isolation_t isolation;
 #endif
 
-const uint32_t subject_state_bytes = sizeof(est_t);
-
 SUBJECT void subject_begin(void) {
     config        = est_config_default();
     config.na     = SUBJECT_NA;

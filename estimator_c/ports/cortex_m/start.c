@@ -2,8 +2,10 @@
 
 #include "semihosting.h"
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <string.h>
 
 #define FAULT_STATUS 70U  ///< EX_SOFTWARE of sysexits.h
 
@@ -70,10 +72,6 @@ __attribute__((section(".vectors"), used)) static const struct {
 
 // What the compiler calls on its own. Volatile, or it might take their loops for calls of themselves.
 
-void* memset(void* to, int value, size_t n);
-void* memcpy(void* restrict to, const void* restrict from, size_t n);
-void* memmove(void* to, const void* from, size_t n);
-
 void* memset(void* const to, const int value, const size_t n) {
     volatile uint8_t* const bytes = to;
     for (size_t i = 0U; i < n; i++) {
@@ -94,11 +92,10 @@ void* memcpy(void* const restrict to, const void* const restrict from, const siz
 void* memmove(void* const to, const void* const from, const size_t n) {
     volatile uint8_t* const bytes  = to;
     const uint8_t* const    source = from;
-    if ((uintptr_t)to < (uintptr_t)from) {
-        return memcpy(to, from, n);
-    }
-    for (size_t i = n; i > 0U; i--) {
-        bytes[i - 1U] = source[i - 1U];
+    const bool              is_down = (uintptr_t)to < (uintptr_t)from;
+    for (size_t i = 0U; i < n; i++) {
+        const size_t at = is_down ? i : (n - 1U - i);  // what is overwritten has been read
+        bytes[at]       = source[at];
     }
     return to;
 }

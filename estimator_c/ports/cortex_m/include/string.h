@@ -7,5 +7,6 @@
 
 void* memset(void* to, int value, size_t n);
 void* memcpy(void* restrict to, const void* restrict from, size_t n);
+void* memmove(void* to, const void* from, size_t n);
 
 #endif  // STRING_H_INCLUDED
