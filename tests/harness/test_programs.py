@@ -13,6 +13,7 @@ import pytest
 from emulator import PROGRAMS, SuspensionComputer
 from harness import cli, information
 from harness.bench import Bench
+from harness.cli import options
 from harness.dut import open_dut
 from harness.errors import ConfigurationError
 from harness.netlist import netlist
@@ -54,7 +55,7 @@ def played(scenario: Scenario) -> Run:
 
 
 def test_every_program_has_its_name_in_scenarios_and_on_the_command_line() -> None:
-    assert set(typing.get_args(typing.get_type_hints(PlantChoice)["set"])) == set(PROGRAMS) == set(cli._PROGRAMS)
+    assert set(typing.get_args(typing.get_type_hints(PlantChoice)["set"])) == set(PROGRAMS) == set(options.PROGRAMS)
 
 
 @pytest.mark.parametrize("program", ["bump-stop", "two-mass"])

@@ -1,0 +1,126 @@
+"""Options that mean the same in every command, and what they ask for."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from harness.rig import Rig
+    from harness.scenario import Scenario
+
+DEFAULT_SCENARIO = "thesis"
+DEFAULT_SEED = 1995
+
+
+def add_what_to_play(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--scenario",
+        metavar="NAME",
+        help=f"a shipped name or a .toml file (default: {DEFAULT_SCENARIO}, or that recorded)",
+    )
+    command.add_argument(
+        "--program", choices=PROGRAMS, help="what is wired on the computer, instead of the scenario's plant.set"
+    )
+    command.add_argument(
+        "--rig",
+        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
+        metavar="NAME",
+        help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG or emulator)",
+    )
+    command.add_argument(
+        "--seed", type=seed, metavar="N", help=f"of all that is random (default: {DEFAULT_SEED}, or that recorded)"
+    )
+
+
+PROGRAMS = ("front", "shock", "bump-stop", "two-mass")
+"""Those of emulator.PROGRAMS, which would take a tenth of a second to ask."""
+
+
+def seed(text: str) -> int:
+    if text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 2**63:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
+
+
+def factor(text: str) -> float:
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if 1e-3 <= factor <= 1e6:
+        return factor
+    raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
+
+
+def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
+    shown = "$ANALOGRIG_DUT or host" if default is not None else "that of the recording"
+    command.add_argument(
+        "--dut",
+        default=default,
+        metavar="NAME",
+        help=f"shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], or serial:URL (default: {shown})",
+    )
+    command.add_argument(
+        "--exchange",
+        choices=("sample", "block", "stream"),
+        help="how samples go to the device, instead of as described",
+    )
+    command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
+    command.add_argument(
+        "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
+    )
+    command.add_argument(
+        "--report-interval", type=int, metavar="N", help="the device reports its estimate every N samples"
+    )
+    command.add_argument(
+        "--real-time",
+        type=factor,
+        nargs="?",
+        const=1.0,
+        metavar="FACTOR",
+        help="samples go out as the machine takes them, or FACTOR times slower; a stream, unless --exchange is given",
+    )
+
+
+def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=default,
+        metavar="DIR",
+        help="where run.npz and report.html go (default: %(default)s)",
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+
+
+def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says about the device beyond its name."""
+    in_real_time = "stream" if arguments.real_time is not None else None
+    return {
+        "exchange": arguments.exchange or in_real_time,
+        "baud": arguments.baud,
+        "report_interval_n": arguments.report_interval,
+        "wire_faults": arguments.wire_faults,
+    }
+
+
+def what_to_play(rig: Rig, arguments: argparse.Namespace) -> tuple[Scenario, int]:
+    """Scenario and seed: those asked for; by default those of the recording if the rig is one."""
+    from dataclasses import replace
+
+    from harness.rig import RecordingRig
+    from harness.scenario import Scenario
+
+    recording = rig if isinstance(rig, RecordingRig) else None
+    if recording is not None and arguments.scenario is None:
+        scenario = recording.scenario()
+    else:
+        scenario = Scenario.load(arguments.scenario or DEFAULT_SCENARIO)
+    if arguments.program is not None:
+        scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
+    if arguments.seed is not None:
+        return scenario, arguments.seed
+    return scenario, DEFAULT_SEED if recording is None else recording.run.conditions.seed

@@ -1,0 +1,29 @@
+"""``analogrig run``: play a scenario and judge."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import Any
+
+from harness.cli.options import add_dut, add_output, add_what_to_play, changes_of_dut, what_to_play
+from harness.cli.playing import play, prepare
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("run", help="play a scenario on a rig, through a device, and judge what it says")
+    add_what_to_play(command)
+    add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
+    add_output(command)
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from harness.dut import open_dut
+    from harness.rig import open_rig
+
+    with open_rig(arguments.rig) as rig:
+        scenario, seed = what_to_play(rig, arguments)
+        prepare(arguments.out, rig)
+        with open_dut(arguments.dut, **changes_of_dut(arguments)) as dut:
+            return play(rig, dut, scenario, seed, arguments)
