@@ -192,7 +192,7 @@ def _reason(error: OSError) -> str:
 
 
 class _Progress(ctypes.Structure):
-    """As device_progress_t of estimator_c/device/device.h."""
+    """As serial_progress_t of estimator_c/device/serial_device.h."""
 
     _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
 
@@ -229,12 +229,12 @@ class MemoryWire:
             c = ctypes.CDLL(str(library))
         except OSError as error:
             raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
-        c.device_run.restype = _Progress
-        c.device_size.restype = ctypes.c_size_t
-        self._run = c.device_run
-        self._init = c.device_init
+        c.serial_device_run.restype = _Progress
+        c.serial_device_size.restype = ctypes.c_size_t
+        self._run = c.serial_device_run
+        self._init = c.serial_device_init
         self._catalogue_hash = catalogue_hash
-        self._device = ctypes.create_string_buffer(c.device_size())
+        self._device = ctypes.create_string_buffer(c.serial_device_size())
         self._output = ctypes.create_string_buffer(_READ_BYTES)
         self._answers = b""
         self.clock = VirtualClock() if clock is None else clock

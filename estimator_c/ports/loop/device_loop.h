@@ -6,7 +6,7 @@
 #ifndef DEVICE_LOOP_H_INCLUDED
 #define DEVICE_LOOP_H_INCLUDED
 
-#include "device.h"
+#include "serial_device.h"
 
 #ifdef __cplusplus
 extern "C" {
@@ -18,7 +18,7 @@ extern "C" {
 #define DEVICE_LOOP_INPUT_SIZE 4096U
 #endif
 
-/// A burst of answers; when it is full the line waits. At least DEVICE_ANSWER_MAX.
+/// A burst of answers; when it is full the line waits. At least SERIAL_DEVICE_ANSWER.
 #ifndef DEVICE_LOOP_OUTPUT_SIZE
 #define DEVICE_LOOP_OUTPUT_SIZE 4096U
 #endif
