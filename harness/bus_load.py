@@ -1,7 +1,8 @@
 """How long frames take on a CAN bus, how much of it an exchange fills, and how long a message may have to wait.
 
-A frame is counted bit by bit, stuff bits included, from its start to the end of the intermission after it. Sources: ISO 11898-1 (2015), clauses 10.4 and 10.5; for the worst case Davis, Burns, Bril,
-Lukkien: Controller Area Network schedulability analysis, Real-Time Systems 35 (2007).
+A frame is counted bit by bit, stuff bits included, from its start to the end of the intermission after it. Sources:
+ISO 11898-1 (2015), clauses 10.4 and 10.5; for the worst case Davis, Burns, Bril and Lukkien, "Controller Area Network
+schedulability analysis", Real-Time Systems 35 (2007), here "Davis et al.".
 """
 
 from __future__ import annotations
