@@ -14,13 +14,14 @@ static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
     stream->n += sizeof(*frame);
 }
 
-/// Now and then in the wrong kind of frame.
+/// Now and then in the wrong kind of frame, or with another identifier of the same last byte.
 static void
 add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     can_frame_t   frame  = { .id = id, .length = analogrig_length(id) };
     const uint8_t choice = take_byte(input);
     frame.flags          = (frame.length > CAN_FRAME_CLASSIC_MAX) ? CAN_FRAME_FD : 0U;
     frame.flags ^= ((choice & 0xF0U) == 0xF0U) ? (choice & 0xFU) : 0U;
+    frame.id |= ((choice & 0xF0U) == 0xE0U) ? ((choice & 7U) << 8U) : 0U;
     (void)memcpy(frame.data, payload, frame.length);
     add_frame(stream, &frame);
 }
@@ -36,7 +37,18 @@ static void add_noise(stream_t* const stream, input_t* const input) {
     add_frame(stream, &frame);
 }
 
-static size_t messages(const stream_t* const stream) { return stream->n / sizeof(can_frame_t); }
+/// Of the harness, each in a data frame of its length.
+static size_t messages(const stream_t* const stream) {
+    size_t n = 0U;
+    for (size_t i = 0U; i < stream->n; i += sizeof(can_frame_t)) {
+        can_frame_t frame;
+        (void)memcpy(&frame, &stream->bytes[i], sizeof(frame));
+        const bool is_data = (frame.flags | CAN_FRAME_FD) == CAN_FRAME_FD;
+        const bool is_ours = (frame.id <= UINT8_MAX) && analogrig_is_from_harness((uint8_t)frame.id);
+        n += (is_data && is_ours && (frame.length == analogrig_length((uint8_t)frame.id))) ? 1U : 0U;
+    }
+    return n;
+}
 
 /// Nothing but classic frames of the device.
 static size_t checked(const answers_t* const answers) {

@@ -13,6 +13,9 @@
 /// An answer's line: t, three digits of identifier, the length, sixteen digits of data.
 #define ANSWER_LINE 21U
 
+/// That of a SampleBlock.
+#define BLOCK_LINE 133U
+
 static void add_text(stream_t* const stream, const char* const text) {
     const size_t n = strlen(text);
     (void)memcpy(&stream->bytes[stream->n], text, n);
@@ -21,13 +24,19 @@ static void add_text(stream_t* const stream, const char* const text) {
 
 static void begin(stream_t* const stream) { add_text(stream, "O\r"); }
 
+/// Now and then in the wrong kind of frame, or a digit too long.
 static void
 add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     const slcan_t adapter = { .is_open = true };
+    const uint8_t choice  = take_byte(input);
     can_frame_t   frame   = { .id = id, .length = analogrig_length(id) };
-    frame.flags           = ((frame.length > CAN_FRAME_CLASSIC_MAX) || (take_byte(input) > 0xF0U)) ? CAN_FRAME_FD : 0U;
+    frame.flags           = ((frame.length > CAN_FRAME_CLASSIC_MAX) || (choice >= 0xF0U)) ? CAN_FRAME_FD : 0U;
     (void)memcpy(frame.data, payload, frame.length);
     stream->n += slcan_encode(&adapter, &frame, &stream->bytes[stream->n]);
+    if ((choice & 0xF0U) == 0xE0U) {
+        stream->bytes[stream->n - 1U] = (uint8_t)'0';
+        stream->bytes[stream->n++]    = CR;
+    }
 }
 
 /// Any bytes, or such as a line is made of.
@@ -40,13 +49,22 @@ static void add_noise(stream_t* const stream, input_t* const input) {
     }
 }
 
-/// No frame without a CR.
+/// A line for a data frame of 8 or 64 bytes, as long as such a line is.
+static bool may_be_message(const uint8_t* const line, const size_t n) {
+    return ((n == ANSWER_LINE) && (line[4] == (uint8_t)'8')) ||
+           ((n == BLOCK_LINE) && ((line[4] == (uint8_t)'F') || (line[4] == (uint8_t)'f')));
+}
+
 static size_t messages(const stream_t* const stream) {
-    size_t lines = 0U;
+    size_t found = 0U;
+    size_t start = 0U;
     for (size_t i = 0U; i < stream->n; i++) {
-        lines += (stream->bytes[i] == CR) ? 1U : 0U;
+        if (stream->bytes[i] == CR) {
+            found += may_be_message(&stream->bytes[start], i - start) ? 1U : 0U;
+            start = i + 1U;
+        }
     }
-    return lines;
+    return found;
 }
 
 static uint8_t hex(const uint8_t character) {
