@@ -2,54 +2,100 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections import deque
 from collections.abc import Iterable
+from pathlib import Path
 
 import can
 
 from harness.can_bus import CanBus
-from harness.catalogue import CATALOGUE_HASH
+from harness.catalogue import CATALOGUE_HASH, FirmwareId
 from harness.errors import LinkClosed, LinkError
-from harness.frame import FrameDecoder, encode
 from harness.line import CanLine
-from harness.wire import MemoryWire, VirtualClock
+from harness.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
 
 MOST_BYTES = 64
 """In a frame of CAN FD."""
 
-CLASSIC_BYTES = 8
+_EXTENDED, _REMOTE, _FD, _ERROR = 1, 2, 4, 8
+"""As estimator_c/device/can_frame.h has them."""
 
+_OUTPUT_N = 128
 _POLL_S = 0.05
 """A device in a thread asks so often whether it shall end."""
 
 
-class LibraryCanDevice:
-    """The C of the device; its CAN shell is made here of its serial one."""
+class _Frame(ctypes.Structure):
+    """As can_frame_t of estimator_c/device/can_frame.h."""
 
-    def __init__(self, *, is_fd: bool, input_blocks: int, catalogue_hash: int = CATALOGUE_HASH) -> None:
+    _fields_ = (
+        ("id", ctypes.c_uint32),
+        ("flags", ctypes.c_uint8),
+        ("length", ctypes.c_uint8),
+        ("data", ctypes.c_uint8 * MOST_BYTES),
+    )
+
+
+def _to_c(frame: can.Message) -> _Frame:
+    flags = (
+        (_EXTENDED if frame.is_extended_id else 0)
+        | (_REMOTE if frame.is_remote_frame else 0)
+        | (_FD if frame.is_fd else 0)
+        | (_ERROR if frame.is_error_frame else 0)
+    )
+    data = bytes(frame.data[:MOST_BYTES])
+    out = _Frame(frame.arbitration_id, flags, len(data))
+    ctypes.memmove(out.data, data, len(data))
+    return out
+
+
+def _from_c(frame: _Frame) -> can.Message:
+    return can.Message(
+        arbitration_id=frame.id,
+        is_extended_id=False,
+        is_fd=bool(frame.flags & _FD),
+        data=bytes(frame.data)[: frame.length],
+    )
+
+
+class LibraryCanDevice:
+    """The C of the device behind its CAN shell."""
+
+    def __init__(
+        self, *, is_fd: bool, input_blocks: int, catalogue_hash: int = CATALOGUE_HASH, library: Path = LIBRARY
+    ) -> None:
         """It is not booted yet; ``is_fd``: its controller understands CAN FD. Another hash makes it a stranger.
 
         :raises LinkError: the device library was not built.
         """
-        self._wire = MemoryWire(0, catalogue_hash=catalogue_hash, input_blocks=input_blocks)
-        self._decoder = FrameDecoder(catalogue_hash)
-        self._catalogue_hash, self._most_bytes = catalogue_hash, MOST_BYTES if is_fd else CLASSIC_BYTES
+        c = load_library(library)
+        c.can_device_run.restype = Progress
+        c.can_device_size.restype = ctypes.c_size_t
+        self._run, self._init = c.can_device_run, c.can_device_init
+        self._is_fd, self._input_blocks, self._catalogue_hash = is_fd, input_blocks, catalogue_hash
+        self._device = ctypes.create_string_buffer(c.can_device_size())
+        self._output = (_Frame * _OUTPUT_N)()
 
     def boot(self, boot_nonce: int) -> None:
         """As if it had been switched off and on."""
-        self._wire.boot(boot_nonce)
+        identity = Identity(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
+        self._init(self._device, ctypes.byref(identity), ctypes.c_bool(self._is_fd))
 
     def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
         """What it says to these."""
-        for frame in frames:
-            packet = bytes((frame.arbitration_id & 0x7F,)) + frame.data
-            is_plain = not (frame.is_remote_frame or frame.is_error_frame or frame.is_extended_id)
-            fits = frame.is_fd == (len(frame.data) > CLASSIC_BYTES) and len(frame.data) <= self._most_bytes
-            if is_plain and fits and frame.arbitration_id < 0x80:
-                self._wire.write(encode(packet, self._catalogue_hash))
-        packets = self._decoder.feed(self._wire.read(0.0))
-        return [can.Message(arbitration_id=each[0], is_extended_id=False, data=each[1:]) for each in packets]
+        waiting = [_to_c(frame) for frame in frames]
+        out: list[can.Message] = []
+        while True:
+            array = (_Frame * len(waiting))(*waiting)
+            progress = self._run(
+                self._device, array, ctypes.c_size_t(len(waiting)), self._output, ctypes.c_size_t(_OUTPUT_N)
+            )
+            out += [_from_c(self._output[i]) for i in range(progress.given)]
+            waiting = waiting[progress.taken :]
+            if not progress.given and not waiting:
+                return out
 
 
 class MemoryBus:

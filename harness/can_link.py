@@ -12,13 +12,11 @@ from collections.abc import Iterable, Mapping
 
 import can
 
+from harness.bus_load import CLASSIC_BYTES
 from harness.can_bus import CanBus
 from harness.catalogue import LAYOUTS, Message, pack, unpack
 from harness.errors import LinkError
 from harness.link import CanListener
-
-CLASSIC_BYTES = 8
-"""The most in a frame that is not CAN FD."""
 
 _OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
 _DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}

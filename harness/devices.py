@@ -263,8 +263,7 @@ class HostDevice(EitherDevice):
     def bus(self) -> CanBus:
         from harness.can_bus import ChildBus, PythonCanBus
 
-        arguments = ["--slcan", *(["--fd"] if self.fd else [])]
-        child = host_child(arguments)
+        child = host_child(["--slcan"])
         try:
             return ChildBus(child, PythonCanBus(self._slcan(child.first_line()), name="slcan"))
         except BaseException:
@@ -326,6 +325,25 @@ class QemuDevice(EitherDevice):
         return {"firmware": where} if where else {}
 
     def wire(self) -> Wire:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            line = theirs.fileno()
+            child = self._boot(["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"], inherited=[line])
+            return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+
+    def bus(self) -> CanBus:
+        """On the second UART, as a terminal, since python-can's slcan opens nothing else as fast."""
+        from harness.can_bus import ChildBus, PythonCanBus
+
+        child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])
+        try:
+            (terminal,) = re.findall(r"/dev/\S+", child.first_line()) or [""]
+            return ChildBus(child, PythonCanBus(self._slcan(terminal), name="qemu slcan"))
+        except BaseException:
+            child.end()
+            raise
+
+    def _boot(self, line: Sequence[str], inherited: Sequence[int] = ()) -> Child:
         qemu = shutil.which(QEMU)
         if qemu is None:
             raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
@@ -340,13 +358,8 @@ class QemuDevice(EitherDevice):
             self._image(),
             *_NO_SCREEN,
         ]
-        command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            line = theirs.fileno()
-            command += ["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"]
-            child = Child(command, f"QEMU ({self.machine})", inherited=[line])
-            return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+        command += ["-semihosting-config", f"enable=on,target=native,{arguments}", *line]
+        return Child(command, f"QEMU ({self.machine})", inherited=inherited)
 
     @property
     def elsewhere(self) -> str:

@@ -2,7 +2,8 @@
 
 A pseudo-terminal takes any number of bytes at once, a virtual bus any number of frames. Here each takes its bits, the
 device answers when the last bit of a message is there, and takes no time itself. Nothing is delayed, so that the figure
-is the same every time; it is exact for lock-step, where nothing is sent before the answers have come.
+is the same every time; for lock-step, where nothing is sent before the answers have come, it is exact, but that CAN
+frames count with as many stuff bits as they can have.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from harness import frame
+from harness.bus_load import CLASSIC_BYTES, longest_bits
 from harness.catalogue import LAYOUTS, Message
 
 if TYPE_CHECKING:
@@ -69,20 +71,15 @@ class CanLine:
         return f"{self.bitrate} bit/s{faster}"
 
     def frame_s(self, frame: can.Message) -> float:
-        """How long a frame takes, with the space after it [s]."""
-        return self._longest_s(len(frame.data))
+        """How long a frame takes, with the space after it, when it has as many stuff bits as it can have [s]."""
+        bits = longest_bits(len(frame.data), is_fd=frame.is_fd, switches=frame.bitrate_switch)
+        return bits.seconds(self.bitrate, self.data_bitrate)
 
     def message_s(self, kind: type[Message]) -> float:
-        return self._longest_s(LAYOUTS[kind.__name__].length)
+        length = LAYOUTS[kind.__name__].length
+        is_fd = length > CLASSIC_BYTES
+        bits = longest_bits(length, is_fd=is_fd, switches=is_fd and self.data_bitrate is not None)
+        return bits.seconds(self.bitrate, self.data_bitrate)
 
     def together_s(self, to_s: float, from_s: float) -> float:
         return to_s + from_s
-
-    def _longest_s(self, n: int) -> float:
-        """Of a frame of n bytes with as many stuff bits as there can be (Davis et al. 2007, Equ 1; ISO 11898-1)."""
-        if n <= 8:
-            return (47 + 8 * n + (34 + 8 * n - 1) // 4) / self.bitrate
-        head, tail = 17 + 17 // 4, 13
-        data = 5 + 8 * n
-        data += data // 4 + (4 + 17 + 6 if n <= 16 else 4 + 21 + 7)
-        return (head + tail) / self.bitrate + data / (self.data_bitrate or self.bitrate)

@@ -235,12 +235,12 @@ class MemoryWire:
         :raises LinkError: the device library was not built.
         """
         c = load_library(library)
-        c.device_run.restype = Progress
-        c.device_size.restype = ctypes.c_size_t
-        self._run = c.device_run
-        self._init = c.device_init
+        c.serial_device_run.restype = Progress
+        c.serial_device_size.restype = ctypes.c_size_t
+        self._run = c.serial_device_run
+        self._init = c.serial_device_init
         self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
-        self._device = ctypes.create_string_buffer(c.device_size())
+        self._device = ctypes.create_string_buffer(c.serial_device_size())
         self._output = ctypes.create_string_buffer(_READ_BYTES)
         self._answers = b""
         self.clock = VirtualClock() if clock is None else clock
