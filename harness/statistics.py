@@ -100,7 +100,7 @@ class Design:
 class SequentialTest:
     """Wald's test of a good rate against a bad one; it may be looked at after every trial.
 
-    The probability to call a rate of ``bad`` or more BELOW is at most ``miss``, and to call one of ``good`` or less ABOVE
+    The probability to call a rate of ``bad`` or more BELOW is at most ``miss``, to call one of ``good`` or less ABOVE
     at most ``false_alarm`` (Wald 1947, section 3.2: with 1 / false_alarm and miss for A and B, both hold).
     """
 
