@@ -21,7 +21,8 @@ LONGEST_INPUT = {"fuzz_est": 512, "fuzz_serial": 2048, "fuzz_can": 2048, "fuzz_s
 """By target, in bytes: some hundred samples."""
 
 _SANITIZED = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined")
-_FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *(f"-I{part}" for part in (*PARTS, LOOP, HERE)))
+_INCLUDE = tuple(f"-I{part}" for part in (*PARTS, LOOP, HERE))
+_FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *_INCLUDE)
 
 
 def build(target: str, folder: Path) -> Path:
