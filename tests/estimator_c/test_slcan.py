@@ -11,6 +11,7 @@ import ctypes
 import random
 import subprocess
 from collections.abc import Iterator
+from functools import partial
 
 import can
 import pytest
@@ -91,11 +92,12 @@ def frames() -> list[can.Message]:
     for is_extended in (False, True):
         for i in range(40):
             top = 0x1FFFFFFF if is_extended else 0x7FF
-            identity = {"arbitration_id": rng.choice([0, top, rng.randint(0, top)]), "is_extended_id": is_extended}
-            classic, fd = rng.randbytes(i % 9), rng.randbytes(CAN_FD_DLC[i % 16])
-            out.append(can.Message(**identity, data=classic))
-            out.append(can.Message(**identity, data=fd, is_fd=True, bitrate_switch=i > 20))
-            out.append(can.Message(**identity, is_remote_frame=True, dlc=i % 9))
+            message = partial(
+                can.Message, arbitration_id=rng.choice([0, top, rng.randint(0, top)]), is_extended_id=is_extended
+            )
+            out.append(message(data=rng.randbytes(i % 9)))
+            out.append(message(data=rng.randbytes(CAN_FD_DLC[i % 16]), is_fd=True, bitrate_switch=i > 20))
+            out.append(message(is_remote_frame=True, dlc=i % 9))
     return out
 
 
