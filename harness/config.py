@@ -21,7 +21,7 @@ from harness.errors import ConfigurationError
 
 T = TypeVar("T")
 
-Kind = Literal["scenarios", "rigs", "devices"]
+Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
 
 MAX_FILE_BYTES = 1_000_000
 

@@ -98,8 +98,9 @@ def _changes(run: Run) -> Iterator[_Change]:
         steps = _steps(before or plant, plant, ramps_n[start], end - start, conditions.sample_period_problem_s)
         if before is not None:
             yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
-        for step, force in zip(steps, force_n[start:end], strict=True):
-            state = step.next(state, force)
+        if end < run.samples:
+            for step, force in zip(steps, force_n[start:end], strict=True):
+                state = step.next(state, force)
         before = plant
 
 
