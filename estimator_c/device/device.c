@@ -20,7 +20,7 @@
 #define RUN_MAX 7U      ///< of the run ids, which have three bits
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
-#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE
+#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE
 
 /// What is still to be said about a sample, in this order.
 #define SAY_ALARM 1U
@@ -425,6 +425,8 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
         return self->counters.samples_of_other_runs;
     case ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE:
         return self->counters.receive_overruns;
+    case ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE:
+        return self->counters.frames_foreign;
     default:
         return 0U;
     }
@@ -538,6 +540,11 @@ void device_overrun(device_t* const self, const uint32_t lost_n) {
 void device_dropped(device_t* const self, const uint32_t frames_n) {
     DEVICE_ASSERT(self != 0);
     add(&self->counters.frames_dropped, frames_n);
+}
+
+void device_foreign(device_t* const self, const uint32_t frames_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.frames_foreign, frames_n);
 }
 
 bool device_is_busy(const device_t* const self) {

@@ -4,7 +4,7 @@
 /// answers, and a message that cannot be understood has none. It does not wait, and it never holds more than one message:
 /// the next one is taken when the last has all its answers, which are made one at a time, as the line has room for them.
 /// A slow line slows the harness down and nothing is lost. What a line is made of, bytes or CAN frames, is for the shells
-/// to know: serial_device.h, can_device.h.
+/// to know: serial_device.h, can_device.h, slcan_device.h.
 ///
 ///     Identify    -> Hello, Firmware          Configure   -> Configured
 ///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Estimate ...] Stepped
@@ -56,6 +56,7 @@ typedef struct {
 /// Counters since device_init() or RESET. They saturate, they do not wrap.
 typedef struct {
     uint32_t frames_dropped;         ///< what came and was no frame, or not whole, as the shell told
+    uint32_t frames_foreign;         ///< frames of others on the same bus, as the shell told
     uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
     uint32_t messages_repeated;      ///< messages with one of the last DEVICE_LATE_MAX sequence numbers; ignored
     uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
@@ -70,6 +71,12 @@ typedef struct {
     uint8_t id;  ///< of the catalogue
     uint8_t payload[DEVICE_ANSWER_LENGTH];
 } device_message_t;
+
+/// How far a shell has come with its input and output.
+typedef struct {
+    size_t taken;  ///< of the input: done with
+    size_t given;  ///< written to the output
+} device_progress_t;
 
 /// What is left to answer of the last message. Private.
 typedef enum {
@@ -134,6 +141,9 @@ void device_overrun(device_t* self, uint32_t lost_n);
 
 /// So many frames were no good: the shell has dropped them.
 void device_dropped(device_t* self, uint32_t frames_n);
+
+/// So many frames were those of others on the same bus: the shell has passed over them.
+void device_foreign(device_t* self, uint32_t frames_n);
 
 /// Whether there may still be answers to the last message: ask for them before the next one is entered.
 bool device_is_busy(const device_t* self);

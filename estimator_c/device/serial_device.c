@@ -25,14 +25,14 @@ static void enter(serial_device_t* const self, const uint8_t byte) {
     }
 }
 
-serial_progress_t serial_device_run(serial_device_t* const self,
+device_progress_t serial_device_run(serial_device_t* const self,
                                     const uint8_t* const   in,
                                     const size_t           in_n,
                                     uint8_t* const         out,
                                     const size_t           out_n) {
     SERIAL_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     const uint32_t    hash     = self->decoder.catalogue_hash;
-    serial_progress_t progress = { .taken = 0U, .given = 0U };
+    device_progress_t progress = { .taken = 0U, .given = 0U };
     while ((out_n - progress.given) >= SERIAL_DEVICE_ANSWER) {
         device_message_t answer;
         if (device_answer(&self->device, &answer)) {
@@ -44,11 +44,6 @@ serial_progress_t serial_device_run(serial_device_t* const self,
         }
     }
     return progress;
-}
-
-bool serial_device_is_busy(const serial_device_t* const self) {
-    SERIAL_DEVICE_ASSERT(self != 0);
-    return device_is_busy(&self->device);
 }
 
 size_t serial_device_size(void) { return sizeof(serial_device_t); }

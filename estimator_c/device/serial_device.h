@@ -22,26 +22,18 @@ extern "C" {
 
 /// The state of a device on a serial line. The fields are private, but for the device.
 typedef struct {
-    device_t        device;
+    device_t        device;  ///< first
     frame_decoder_t decoder;
 } serial_device_t;
-
-typedef struct {
-    size_t taken;  ///< bytes of the input that are done with
-    size_t given;  ///< bytes written to the output
-} serial_progress_t;
 
 /// Makes the device ready: default configuration, stopped, at the beginning of a frame.
 void serial_device_init(serial_device_t* self, const device_identity_t* identity);
 
 /// Works until all input is taken and answered, or until the output has less than SERIAL_DEVICE_ANSWER bytes left: then call
-/// again, with the rest of the input and a new output. Call again too when all input was taken and the output was nearly
-/// full: serial_device_is_busy() tells. Input is taken only as far as it could be answered.
+/// again, with the rest of the input and a new output (both counted in bytes). Call again too when all input was taken and the output was nearly
+/// full: device_is_busy() tells. Input is taken only as far as it could be answered.
 /// Cost: per byte O(1); per message as device_enter() and device_answer().
-serial_progress_t serial_device_run(serial_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
-
-/// Whether answers to input already taken are still to come.
-bool serial_device_is_busy(const serial_device_t* self);
+device_progress_t serial_device_run(serial_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
 /// sizeof(serial_device_t), for callers in other languages.
 size_t serial_device_size(void);

@@ -82,14 +82,14 @@ static void add_next(stream_t* const stream, input_t* const input) {
 /// The stream in pieces into the device, its answers in pieces out of it; sizes come from the input, the largest without one.
 static void play(serial_device_t* const device, const stream_t* const stream, input_t* const sizes, answers_t* const answers) {
     size_t taken = 0U;
-    while ((taken < stream->n) || serial_device_is_busy(device)) {
+    while ((taken < stream->n) || device_is_busy(&device->device)) {
         const bool   any_size = sizes->n > 0U;
         const size_t left     = stream->n - taken;
         const size_t piece    = any_size ? (byte(sizes) % 100U) : left;
         const size_t in_n     = (piece < left) ? piece : left;
         const size_t room     = any_size ? (4U * (size_t)byte(sizes)) : (64U * SERIAL_DEVICE_ANSWER);
         expect(answers->n + room <= ANSWERS_MAX);
-        const serial_progress_t progress =
+        const device_progress_t progress =
             serial_device_run(device, &stream->bytes[taken], in_n, &answers->bytes[answers->n], room);
         expect((progress.taken <= in_n) && (progress.given <= room));
         expect((room < SERIAL_DEVICE_ANSWER) || (in_n == 0U) || (progress.taken > 0U) || (progress.given > 0U));

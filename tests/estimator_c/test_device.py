@@ -643,12 +643,12 @@ def answers_in_pieces(stream: bytes, rng: random.Random, room: int) -> bytes:
     c = ctypes.CDLL(str(LIBRARY))
     c.serial_device_run.restype = Progress
     c.serial_device_size.restype = ctypes.c_size_t
-    c.serial_device_is_busy.restype = ctypes.c_bool
+    c.device_is_busy.restype = ctypes.c_bool
     state = ctypes.create_string_buffer(c.serial_device_size())
     c.serial_device_init(state, (ctypes.c_uint32 * 3)(CATALOGUE_HASH, NONCE, FirmwareId.LIBRARY))
     out = ctypes.create_string_buffer(b"\xaa" * (room + 16))
     answers, waiting, at = b"", b"", 0
-    while waiting or at < len(stream) or c.serial_device_is_busy(state):
+    while waiting or at < len(stream) or c.device_is_busy(state):
         piece = stream[at : at + rng.randrange(40)]
         at += len(piece)
         waiting += piece
