@@ -19,9 +19,11 @@ BUS_OFF = 0x40
 CLASSIC = (
     can.Message(arbitration_id=0x7FF, is_extended_id=False, data=bytes(range(8))),
     can.Message(arbitration_id=0x1FFFFFFF, data=b""),
-    can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=4),
+    can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=0),
 )
-FD = (
+"""QEMU's SJA1000 (7.2) forgets where the next frame begins after a remote one of another length."""
+VIRTUAL_ONLY = (
+    can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True, dlc=4),
     can.Message(arbitration_id=0x123, is_extended_id=False, is_fd=True, data=bytes(range(64))),
     can.Message(arbitration_id=0x123, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(12)),
 )
@@ -29,7 +31,7 @@ FD = (
 
 @pytest.mark.parametrize(
     ("sender", "receiver", "frames"),
-    [(VIRTUAL, VIRTUAL, CLASSIC + FD), (*CONTROLLERS, CLASSIC), (*reversed(CONTROLLERS), CLASSIC)],
+    [(VIRTUAL, VIRTUAL, CLASSIC + VIRTUAL_ONLY), (*CONTROLLERS, CLASSIC), (*reversed(CONTROLLERS), CLASSIC)],
     ids=[VIRTUAL, "-".join(CONTROLLERS), "-".join(reversed(CONTROLLERS))],
 )
 def test_frames_of_every_kind_arrive_as_they_were_sent(
@@ -53,7 +55,7 @@ def test_own_frames_do_not_come_back(channel: str) -> None:
 
 def test_controller_without_can_fd_refuses_its_frames() -> None:
     with socketcan(CONTROLLERS[0], fd=True) as bus, pytest.raises(can.CanOperationError) as raised:
-        bus.send(FD[0])
+        bus.send(VIRTUAL_ONLY[-1])
     assert raised.value.error_code == errno.EINVAL
 
 
