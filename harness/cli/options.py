@@ -65,7 +65,8 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
         "--dut",
         default=default,
         metavar="NAME",
-        help=f"shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], or serial:URL (default: {shown})",
+        help="shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
+        f" can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
     )
     command.add_argument(
         "--exchange",
@@ -73,6 +74,9 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
         help="how samples go to the device, instead of as described",
     )
     command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
+    command.add_argument(
+        "--bitrate", type=int, metavar="N", help="of a CAN bus; without a real one its time is reported"
+    )
     command.add_argument(
         "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
     )
@@ -106,6 +110,7 @@ def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "exchange": arguments.exchange or in_real_time,
         "baud": arguments.baud,
+        "bitrate": arguments.bitrate,
         "report_interval_n": arguments.report_interval,
         "wire_faults": arguments.wire_faults,
     }
