@@ -179,8 +179,8 @@ def test_real_time_that_does_not_fit_the_bus_is_refused_with_the_arithmetic() ->
         with pytest.raises(ConfigurationError) as caught:
             Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
         assert str(caught.value) == (
-            "device bob: real time does not fit its line: 20000 samples/s, each of 135 us to the device and 1080 us back"
-            " (7 estimates every 1 samples), are 24.3 times what 1000000 bit/s carry; 24.3 times slower would fit"
+            "device bob: real time does not fit its line: 20000 samples/s, each of 135 us to the device and 1080 us"
+            " back (7 estimates every 1 samples), are 24.3 times what 1000000 bit/s carry; 24.3 times slower would fit"
         )
         short = Scenario(samples=56, excitation=THESIS.excitation)
         assert Bench(rig, dut, real_time=24.31).play(short, seed=1).samples == 56
