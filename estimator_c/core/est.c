@@ -139,18 +139,43 @@ static void restart(est_t* const self, const uint_fast8_t pending_n) {
     self->pending_n = (uint8_t)larger(self->pending_n, pending_n);
 }
 
-/// One sample less to come before the next equation is complete. What an alarm, or a new C, leaves to do to P is done here, where
-/// there is time: the step that finds it is long enough.
-static void gather(est_t* const self) {
-    self->pending_n--;
+/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
+/// did on u(k), or the other way round.
+static void follow_slip(est_t* const self, const bool late) {
+    const uint_fast8_t nb = self->config->nb;
+    float* const  b  = &self->theta[self->config->na];
+    for (uint_fast8_t i = 0U; i < self->count; i++) {
+        self->theta[i] = self->edges.theta[i];
+    }
+    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    if (late) {
+        shift(b, nb, 0.0F);
+        return;
+    }
+    for (uint_fast8_t j = 0U; j < nb; j++) {
+        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
+    }
+}
+
+/// What an alarm, a slip or a new C leaves to do to theta and P.
+static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_DOUBT)) {
         est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
+    } else if (EST_WITH_EDGES && (self->renewal != EST_RENEWAL_NONE)) {
+        follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else {
-        // P is as it should be
+        // they are as they should be
     }
     self->renewal = EST_RENEWAL_NONE;
+}
+
+/// One sample less to come before the next equation is complete. There is time here for what the step that found a change
+/// left to do: that one is long enough.
+static void gather(est_t* const self) {
+    self->pending_n--;
+    renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
         count(&self->counters.restarts);
@@ -202,7 +227,7 @@ static void doubt_edge(est_t* const self) {
         return;
     }
     const float step = self->u[0] - self->u[1];
-    est_edges_begin(&self->edges, self->config, self->theta, self->count, step, self->pending_n == 0U);
+    est_edges_begin(&self->edges, self->config, self->theta, step, self->pending_n == 0U);
     est_trigger_begin_doubt(&self->trigger);
 }
 
@@ -266,10 +291,11 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 /// they are taken against what was believed before the doubt.
 EST_INLINE void
 read_otherwise(est_t* const self, const est_shape_t shape, const float* const phi, float* const readings) {
-    const float e = est_equation_residual(phi, self->edges.theta, est_shape_count(shape));
+    const float e = (self->edges.age_n > 1U) ? est_equation_residual(phi, self->edges.theta, est_shape_count(shape))
+                                             : readings[0];  // theta has not moved since
     float       early;
     float       late;
-    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
+    est_edges_shares(&self->edges, shape, &self->whitener, self->u, &early, &late);
     readings[1] = e - early;
     readings[2] = e - late;
 }
@@ -295,31 +321,36 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
-/// Of the magnitudes of the two, the first of which is one.
-static float larger_magnitude(const float a, const float b) {
-    const float magnitude = (b < 0.0F) ? -b : b;
-    return (a < magnitude) ? magnitude : a;
+/// Whether one of the coefficients is further from the C in use than this.
+EST_INLINE bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
+    bool out = false;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        const float step = c[i] - whitener->c[i];
+        out              = out || (step > distance) || (step < -distance);
+    }
+    return out;
 }
 
 /// After convergence the noise of the equations is coloured by A itself (thesis section 3.5: noise on the output).
 static void refresh_prefilter(est_t* const self) {
     const uint_fast8_t na = self->config->na;
-    float         c[EST_NA_MAX];
-    float         factor = 1.0F;
-    float         step   = 0.0F;  // of the coefficient that moves most
-    for (uint_fast8_t i = 0U; i < na; i++) {
+    float c[EST_NA_MAX];
+    float factor = 1.0F;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         factor *= CONTRACTION;
-        c[i]  = self->theta[i] * factor;
-        step = larger_magnitude(step, c[i] - self->whitener.c[i]);
+        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
     }
-    if ((step > REFRESH_STEP) && est_whitener_accepts(c, na)) {
-        est_whitener_set(&self->whitener, c, na);
-        count(&self->counters.refreshes);
-        if (step > REFRESH_STRIDE) {
-            self->renewal = EST_RENEWAL_DOUBT;
-            restart(self, 1U);
-        }
+    if (!further(&self->whitener, c, REFRESH_STEP) || !est_whitener_accepts(c, EST_NA_MAX)) {
+        return;
     }
+    if (further(&self->whitener, c, REFRESH_STRIDE)) {
+        self->renewal = EST_RENEWAL_DOUBT;
+        restart(self, 1U);
+    }
+    est_whitener_set(&self->whitener, c, EST_NA_MAX);
+    count(&self->counters.refreshes);
 }
 
 static bool remembers_edge(const est_t* const self) {
@@ -341,24 +372,6 @@ EST_INLINE void approach_refresh(est_t* const self) {
 }
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
-
-/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
-/// did on u(k), or the other way round. The statistic goes on as this reading has it, so that a change is not lost in it.
-static void follow_slip(est_t* const self) {
-    const uint_fast8_t nb = self->config->nb;
-    float* const  b  = &self->theta[self->config->na];
-    for (uint_fast8_t i = 0U; i < self->count; i++) {
-        self->theta[i] = self->edges.theta[i];
-    }
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
-    if (est_trigger_settle_late(&self->trigger)) {
-        shift(b, nb, 0.0F);
-        return;
-    }
-    for (uint_fast8_t j = 0U; j < nb; j++) {
-        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
-    }
-}
 
 static void zero(float* const x, const uint_fast8_t n) {
     for (uint_fast8_t i = 0U; i < n; i++) {
@@ -387,7 +400,7 @@ static void react(est_t* const self, const est_finding_t finding) {
         estimate_afresh(self);
     } else {
         count(&self->counters.slips);
-        follow_slip(self);
+        self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
     }
     forget_samples(self);  // they belong to the plant, or the clock, as it was
 }

@@ -59,8 +59,8 @@ static float other_statistic(est_trigger_t* const              self,
 }
 
 /// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
-EST_OUTLINE float cusum(const float before, const float innovation, const float precision) {
-    const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
+EST_OUTLINE float cusum(const float before, const float innovation, const float weight) {
+    const float sum = before + ((innovation * innovation * weight) - CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
@@ -71,9 +71,11 @@ EST_OUTLINE float best_rival(const est_trigger_t* const self) {
 
 /// The plant has changed only if no reading of the edges explains the innovations.
 static est_finding_t
-find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const readings, const float precision, const bool expires) {
+find_in_doubt(
+    est_trigger_t* const self, const float ceiling, const float* const readings, const float weight, const bool expires) {
+    EST_UNROLL
     for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = cusum(self->rival[i], readings[i + 1U], precision);
+        self->rival[i] = cusum(self->rival[i], readings[i + 1U], weight);
     }
     if (self->statistic < ceiling) {
         return EST_QUIET;
@@ -97,12 +99,6 @@ void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
     self->mean_n    = 0U;
     self->quiet_n   = quiet_n;
     est_trigger_begin_doubt(self);
-}
-
-void est_trigger_begin_doubt(est_trigger_t* const self) {
-    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = self->statistic;
-    }
 }
 
 est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
@@ -136,9 +132,10 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
         self->quiet_n--;
         self->statistic = no_statistic(readings[0]);
     } else if (config->kind == EST_TRIGGER_CUSUM) {
-        self->statistic = cusum(self->statistic, readings[0], precision);
+        const float weight = CUSUM_GAIN * precision;
+        self->statistic = cusum(self->statistic, readings[0], weight);
         if (EST_WITH_EDGES && (doubt_n > 0U)) {
-            return find_in_doubt(self, config->ceiling, readings, precision, doubt_n >= EST_DOUBT_N);
+            return find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);
         }
     } else if (EST_WITH_TRIGGERS) {
         self->statistic = other_statistic(self, config, readings[0], precision);
