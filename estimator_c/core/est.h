@@ -37,8 +37,8 @@
 extern "C" {
 #endif
 
-#define EST_VERSION_MAJOR 0
-#define EST_VERSION_MINOR 1
+#define EST_VERSION_MAJOR 0  // MISRA D1
+#define EST_VERSION_MINOR 1  // MISRA D1
 
 /// The largest orders that est_init() accepts, and the most parameters. They fix the size of est_t; override them with -D.
 #ifndef EST_NA_MAX
@@ -197,7 +197,11 @@ typedef struct {
 } est_factors_t;
 
 /// The gains of so many equations are needed to find those of the next.
-#define EST_GAINS_KEPT ((EST_NA_MAX > 1U) ? (EST_NA_MAX - 1U) : 1U)
+#if EST_NA_MAX > 1
+#define EST_GAINS_KEPT (EST_NA_MAX - 1U)
+#else
+#define EST_GAINS_KEPT 1U
+#endif
 
 /// The last values of one whitened signal, newest first. Private.
 typedef struct {

@@ -4,6 +4,7 @@
 #include "est_shape.h"
 
 #include <float.h>
+#include <stddef.h>
 
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
@@ -46,15 +47,15 @@ static float other_statistic(est_trigger_t* const              self,
                              const float                       precision) {
     switch (config->kind) {
     case EST_TRIGGER_PREDICTION_ERROR:
-        return magnitude(innovation);
+        return magnitude(innovation);  // MISRA D4
     case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
-        return mean_between_faults(self, config->absolute, innovation);
+        return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
     case EST_TRIGGER_NONE:
-        return no_statistic(innovation);
+        return no_statistic(innovation);  // MISRA D4
     case EST_TRIGGER_CUSTOM:
     case EST_TRIGGER_CUSUM:
     default:
-        return custom(self, config, innovation, 1.0F / precision);
+        return custom(self, config, innovation, 1.0F / precision);  // MISRA D4
     }
 }
 
@@ -78,10 +79,10 @@ find_in_doubt(
         self->rival[i] = cusum(self->rival[i], readings[i + 1U], weight);
     }
     if (self->statistic < ceiling) {
-        return EST_QUIET;
+        return EST_QUIET;  // MISRA D4
     }
     if (best_rival(self) < ceiling) {
-        return expires ? EST_SLIP : EST_QUIET;
+        return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
     }
     return EST_ALARM;
 }
@@ -89,7 +90,7 @@ find_in_doubt(
 bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
                        (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
-                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != 0));
+                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
@@ -103,7 +104,7 @@ void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
 
 est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
-        return EST_SLIP;
+        return EST_SLIP;  // MISRA D4
     }
     if (est_trigger_in_doubt(self)) {
         self->statistic = best_rival(self);
@@ -135,7 +136,7 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
         const float weight = CUSUM_GAIN * precision;
         self->statistic = cusum(self->statistic, readings[0], weight);
         if (EST_WITH_EDGES && (doubt_n > 0U)) {
-            return find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);
+            return find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);  // MISRA D4
         }
     } else if (EST_WITH_TRIGGERS) {
         self->statistic = other_statistic(self, config, readings[0], precision);

@@ -52,7 +52,7 @@ float est_whitener_advance(est_whitener_t* const self) {
         float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
         EST_UNROLL
         for (uint_fast8_t m = EST_NA_MAX; m > i; m--) {
-            sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];
+            sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];  // cppcheck F1
         }
         covariance[i - 1U] = sum;
         gain[i - 1U]       = sum * self->precision[i - 1U];

@@ -14,7 +14,7 @@
 /// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
 /// Schur-Cohn (step-down): all zeros are inside iff every reflection coefficient is below 1.
 EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
-    float a[EST_NA_MAX] = { 0.0F };
+    float a[EST_NA_MAX] = { 0.0F };  // MISRA D2
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         a[i] = (i < na) ? c[i] : 0.0F;
@@ -23,7 +23,7 @@ EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t n
     for (uint_fast8_t order = EST_NA_MAX; order > 0U; order--) {
         const float k = a[order - 1U];
         if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
-            return false;
+            return false;  // MISRA D4
         }
         const float rest = 1.0F - (k * k);
         EST_UNROLL

@@ -134,7 +134,7 @@ class Mutant:
     @property
     def key(self) -> tuple[str, str, str, str]:
         """What it is called, wherever the line has moved to."""
-        return self.file, self.function, self.before.strip(), self.after.strip()
+        return self.file, self.function, code_of(self.before).strip(), code_of(self.after).strip()
 
 
 @dataclass(frozen=True)
@@ -150,9 +150,14 @@ class Outcome:
     """A digest of the function that was altered, as it was."""
 
 
+def code_of(line: str) -> str:
+    """Without a remark."""
+    return line.split("//", maxsplit=1)[0]
+
+
 def altered(line: str) -> Iterator[str]:
     """The line with each alteration in turn."""
-    code = line.split("//", maxsplit=1)[0]
+    code = code_of(line)
 
     def put(start: int, end: int, text: str) -> str:
         return line[:start] + text + line[end:]
@@ -200,13 +205,14 @@ def _lines_of(path: Path) -> Iterator[tuple[int, str, str]]:
 
 @functools.cache
 def sources() -> dict[tuple[str, str], str]:
-    """A digest of each function and macro of the core, by file and name; remarks of their own line do not count."""
+    """A digest of each function and macro of the core, by file and name; remarks do not count."""
     text: dict[tuple[str, str], list[str]] = {}
     for path in sorted(CORE.glob("*.[ch]")):
         for _, function, line in _lines_of(path):
-            if not line.lstrip().startswith("//"):
-                text.setdefault((path.name, function), []).append(line.strip())
-    return {where: hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16] for where, lines in text.items()}
+            text.setdefault((path.name, function), []).append(code_of(line).strip())
+    return {
+        where: hashlib.sha256("\n".join(filter(None, lines)).encode()).hexdigest()[:16] for where, lines in text.items()
+    }
 
 
 def sampled(every: Sequence[Mutant], count: int, seed: int = 1) -> list[Mutant]:
