@@ -1,5 +1,6 @@
 #include "device.h"
 
+#include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
 #include "settings.h"
 
@@ -17,16 +18,15 @@
 #endif
 
 #define RUN_MAX 7U      ///< of the run ids, which have three bits
-#define PAYLOAD_MAX 8U  ///< of an answer; all fit classic CAN
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
-#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE
+#define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE
 
-/// Where the answers of one step of work go.
-typedef struct {
-    uint8_t* bytes;
-    size_t   n;
-} answer_t;
+/// What is still to be said about a sample, in this order.
+#define SAY_ALARM 1U
+#define SAY_DIAGNOSIS 2U
+#define SAY_ESTIMATES 4U
+#define SAY_STEPPED 8U
 
 static void add(uint32_t* const counter, const uint32_t n) {
     *counter = (*counter < (UINT32_MAX - n)) ? (*counter + n) : UINT32_MAX;
@@ -36,74 +36,93 @@ static uint16_t word(const uint8_t* const bytes) { return (uint16_t)(bytes[0] | 
 
 // ---------------------------------------------        ANSWERS         ---------------------------------------------
 
-static void put(device_t* const self, answer_t* const answer, const uint8_t id, const uint8_t* const payload) {
-    answer->n += frame_encode(self->identity.catalogue_hash, id, payload, &answer->bytes[answer->n]);
-    self->seq++;
-}
-
-static void put_hello(device_t* const self, answer_t* const answer, const uint8_t answers) {
+static void hello(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_hello_t message = { .seq            = self->seq,
                                                .theta_max      = EST_THETA_MAX,
-                                               .answers        = answers,
+                                               .answers        = self->job_answers,
                                                .catalogue_hash = self->identity.catalogue_hash };
-    uint8_t                        payload[PAYLOAD_MAX];
-    (void)analogrig_hello_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_HELLO_FRAME_ID, payload);
+    answer->id                             = ANALOGRIG_HELLO_FRAME_ID;
+    (void)analogrig_hello_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void put_firmware(device_t* const self, answer_t* const answer, const uint8_t answers) {
+static void firmware(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_firmware_t message = { .seq          = self->seq,
                                                   .firmware_id  = self->identity.firmware_id,
-                                                  .answers      = answers,
+                                                  .answers      = self->job_answers,
                                                   .input_blocks = self->identity.input_blocks,
                                                   .boot_nonce   = self->identity.boot_nonce };
-    uint8_t                           payload[PAYLOAD_MAX];
-    (void)analogrig_firmware_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_FIRMWARE_FRAME_ID, payload);
+    answer->id                                = ANALOGRIG_FIRMWARE_FRAME_ID;
+    (void)analogrig_firmware_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void put_estimate(device_t* const self, answer_t* const answer, const uint8_t element, const float value) {
+static void configured(const device_t* const self, device_message_t* const answer) {
+    const struct analogrig_configured_t message = { .seq     = self->seq,
+                                                    .key     = self->job_next,
+                                                    .answers = self->job_answers,
+                                                    .result  = self->job_result,
+                                                    .value   = settings_get(&self->settings, self->job_next) };
+    answer->id                                  = ANALOGRIG_CONFIGURED_FRAME_ID;
+    (void)analogrig_configured_pack(answer->payload, &message, sizeof(answer->payload));
+}
+
+static void controlled(const device_t* const self, device_message_t* const answer) {
+    const struct analogrig_controlled_t message = { .seq      = self->seq,
+                                                    .command  = self->job_next,
+                                                    .answers  = self->job_answers,
+                                                    .result   = self->job_result,
+                                                    .argument = self->job_argument };
+    answer->id                                  = ANALOGRIG_CONTROLLED_FRAME_ID;
+    (void)analogrig_controlled_pack(answer->payload, &message, sizeof(answer->payload));
+}
+
+static void status(const device_t* const self, device_message_t* const answer, const uint32_t value) {
+    const struct analogrig_status_t message = {
+        .seq = self->seq, .counter = self->job_next, .answers = self->job_answers, .value = value
+    };
+    answer->id = ANALOGRIG_STATUS_FRAME_ID;
+    (void)analogrig_status_pack(answer->payload, &message, sizeof(answer->payload));
+}
+
+static void estimate(const device_t* const self, device_message_t* const answer, const uint8_t element, const float value) {
     const struct analogrig_estimate_t message = {
         .seq = self->seq, .element = element, .sample_index = self->next_index, .value = value
     };
-    uint8_t payload[PAYLOAD_MAX];
-    (void)analogrig_estimate_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_ESTIMATE_FRAME_ID, payload);
+    answer->id = ANALOGRIG_ESTIMATE_FRAME_ID;
+    (void)analogrig_estimate_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void put_alarm(device_t* const self, answer_t* const answer, const float statistic) {
+static void alarm(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_alarm_t message = { .seq          = self->seq,
                                                .trigger      = (uint8_t)self->settings.estimator.trigger.kind,
                                                .sample_index = self->next_index,
-                                               .statistic    = statistic };
-    uint8_t                        payload[PAYLOAD_MAX];
-    (void)analogrig_alarm_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_ALARM_FRAME_ID, payload);
+                                               .statistic    = self->stepped.statistic };
+    answer->id                             = ANALOGRIG_ALARM_FRAME_ID;
+    (void)analogrig_alarm_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void put_diagnosis(device_t* const self, answer_t* const answer, const est_diagnosis_t* const diagnosis) {
+static void diagnosis(const device_t* const self, device_message_t* const answer) {
+    const est_diagnosis_t              stated  = est_isolation_diagnosis(&self->isolation);
     const struct analogrig_diagnosis_t message = { .seq         = self->seq,
-                                                   .change      = (uint8_t)diagnosis->change,
-                                                   .onset_index = (uint16_t)(self->alarm_index - diagnosis->onset_n),
-                                                   .extent      = diagnosis->extent };
-    uint8_t                            payload[PAYLOAD_MAX];
-    (void)analogrig_diagnosis_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_DIAGNOSIS_FRAME_ID, payload);
+                                                   .change      = (uint8_t)stated.change,
+                                                   .onset_index = (uint16_t)(self->alarm_index - stated.onset_n),
+                                                   .extent      = stated.extent };
+    answer->id                                 = ANALOGRIG_DIAGNOSIS_FRAME_ID;
+    (void)analogrig_diagnosis_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void put_stepped(device_t* const self, answer_t* const answer, const est_step_t* step, const bool restarted) {
+static void stepped(const device_t* const self, device_message_t* const answer) {
+    const est_step_t* const          last    = &self->stepped;
     const struct analogrig_stepped_t message = { .seq          = self->seq,
-                                                 .missing      = (step->status == EST_MISSING) ? 1U : 0U,
-                                                 .refused      = (step->status == EST_REFUSED) ? 1U : 0U,
-                                                 .restarted    = restarted ? 1U : 0U,
-                                                 .gathering    = (step->status == EST_GATHERING) ? 1U : 0U,
-                                                 .idle         = step->idle ? 1U : 0U,
+                                                 .missing      = (last->status == EST_MISSING) ? 1U : 0U,
+                                                 .refused      = (last->status == EST_REFUSED) ? 1U : 0U,
+                                                 .restarted    = self->restarted ? 1U : 0U,
+                                                 .gathering    = (last->status == EST_GATHERING) ? 1U : 0U,
+                                                 .idle         = last->idle ? 1U : 0U,
                                                  .run          = self->run,
                                                  .sample_index = self->next_index,
-                                                 .statistic    = step->statistic };
-    uint8_t                          payload[PAYLOAD_MAX];
-    (void)analogrig_stepped_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_STEPPED_FRAME_ID, payload);
+                                                 .statistic    = last->statistic };
+    answer->id                               = ANALOGRIG_STEPPED_FRAME_ID;
+    (void)analogrig_stepped_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
@@ -116,15 +135,12 @@ static est_step_t step(device_t* const self, const est_sample_t sample) {
     return out;
 }
 
-/// Works on the diagnosis of the last alarm, if there is one to come, and says it once.
-static void isolate(device_t* const self, answer_t* const answer) {
+/// Works on the diagnosis of the last alarm, if there is one to come; whether there is one now.
+static bool isolate(device_t* const self) {
     const est_change_t before = est_isolation_diagnosis(&self->isolation).change;
     for (uint8_t i = 0U; (i < DEVICE_ISOLATION_SLICES) && est_isolation_work(&self->isolation); i++) {
     }
-    const est_diagnosis_t diagnosis = est_isolation_diagnosis(&self->isolation);
-    if (diagnosis.change != before) {
-        put_diagnosis(self, answer, &diagnosis);
-    }
+    return est_isolation_diagnosis(&self->isolation).change != before;
 }
 
 static void enter_gap(device_t* const self, const uint16_t lost_n) {
@@ -137,20 +153,17 @@ static void enter_gap(device_t* const self, const uint16_t lost_n) {
     self->unreported_n = (uint16_t)(((uint32_t)self->unreported_n + lost_n) % self->report_interval_n);
 }
 
-static void report(device_t* const self, answer_t* const answer, const float innovation) {
+static bool report_is_due(device_t* const self) {
     self->unreported_n++;
     if (self->unreported_n < self->report_interval_n) {
-        return;
+        return false;
     }
     self->unreported_n = 0U;
-    for (uint8_t i = 0U; i < est_theta_count(&self->estimator); i++) {
-        put_estimate(self, answer, i, est_theta(&self->estimator, i));
-    }
-    put_estimate(self, answer, ANALOGRIG_ESTIMATE_ELEMENT_INNOVATION_CHOICE, innovation);
+    return true;
 }
 
-static void
-enter_sample(device_t* const self, answer_t* const answer, const uint16_t index, const est_sample_t sample) {
+/// Lets the estimator step, and notes what there is to say about it.
+static void enter_sample(device_t* const self, const uint16_t index, const est_sample_t sample) {
     const uint16_t ahead = (uint16_t)(index - self->next_index);
     if (ahead > (UINT16_MAX / 2U)) {
         add(&self->counters.samples_ignored, 1U);
@@ -159,18 +172,49 @@ enter_sample(device_t* const self, answer_t* const answer, const uint16_t index,
     if (ahead > 0U) {
         enter_gap(self, ahead);
     }
-    const uint32_t   restarts = est_counters(&self->estimator).restarts;
-    const est_step_t stepped  = step(self, sample);
-    if (stepped.alarm) {
+    const uint32_t restarts = est_counters(&self->estimator).restarts;
+    self->stepped           = step(self, sample);
+    self->restarted         = est_counters(&self->estimator).restarts != restarts;
+    self->to_say            = SAY_STEPPED;
+    self->element           = 0U;
+    if (self->stepped.alarm) {
         self->alarm_index = self->next_index;
-        put_alarm(self, answer, stepped.statistic);
+        self->to_say |= SAY_ALARM;
     }
-    if (self->isolating) {
-        isolate(self, answer);
+    if (self->isolating && isolate(self)) {
+        self->to_say |= SAY_DIAGNOSIS;
     }
-    report(self, answer, stepped.innovation);
-    put_stepped(self, answer, &stepped, est_counters(&self->estimator).restarts != restarts);
-    self->next_index++;
+    if (report_is_due(self)) {
+        self->to_say |= SAY_ESTIMATES;
+    }
+}
+
+/// All elements of theta, then the innovation.
+static void say_estimate(device_t* const self, device_message_t* const answer) {
+    if (self->element < est_theta_count(&self->estimator)) {
+        estimate(self, answer, self->element, est_theta(&self->estimator, self->element));
+        self->element++;
+    } else {
+        estimate(self, answer, ANALOGRIG_ESTIMATE_ELEMENT_INNOVATION_CHOICE, self->stepped.innovation);
+        self->to_say &= (uint8_t)~SAY_ESTIMATES;
+    }
+}
+
+/// The next of what there is to say about the sample.
+static void say(device_t* const self, device_message_t* const answer) {
+    if ((self->to_say & SAY_ALARM) != 0U) {
+        alarm(self, answer);
+        self->to_say &= (uint8_t)~SAY_ALARM;
+    } else if ((self->to_say & SAY_DIAGNOSIS) != 0U) {
+        diagnosis(self, answer);
+        self->to_say &= (uint8_t)~SAY_DIAGNOSIS;
+    } else if ((self->to_say & SAY_ESTIMATES) != 0U) {
+        say_estimate(self, answer);
+    } else {
+        stepped(self, answer);
+        self->to_say = 0U;
+        self->next_index++;
+    }
 }
 
 /// Counts samples that cannot be entered.
@@ -186,7 +230,7 @@ static bool accepts_samples(device_t* const self, const uint8_t run, const uint8
     return true;
 }
 
-static void on_sample(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+static void on_sample(device_t* const self, const uint8_t* const payload) {
     struct analogrig_sample_t message;
     (void)analogrig_sample_unpack(&message, payload, ANALOGRIG_SAMPLE_LENGTH);
     if (!accepts_samples(self, message.run, 1U)) {
@@ -195,7 +239,10 @@ static void on_sample(device_t* const self, answer_t* const answer, const uint8_
     const est_sample_t sample = { .u     = (float)message.force,
                                   .y     = (float)message.displacement,
                                   .valid = message.missing == 0U };
-    enter_sample(self, answer, message.sample_index, sample);
+    enter_sample(self, message.sample_index, sample);
+    self->job       = DEVICE_STEPPING;
+    self->job_next  = 1U;
+    self->job_count = 1U;
 }
 
 static void on_sample_block(device_t* const self, const uint8_t* const payload) {
@@ -209,24 +256,36 @@ static void on_sample_block(device_t* const self, const uint8_t* const payload) 
     self->job_count   = block.samples;
     self->job_index   = block.sample_index;
     self->job_missing = block.missing;
+    self->job_payload = payload;
 }
 
-/// The next sample of the block that still lies in the decoder. The codec has a name for each of its codes, no array.
-static void step_block(device_t* const self, answer_t* const answer) {
-    const uint8_t* const payload = frame_payload(&self->decoder);
-    const uint8_t        i       = self->job_next;
+/// The next sample of the block. The codec has a name for each of its codes, no array.
+static void step_block(device_t* const self) {
+    const uint8_t        i = self->job_next;
     const uint8_t* const force =
-        &payload[ANALOGRIG_SAMPLE_BLOCK_FORCE_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_FORCE_STRIDE)];
+        &self->job_payload[ANALOGRIG_SAMPLE_BLOCK_FORCE_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_FORCE_STRIDE)];
     const uint8_t* const displacement =
-        &payload[ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_STRIDE)];
+        &self->job_payload[ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_STRIDE)];
     const est_sample_t sample = { .u     = (float)word(force),
                                   .y     = (float)word(displacement),
                                   .valid = (((uint32_t)self->job_missing >> i) & 1U) == 0U };
-    enter_sample(self, answer, (uint16_t)(self->job_index + i), sample);
+    enter_sample(self, (uint16_t)(self->job_index + i), sample);
     self->job_next++;
-    if (self->job_next == self->job_count) {
+}
+
+/// What is next about the samples of the message; false if nothing is left to say.
+static bool answer_samples(device_t* const self, device_message_t* const answer) {
+    while ((self->to_say == 0U) && (self->job_next < self->job_count)) {
+        step_block(self);
+    }
+    const bool has_answer = self->to_say != 0U;
+    if (has_answer) {
+        say(self, answer);
+    }
+    if ((self->to_say == 0U) && (self->job_next == self->job_count)) {
         self->job = DEVICE_IDLE;
     }
+    return has_answer;
 }
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
@@ -246,27 +305,18 @@ static uint8_t configure(device_t* const self, const uint8_t key, const float va
     }
 }
 
-static void on_configure(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+static void on_configure(device_t* const self, const uint8_t* const payload) {
     struct analogrig_configure_t message;
     (void)analogrig_configure_unpack(&message, payload, ANALOGRIG_CONFIGURE_LENGTH);
-    const uint8_t                       result  = configure(self, message.key, message.value);
-    const struct analogrig_configured_t applied = {
-        .seq     = self->seq,
-        .key     = message.key,
-        .answers = message.seq,
-        .result  = result,
-        .value   = settings_get(&self->settings, message.key),
-    };
-    uint8_t out[PAYLOAD_MAX];
-    (void)analogrig_configured_pack(out, &applied, sizeof(out));
-    put(self, answer, ANALOGRIG_CONFIGURED_FRAME_ID, out);
+    self->job        = DEVICE_CONFIGURING;
+    self->job_next   = message.key;
+    self->job_result = configure(self, message.key, message.value);
 }
 
 // ---------------------------------------------        CONTROL         ---------------------------------------------
 
-/// As after device_init(), except for the identity, the input and the sequence numbers.
+/// As after device_init(), except for the identity and the sequence numbers.
 static void reset(device_t* const self) {
-    frame_decoder_init(&self->decoder, self->identity.catalogue_hash);
     self->counters          = (device_counters_t){ 0 };
     self->stopped           = (est_counters_t){ 0 };
     self->settings          = settings_default();
@@ -324,24 +374,18 @@ static uint8_t control(device_t* const self, const uint8_t command, const uint32
     }
 }
 
-static void on_control(device_t* const self, answer_t* const answer, const uint8_t* const payload) {
+static void on_control(device_t* const self, const uint8_t* const payload) {
     struct analogrig_control_t message;
     (void)analogrig_control_unpack(&message, payload, ANALOGRIG_CONTROL_LENGTH);
     if (message.command == ANALOGRIG_CONTROL_COMMAND_STATUS_CHOICE) {
-        self->job         = DEVICE_COUNTING;
-        self->job_next    = COUNTER_FIRST;
-        self->job_answers = message.seq;
+        self->job      = DEVICE_COUNTING;
+        self->job_next = COUNTER_FIRST;
         return;
     }
-    const uint8_t                       result = control(self, message.command, message.argument);
-    const struct analogrig_controlled_t done   = { .seq      = self->seq,
-                                                   .command  = message.command,
-                                                   .answers  = message.seq,
-                                                   .result   = result,
-                                                   .argument = message.argument };
-    uint8_t                             out[PAYLOAD_MAX];
-    (void)analogrig_controlled_pack(out, &done, sizeof(out));
-    put(self, answer, ANALOGRIG_CONTROLLED_FRAME_ID, out);
+    self->job          = DEVICE_CONTROLLING;
+    self->job_next     = message.command;
+    self->job_result   = control(self, message.command, message.argument);
+    self->job_argument = message.argument;
 }
 
 static uint32_t counter_value(const device_t* const self, const uint8_t counter) {
@@ -366,7 +410,7 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
     case ANALOGRIG_STATUS_COUNTER_REFRESHES_CHOICE:
         return estimator.refreshes;
     case ANALOGRIG_STATUS_COUNTER_FRAMES_DROPPED_CHOICE:
-        return frame_dropped(&self->decoder);
+        return self->counters.frames_dropped;
     case ANALOGRIG_STATUS_COUNTER_SEQUENCE_GAPS_CHOICE:
         return self->counters.sequence_gaps;
     case ANALOGRIG_STATUS_COUNTER_MESSAGES_REPEATED_CHOICE:
@@ -381,23 +425,11 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
         return self->counters.samples_of_other_runs;
     case ANALOGRIG_STATUS_COUNTER_RECEIVE_OVERRUNS_CHOICE:
         return self->counters.receive_overruns;
+    case ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE:
+        return self->counters.frames_foreign;
     default:
         return 0U;
     }
-}
-
-static void put_counter(device_t* const self, answer_t* const answer) {
-    const struct analogrig_status_t message = { .seq     = self->seq,
-                                                .counter = self->job_next,
-                                                .answers = self->job_answers,
-                                                .value   = counter_value(self, self->job_next) };
-    uint8_t                         payload[PAYLOAD_MAX];
-    (void)analogrig_status_pack(payload, &message, sizeof(payload));
-    put(self, answer, ANALOGRIG_STATUS_FRAME_ID, payload);
-    if (self->job_next == COUNTER_LAST) {
-        self->job = DEVICE_IDLE;
-    }
-    self->job_next++;
 }
 
 // ---------------------------------------------        MESSAGES        ---------------------------------------------
@@ -419,29 +451,19 @@ static bool sequence_allows(device_t* const self, const uint8_t id, const uint8_
     return true;
 }
 
-static void on_message(device_t* const self, answer_t* const answer) {
-    const uint8_t        id      = frame_id(&self->decoder);
-    const uint8_t* const payload = frame_payload(&self->decoder);
-    if (!analogrig_is_from_harness(id)) {
-        add(&self->counters.messages_refused, 1U);
-        return;
-    }
-    if (!sequence_allows(self, id, payload[0])) {
-        return;
-    }
+static void on_message(device_t* const self, const uint8_t id, const uint8_t* const payload) {
     switch (id) {
     case ANALOGRIG_IDENTIFY_FRAME_ID:
-        put_hello(self, answer, payload[0]);
-        put_firmware(self, answer, payload[0]);
+        self->job = DEVICE_GREETING;
         break;
     case ANALOGRIG_CONTROL_FRAME_ID:
-        on_control(self, answer, payload);
+        on_control(self, payload);
         break;
     case ANALOGRIG_CONFIGURE_FRAME_ID:
-        on_configure(self, answer, payload);
+        on_configure(self, payload);
         break;
     case ANALOGRIG_SAMPLE_FRAME_ID:
-        on_sample(self, answer, payload);
+        on_sample(self, payload);
         break;
     case ANALOGRIG_SAMPLE_BLOCK_FRAME_ID:
         on_sample_block(self, payload);
@@ -452,14 +474,6 @@ static void on_message(device_t* const self, answer_t* const answer) {
     }
 }
 
-static void continue_job(device_t* const self, answer_t* const answer) {
-    if (self->job == DEVICE_STEPPING) {
-        step_block(self, answer);
-    } else {
-        put_counter(self, answer);
-    }
-}
-
 void device_init(device_t* const self, const device_identity_t* const identity) {
     DEVICE_ASSERT((self != 0) && (identity != 0));
     *self          = (device_t){ 0 };
@@ -467,22 +481,55 @@ void device_init(device_t* const self, const device_identity_t* const identity) 
     reset(self);
 }
 
-device_progress_t
-device_run(device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
-    DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
-    device_progress_t progress = { .taken = 0U, .given = 0U };
-    while ((out_n - progress.given) >= DEVICE_ANSWER_MAX) {
-        answer_t answer = { .bytes = &out[progress.given], .n = 0U };
-        if (device_is_busy(self)) {
-            continue_job(self, &answer);
-        } else if (progress.taken == in_n) {
-            break;
-        } else if (frame_decoder_enter(&self->decoder, in[progress.taken++])) {
-            on_message(self, &answer);
-        }
-        progress.given += answer.n;
+void device_enter(device_t* const self, const uint8_t id, const uint8_t* const payload) {
+    DEVICE_ASSERT((self != 0) && (payload != 0) && !device_is_busy(self));
+    if (!analogrig_is_from_harness(id)) {
+        add(&self->counters.messages_refused, 1U);
+        return;
     }
-    return progress;
+    if (sequence_allows(self, id, payload[0])) {
+        self->job_answers = payload[0];
+        on_message(self, id, payload);
+    }
+}
+
+bool device_answer(device_t* const self, device_message_t* const answer) {
+    DEVICE_ASSERT((self != 0) && (answer != 0));
+    bool has_answer = true;
+    switch (self->job) {
+    case DEVICE_GREETING:
+        hello(self, answer);
+        self->job = DEVICE_INTRODUCING;
+        break;
+    case DEVICE_INTRODUCING:
+        firmware(self, answer);
+        self->job = DEVICE_IDLE;
+        break;
+    case DEVICE_CONFIGURING:
+        configured(self, answer);
+        self->job = DEVICE_IDLE;
+        break;
+    case DEVICE_CONTROLLING:
+        controlled(self, answer);
+        self->job = DEVICE_IDLE;
+        break;
+    case DEVICE_COUNTING:
+        status(self, answer, counter_value(self, self->job_next));
+        self->job = (self->job_next == COUNTER_LAST) ? DEVICE_IDLE : DEVICE_COUNTING;
+        self->job_next++;
+        break;
+    case DEVICE_STEPPING:
+        has_answer = answer_samples(self, answer);
+        break;
+    case DEVICE_IDLE:
+    default:
+        has_answer = false;
+        break;
+    }
+    if (has_answer) {
+        self->seq++;
+    }
+    return has_answer;
 }
 
 void device_overrun(device_t* const self, const uint32_t lost_n) {
@@ -490,9 +537,17 @@ void device_overrun(device_t* const self, const uint32_t lost_n) {
     add(&self->counters.receive_overruns, lost_n);
 }
 
+void device_dropped(device_t* const self, const uint32_t frames_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.frames_dropped, frames_n);
+}
+
+void device_foreign(device_t* const self, const uint32_t frames_n) {
+    DEVICE_ASSERT(self != 0);
+    add(&self->counters.frames_foreign, frames_n);
+}
+
 bool device_is_busy(const device_t* const self) {
     DEVICE_ASSERT(self != 0);
     return self->job != DEVICE_IDLE;
 }
-
-size_t device_size(void) { return sizeof(device_t); }

@@ -1,9 +1,10 @@
-/// device: the device under test without its hardware. Bytes go in, bytes come out; the estimator works in between.
+/// device: the device under test without its hardware. Messages go in, messages come out; the estimator works in between.
 ///
-/// It speaks the messages of estimator_c/catalogue in the frames of frame.h, and never without being asked: each message
-/// of the harness has its answers, and a message that cannot be understood has none. It does not wait, and it never holds
-/// more than one message: what does not fit into the output stays in the input, so that a slow line slows the harness
-/// down and nothing is lost.
+/// It speaks the messages of estimator_c/catalogue, and never without being asked: each message of the harness has its
+/// answers, and a message that cannot be understood has none. It does not wait, and it never holds more than one message:
+/// the next one is taken when the last has all its answers, which are made one at a time, as the line has room for them.
+/// A slow line slows the harness down and nothing is lost. What a line is made of, bytes or CAN frames, is for the shells
+/// to know: serial_device.h, can_device.h, slcan_device.h.
 ///
 ///     Identify    -> Hello, Firmware          Configure   -> Configured
 ///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Estimate ...] Stepped
@@ -20,7 +21,6 @@
 
 #include "est.h"
 #include "est_isolation.h"
-#include "frame.h"
 #include "settings.h"
 
 #include <stdbool.h>
@@ -31,8 +31,8 @@
 extern "C" {
 #endif
 
-/// The most bytes that one step of work answers with: an alarm, a diagnosis, theta, the innovation and Stepped.
-#define DEVICE_ANSWER_MAX ((EST_THETA_MAX + 4U) * FRAME_SIZE(8U))
+/// Bytes in the payload of every answer: all fit classic CAN.
+#define DEVICE_ANSWER_LENGTH 8U
 
 /// Of a gap so many samples are entered as missing, at most. The estimate is the same from the first one on; this bounds
 /// the time that one message may take.
@@ -55,6 +55,8 @@ typedef struct {
 
 /// Counters since device_init() or RESET. They saturate, they do not wrap.
 typedef struct {
+    uint32_t frames_dropped;         ///< what came and was no frame, or not whole, as the shell told
+    uint32_t frames_foreign;         ///< frames of others on the same bus, as the shell told
     uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
     uint32_t messages_repeated;      ///< messages with one of the last DEVICE_LATE_MAX sequence numbers; ignored
     uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
@@ -64,17 +66,32 @@ typedef struct {
     uint32_t receive_overruns;       ///< bytes that the port could not take, as it told
 } device_counters_t;
 
-/// What is left to do of the last message. Private.
+/// A message of the device.
+typedef struct {
+    uint8_t id;  ///< of the catalogue
+    uint8_t payload[DEVICE_ANSWER_LENGTH];
+} device_message_t;
+
+/// How far a shell has come with its input and output.
+typedef struct {
+    size_t taken;  ///< of the input: done with
+    size_t given;  ///< written to the output
+} device_progress_t;
+
+/// What is left to answer of the last message. Private.
 typedef enum {
     DEVICE_IDLE = 0,
-    DEVICE_STEPPING,
+    DEVICE_GREETING,
+    DEVICE_INTRODUCING,
+    DEVICE_CONFIGURING,
+    DEVICE_CONTROLLING,
     DEVICE_COUNTING,
+    DEVICE_STEPPING,
 } device_job_t;
 
 /// The state of a device. The fields are private.
 typedef struct {
     device_identity_t identity;
-    frame_decoder_t   decoder;
     device_counters_t counters;
     settings_t        settings;  ///< what START will use
     est_t             estimator;
@@ -91,36 +108,45 @@ typedef struct {
     uint8_t           seq_expected;  ///< of the next message of the harness
     uint8_t           seq;           ///< of the next message of the device
     device_job_t      job;
-    uint8_t           job_next;     ///< sample of the block, or counter
-    uint8_t           job_count;    ///< samples in the block
-    uint16_t          job_index;    ///< of its first sample
-    uint16_t          job_missing;  ///< bit i: its sample i is missing
-    uint8_t           job_answers;  ///< sequence number of the message that asked for the counters
+    uint8_t           job_answers;   ///< sequence number of the message that is being answered
+    uint8_t           job_next;      ///< sample of the block, counter, key or command
+    uint8_t           job_result;    ///< of a Configure or Control
+    uint32_t          job_argument;  ///< of a Control
+    uint8_t           job_count;     ///< samples in the block
+    uint16_t          job_index;     ///< of its first sample
+    uint16_t          job_missing;   ///< bit i: its sample i is missing
+    const uint8_t*    job_payload;   ///< of the block
+    uint8_t           to_say;        ///< about the last sample
+    uint8_t           element;       ///< of theta, the next to say
+    bool              restarted;
+    est_step_t        stepped;
 } device_t;
-
-typedef struct {
-    size_t taken;  ///< bytes of the input that are done with
-    size_t given;  ///< bytes written to the output
-} device_progress_t;
 
 /// Makes the device ready: default configuration, stopped.
 void device_init(device_t* self, const device_identity_t* identity);
 
-/// Works until all input is taken and answered, or until the output has less than DEVICE_ANSWER_MAX bytes left: then call
-/// again, with the rest of the input and a new output. Call again too when all input was taken and the output was nearly
-/// full: device_is_busy() tells. Input is taken only as far as it could be answered.
-/// Cost: per byte O(1); per sample one est_step() and its answers; a gap at most DEVICE_GAP_MAX missing samples on top,
-/// for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
-device_progress_t device_run(device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
+/// Takes a message, when the last one has all its answers (asserted: the device is not busy). Its payload has the length that
+/// the catalogue gives to its id, and stays as it is until the device is not busy any more. What makes no sense here or now
+/// is refused and counted.
+/// Cost: O(1); a Sample one est_step().
+void device_enter(device_t* self, uint8_t id, const uint8_t* payload);
+
+/// The next answer to the last message; false if there is none.
+/// Cost: O(1), or one est_step() for the first answer about a sample of a block; a gap at most DEVICE_GAP_MAX missing samples
+/// on top, for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
+bool device_answer(device_t* self, device_message_t* answer);
 
 /// So many bytes came that the port could not keep. The harness can ask for their sum.
 void device_overrun(device_t* self, uint32_t lost_n);
 
-/// Whether answers to input already taken are still to come.
-bool device_is_busy(const device_t* self);
+/// So many frames were no good: the shell has dropped them.
+void device_dropped(device_t* self, uint32_t frames_n);
 
-/// sizeof(device_t), for callers in other languages.
-size_t device_size(void);
+/// So many frames were those of others on the same bus: the shell has passed over them.
+void device_foreign(device_t* self, uint32_t frames_n);
+
+/// Whether there may still be answers to the last message: ask for them before the next one is entered.
+bool device_is_busy(const device_t* self);
 
 #ifdef __cplusplus
 }

@@ -2,26 +2,26 @@
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
-#include "device.h"
+#include "serial_device.h"
 #include "subject.h"
 
 #define ANSWERS_N 9U  ///< an alarm, six parameters, the innovation, Stepped
 
 const bool subject_drifts = true;
 
-static device_t device;
-static uint8_t  seq;
-static uint16_t sample_index;
-static uint8_t  output[DEVICE_ANSWER_MAX];
-static size_t   least_answer;
-static size_t   longest_answer;
+static serial_device_t device;
+static uint8_t         seq;
+static uint16_t        sample_index;
+static uint8_t         output[(EST_THETA_MAX + 5U) * SERIAL_DEVICE_ANSWER];
+static size_t          least_answer;
+static size_t          longest_answer;
 
 void device_step(const uint8_t* in, size_t in_n);
 void between_steps(void);
 
 /// Lies inside: what is counted begins with it.
 __attribute__((noinline, used)) void device_step(const uint8_t* const in, const size_t in_n) {
-    const size_t given = device_run(&device, in, in_n, output, sizeof(output)).given;
+    const size_t given = serial_device_run(&device, in, in_n, output, sizeof(output)).given;
     least_answer       = (given < least_answer) ? given : least_answer;
     longest_answer     = (given > longest_answer) ? given : longest_answer;
 }
@@ -39,10 +39,10 @@ SUBJECT void subject_begin(void) {
     const struct analogrig_control_t start   = { .seq = seq, .command = ANALOGRIG_CONTROL_COMMAND_START_CHOICE };
     uint8_t                         payload[ANALOGRIG_CONTROL_LENGTH];
     uint8_t                         frame[FRAME_SIZE(ANALOGRIG_CONTROL_LENGTH)];
-    device_init(&device, &identity);
+    serial_device_init(&device, &identity);
     (void)analogrig_control_pack(payload, &start, sizeof(payload));
     const size_t frame_n = frame_of(ANALOGRIG_CONTROL_FRAME_ID, payload, frame);
-    (void)device_run(&device, frame, frame_n, output, sizeof(output));
+    (void)serial_device_run(&device, frame, frame_n, output, sizeof(output));
     least_answer = sizeof(output);
 }
 

@@ -4,7 +4,7 @@
 /// builds and runs it.
 
 #include "analogrig_codec.h"
-#include "device.h"
+#include "serial_device.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -80,20 +80,20 @@ static void add_next(stream_t* const stream, input_t* const input) {
 }
 
 /// The stream in pieces into the device, its answers in pieces out of it; sizes come from the input, the largest without one.
-static void play(device_t* const device, const stream_t* const stream, input_t* const sizes, answers_t* const answers) {
+static void play(serial_device_t* const device, const stream_t* const stream, input_t* const sizes, answers_t* const answers) {
     size_t taken = 0U;
-    while ((taken < stream->n) || device_is_busy(device)) {
+    while ((taken < stream->n) || device_is_busy(&device->device)) {
         const bool   any_size = sizes->n > 0U;
         const size_t left     = stream->n - taken;
         const size_t piece    = any_size ? (byte(sizes) % 100U) : left;
         const size_t in_n     = (piece < left) ? piece : left;
-        const size_t room     = any_size ? (4U * (size_t)byte(sizes)) : (4U * DEVICE_ANSWER_MAX);
+        const size_t room     = any_size ? (4U * (size_t)byte(sizes)) : (64U * SERIAL_DEVICE_ANSWER);
         expect(answers->n + room <= ANSWERS_MAX);
         const device_progress_t progress =
-            device_run(device, &stream->bytes[taken], in_n, &answers->bytes[answers->n], room);
+            serial_device_run(device, &stream->bytes[taken], in_n, &answers->bytes[answers->n], room);
         expect((progress.taken <= in_n) && (progress.given <= room));
-        expect((room < DEVICE_ANSWER_MAX) || (in_n == 0U) || (progress.taken > 0U) || (progress.given > 0U));
-        expect(!device->running || est_invariants_hold(&device->estimator));
+        expect((room < SERIAL_DEVICE_ANSWER) || (in_n == 0U) || (progress.taken > 0U) || (progress.given > 0U));
+        expect(!device->device.running || est_invariants_hold(&device->device.estimator));
         taken += progress.taken;
         answers->n += progress.given;
     }
@@ -144,10 +144,10 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH,
                                          .boot_nonce     = 1U,
                                          .firmware_id    = 1U };
-    device_t                device;
-    device_t                device_at_once;
-    device_init(&device, &identity);
-    device_init(&device_at_once, &identity);
+    serial_device_t         device;
+    serial_device_t         device_at_once;
+    serial_device_init(&device, &identity);
+    serial_device_init(&device_at_once, &identity);
     play(&device, &stream, &sizes, &answers);
     play(&device_at_once, &stream, &(input_t){ .bytes = 0, .n = 0U }, &answers_at_once);
     expect((answers.n == answers_at_once.n) && (memcmp(answers.bytes, answers_at_once.bytes, answers.n) == 0));

@@ -633,7 +633,7 @@ def test_noise_is_never_answered_and_never_stops_it(device: Device) -> None:
 
 
 class Progress(ctypes.Structure):
-    """As device_progress_t."""
+    """As serial_progress_t."""
 
     _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
 
@@ -641,18 +641,18 @@ class Progress(ctypes.Structure):
 def answers_in_pieces(stream: bytes, rng: random.Random, room: int) -> bytes:
     """What a device answers that receives random pieces and may answer ``room`` bytes at a time."""
     c = ctypes.CDLL(str(LIBRARY))
-    c.device_run.restype = Progress
-    c.device_size.restype = ctypes.c_size_t
+    c.serial_device_run.restype = Progress
+    c.serial_device_size.restype = ctypes.c_size_t
     c.device_is_busy.restype = ctypes.c_bool
-    state = ctypes.create_string_buffer(c.device_size())
-    c.device_init(state, (ctypes.c_uint32 * 3)(CATALOGUE_HASH, NONCE, FirmwareId.LIBRARY))
+    state = ctypes.create_string_buffer(c.serial_device_size())
+    c.serial_device_init(state, (ctypes.c_uint32 * 3)(CATALOGUE_HASH, NONCE, FirmwareId.LIBRARY))
     out = ctypes.create_string_buffer(b"\xaa" * (room + 16))
     answers, waiting, at = b"", b"", 0
     while waiting or at < len(stream) or c.device_is_busy(state):
         piece = stream[at : at + rng.randrange(40)]
         at += len(piece)
         waiting += piece
-        progress = c.device_run(state, waiting, ctypes.c_size_t(len(waiting)), out, ctypes.c_size_t(room))
+        progress = c.serial_device_run(state, waiting, ctypes.c_size_t(len(waiting)), out, ctypes.c_size_t(room))
         assert progress.given <= room
         assert out.raw[room:].startswith(b"\xaa" * 16), "it wrote beyond the room it has"
         answers += out.raw[: progress.given]
@@ -673,5 +673,5 @@ def test_answers_do_not_depend_on_pieces_and_room() -> None:
     rng = random.Random(11)
     whole = answers_in_pieces(stream, rng, 65536)
     assert len(frame.FrameDecoder().feed(whole)) == 2 + 1 + 60 * 8 + len(Counter)
-    for room in (160, 161, 176, 1000):  # 160: DEVICE_ANSWER_MAX of this build
+    for room in (16, 17, 31, 1000):  # 16: SERIAL_DEVICE_ANSWER
         assert answers_in_pieces(stream, rng, room) == whole

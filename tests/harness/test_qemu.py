@@ -183,7 +183,8 @@ def test_hard_fault_is_told_in_the_words_of_the_firmware(tmp_path: Path) -> None
     (tmp_path / "main.c").write_text("int main(void) { *(volatile int*)0xE0200000 = 1; return 0; }\n")
     port = Path(__file__).parents[2] / "estimator_c" / "ports" / "cortex_m"
     sources = [str(path) for path in (tmp_path / "main.c", port / "start.c", port / "semihosting.c")]
-    (tmp_path / "vectors.c").write_text("void uart_receive_interrupt(void) {}\nvoid uart_transmit_interrupt(void) {}\n")
+    handlers = [f"{line}_{way}_interrupt" for line in ("serial", "slcan") for way in ("receive", "transmit")]
+    (tmp_path / "vectors.c").write_text("".join(f"void {handler}(void) {{}}\n" for handler in handlers))
     image = str(tmp_path / "faulty.elf")
     options = ["-mcpu=cortex-m4", "-mthumb", "-ffreestanding", "-nostdlib", "-nostartfiles"]
     paths = [f"-I{port}", f"-I{port / 'include'}", "-T", str(port / "mps2.ld"), str(tmp_path / "vectors.c")]

@@ -20,8 +20,10 @@ extern uint32_t bss_end;
 extern uint32_t stack_top;
 
 /// The port has them.
-void uart_receive_interrupt(void);
-void uart_transmit_interrupt(void);
+void serial_receive_interrupt(void);
+void serial_transmit_interrupt(void);
+void slcan_receive_interrupt(void);
+void slcan_transmit_interrupt(void);
 
 void start(void);
 
@@ -67,7 +69,7 @@ __attribute__((section(".vectors"), used)) static const struct {
     .stack  = &stack_top,
     .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
                 NULL, unexpected, unexpected },
-    .board  = { uart_receive_interrupt, uart_transmit_interrupt },
+    .board  = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
 };
 
 // What the compiler calls on its own. Volatile, or it might take their loops for calls of themselves.

@@ -4,7 +4,11 @@
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
+#include "can_device.h"
 #include "device_loop.h"
+#include "serial_device.h"
+#include "slcan_device.h"
+#include "socket_can.h"
 
 #include <errno.h>
 #include <fcntl.h>
@@ -19,24 +23,31 @@
 #define EXIT_USAGE 2
 
 static const char usage_text[] =
-    "usage: analogrig-device [--catalogue-hash HEX] [PATH]\n"
+    "usage: analogrig-device [--slcan] [--catalogue-hash HEX] [PATH]\n"
+    "       analogrig-device --can INTERFACE [--fd] [--catalogue-hash HEX]\n"
     "\n"
     "The analogrig estimator as a device on the serial device PATH (115200 8N1), or, without PATH, on a new\n"
-    "pseudo-terminal whose name is printed. Ends when standard input ends.\n"
+    "pseudo-terminal whose name is printed; or on a CAN interface of this computer. Ends when standard input ends.\n"
     "\n"
+    "  --slcan               speak CAN as LAWICEL's adapters do, as if such a one were between it and the terminal\n"
+    "  --can INTERFACE       a SocketCAN interface, such as can0; --fd: it carries CAN FD. Prints its name when ready\n"
     "  --catalogue-hash HEX  pretend to be built from another message catalogue (for tests)\n"
     "  --version             print the version and the hash of the catalogue\n"
     "  --help                print this\n";
 
 typedef struct {
     const char* path;
+    const char* interface;
+    bool        is_slcan;
+    bool        is_fd;
     uint32_t    catalogue_hash;
 } options_t;
 
 /// The line to the harness.
 static struct {
     int  fd;
-    bool lost;  ///< errno says why
+    bool is_socket;  ///< of CAN frames; otherwise bytes
+    bool lost;       ///< errno says why
 } line;
 
 static int fail(const char* const what, const char* const name) {
@@ -78,6 +89,13 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
                 *status = refuse("not a hash of 32 bits", (i == argc) ? "nothing" : argv[i]);
                 return false;
             }
+        } else if (strcmp(argv[i], "--slcan") == 0) {
+            options->is_slcan = true;
+        } else if (strcmp(argv[i], "--fd") == 0) {
+            options->is_fd = true;
+        } else if ((strcmp(argv[i], "--can") == 0) && ((i + 1) < argc)) {
+            i++;
+            options->interface = argv[i];
         } else if ((argv[i][0] == '-') || (options->path != NULL)) {
             *status = refuse("unexpected argument", argv[i]);
             return false;
@@ -85,7 +103,15 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
             options->path = argv[i];
         }
     }
-    return true;
+    const bool has_terminal = options->is_slcan || (options->path != NULL);
+    if (has_terminal && (options->interface != NULL)) {
+        *status = refuse("goes with no terminal", "--can");
+    } else if (options->is_fd && (options->interface == NULL)) {
+        *status = refuse("goes with --can", "--fd");
+    } else {
+        return true;
+    }
+    return false;
 }
 
 // ---------------------------------------------        THE LINE        ---------------------------------------------
@@ -155,8 +181,14 @@ uint32_t port_boot_nonce(void) {
 }
 
 size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) {
-    (void)lost;  // what is not read waits in the line
-    const ssize_t received = read(line.fd, bytes, n);
+    if (line.is_socket) {
+        const ssize_t frames = socket_can_receive(line.fd, bytes, n, lost);
+        if ((frames < 0) && !is_transient()) {
+            lose(errno);
+        }
+        return (frames > 0) ? (size_t)frames : 0U;
+    }
+    const ssize_t received = read(line.fd, bytes, n);  // what is not read waits in the line
     if (received > 0) {
         return (size_t)received;
     }
@@ -171,7 +203,7 @@ size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) 
 }
 
 size_t port_transmit(const uint8_t* const bytes, const size_t n) {
-    const ssize_t sent = write(line.fd, bytes, n);
+    const ssize_t sent = line.is_socket ? socket_can_transmit(line.fd, bytes, n) : write(line.fd, bytes, n);
     if ((sent < 0) && !is_transient()) {
         lose(errno);
     }
@@ -215,23 +247,47 @@ bool port_idle(const bool wants_input, const bool has_output) {
         return false;
     }
     if (has_hung_up(fds[1].revents)) {
-        lose(EIO);
+        lose(line.is_socket ? socket_can_error(line.fd) : EIO);
     }
     return !line.lost;
 }
 
-static int serve(const options_t* const options) {
-    const char* name = (options->path != NULL) ? options->path : "a pseudo-terminal";
-    line.fd          = (options->path != NULL) ? open_serial(options->path) : open_terminal();
+static int serve_terminal(const options_t* const options) {
+    static serial_device_t serial;
+    static slcan_device_t  slcan;
+    const char* const      name = (options->path != NULL) ? options->path : "a pseudo-terminal";
+    line.fd                     = (options->path != NULL) ? open_serial(options->path) : open_terminal();
     if (line.fd < 0) {
         return fail("cannot open", name);
     }
-    device_loop(ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
+    if (options->is_slcan) {
+        device_loop(&slcan_line, &slcan, ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
+    } else {
+        device_loop(&serial_line, &serial, ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
+    }
     return line.lost ? fail("lost", name) : EXIT_SUCCESS;
 }
 
+static int serve_bus(const options_t* const options) {
+    static can_device_t device;
+    line.fd        = socket_can_open(options->interface, options->is_fd);
+    line.is_socket = true;
+    if (line.fd < 0) {
+        return fail("cannot open the CAN interface", options->interface);
+    }
+    if ((printf("%s\n", options->interface) < 0) || (fflush(stdout) != 0)) {
+        return fail("cannot write", "standard output");
+    }
+    device_loop(options->is_fd ? &can_fd_line : &can_line, &device, ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE,
+                options->catalogue_hash);
+    return line.lost ? fail("lost", options->interface) : EXIT_SUCCESS;
+}
+
 int main(int argc, char* argv[]) {
-    options_t options = { .path = NULL, .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH };
+    options_t options = { .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH };
     int       status  = EXIT_SUCCESS;
-    return parse(argc, argv, &options, &status) ? serve(&options) : status;
+    if (!parse(argc, argv, &options, &status)) {
+        return status;
+    }
+    return (options.interface != NULL) ? serve_bus(&options) : serve_terminal(&options);
 }

@@ -1,15 +1,7 @@
 #include "device_loop.h"
 
-#include "analogrig_codec.h"
-
-#if DEVICE_LOOP_OUTPUT_SIZE < DEVICE_ANSWER_MAX
-#error "DEVICE_LOOP_OUTPUT_SIZE must hold the answers of one step of work"
-#endif
-
-#define INPUT_BLOCKS (DEVICE_LOOP_INPUT_SIZE / FRAME_SIZE(ANALOGRIG_SAMPLE_BLOCK_LENGTH))
-
-#if (INPUT_BLOCKS < 1) || (INPUT_BLOCKS > 255)
-#error "DEVICE_LOOP_INPUT_SIZE must hold 1 to 255 SampleBlocks"
+#if (DEVICE_LOOP_INPUT_SIZE < DEVICE_LOOP_LEAST) || (DEVICE_LOOP_OUTPUT_SIZE < DEVICE_LOOP_LEAST)
+#error "each of the buffers must hold a frame of any line: DEVICE_LOOP_LEAST bytes"
 #endif
 
 /// What is on its way from and to the line.
@@ -46,33 +38,43 @@ static void transmit(buffers_t* const buffers) {
 }
 
 /// Lets the device work on what has come, as far as its answers have room.
-static void work(device_t* const device, buffers_t* const buffers) {
+static void work(const device_line_t* const line, void* const state, buffers_t* const buffers) {
     const device_progress_t progress =
-        device_run(device, &buffers->input[buffers->input_from], buffers->input_to - buffers->input_from,
-                   &buffers->output[buffers->output_to], sizeof(buffers->output) - buffers->output_to);
+        line->run(state, &buffers->input[buffers->input_from], buffers->input_to - buffers->input_from,
+                  &buffers->output[buffers->output_to], sizeof(buffers->output) - buffers->output_to);
     buffers->input_from += progress.taken;
     buffers->output_to += progress.given;
 }
 
-void device_loop(const uint8_t firmware_id, const uint32_t catalogue_hash) {
-    static device_t         device;
+/// So many SampleBlocks may wait: at least the one that is being taken.
+static uint8_t input_blocks(const device_line_t* const line) {
+    const size_t room = DEVICE_LOOP_INPUT_SIZE / line->block_size;
+    const size_t most = (room < UINT8_MAX) ? room : UINT8_MAX;
+    return (uint8_t)((most > 0U) ? most : 1U);
+}
+
+void device_loop(const device_line_t* const line,
+                 void* const                state,
+                 const uint8_t              firmware_id,
+                 const uint32_t             catalogue_hash) {
     static buffers_t        buffers;
+    device_t* const         device   = state;
     const device_identity_t identity = { .catalogue_hash = catalogue_hash,
                                          .boot_nonce     = port_boot_nonce(),
-                                         .input_blocks   = (uint8_t)INPUT_BLOCKS,
+                                         .input_blocks   = input_blocks(line),
                                          .firmware_id    = firmware_id };
-    device_init(&device, &identity);
+    line->init(state, &identity);
     bool more = true;
     while (more) {
-        if (wants_input(&device, &buffers)) {
-            receive(&device, &buffers);
+        if (wants_input(device, &buffers)) {
+            receive(device, &buffers);
         }
-        work(&device, &buffers);
+        work(line, state, &buffers);
         if (has_output(&buffers)) {
             transmit(&buffers);
         }
         // Work that is left over while the output is empty waits for nobody.
-        const bool wants = wants_input(&device, &buffers);
+        const bool wants = wants_input(device, &buffers);
         if (wants || has_output(&buffers)) {
             more = port_idle(wants, has_output(&buffers));
         }

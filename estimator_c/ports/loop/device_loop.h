@@ -6,19 +6,22 @@
 #ifndef DEVICE_LOOP_H_INCLUDED
 #define DEVICE_LOOP_H_INCLUDED
 
-#include "device.h"
+#include "device_line.h"
 
 #ifdef __cplusplus
 extern "C" {
 #endif
 
+/// The least that each of the two buffers must have: a CAN frame.
+#define DEVICE_LOOP_LEAST 72U
+
 /// Bytes that can wait between the port and the device. The port may hold more, of which the device knows nothing: it tells
-/// the harness that so many blocks can wait as DEVICE_LOOP_INPUT_SIZE has room for.
+/// the harness that so many blocks can wait as DEVICE_LOOP_INPUT_SIZE has room for, 255 at most.
 #ifndef DEVICE_LOOP_INPUT_SIZE
 #define DEVICE_LOOP_INPUT_SIZE 4096U
 #endif
 
-/// A burst of answers; when it is full the line waits. At least DEVICE_ANSWER_MAX.
+/// A burst of answers; when it is full the line waits. When it is nearly full, no answers are made.
 #ifndef DEVICE_LOOP_OUTPUT_SIZE
 #define DEVICE_LOOP_OUTPUT_SIZE 4096U
 #endif
@@ -42,9 +45,10 @@ bool port_idle(bool wants_input, bool has_output);
 
 // ---- what it gets
 
-/// Serves the line until port_idle() says that it is over. `firmware_id` is one of ANALOGRIG_FIRMWARE_FIRMWARE_ID_..._CHOICE,
-/// `catalogue_hash` is ANALOGRIG_CATALOGUE_HASH. Not reentrant: the device is a static object.
-void device_loop(uint8_t firmware_id, uint32_t catalogue_hash);
+/// Serves a line of that kind until port_idle() says that it is over. `state` is the shell's: a serial_device_t for serial_line,
+/// and so on. `firmware_id` is one of ANALOGRIG_FIRMWARE_FIRMWARE_ID_..._CHOICE, `catalogue_hash` is
+/// ANALOGRIG_CATALOGUE_HASH. One line at a time: the buffers are static.
+void device_loop(const device_line_t* line, void* state, uint8_t firmware_id, uint32_t catalogue_hash);
 
 #ifdef __cplusplus
 }

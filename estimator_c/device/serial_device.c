@@ -1,0 +1,49 @@
+#include "serial_device.h"
+
+#ifndef SERIAL_DEVICE_ASSERT
+#ifdef NDEBUG  // a freestanding compiler has no assert.h
+#define SERIAL_DEVICE_ASSERT(x) ((void)0)
+#else
+#include <assert.h>
+#define SERIAL_DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
+#endif
+#endif
+
+void serial_device_init(serial_device_t* const self, const device_identity_t* const identity) {
+    SERIAL_DEVICE_ASSERT(self != 0);
+    device_init(&self->device, identity);
+    frame_decoder_init(&self->decoder, identity->catalogue_hash);
+}
+
+/// Takes a byte, and the message that it completes.
+static void enter(serial_device_t* const self, const uint8_t byte) {
+    const uint32_t dropped = frame_dropped(&self->decoder);
+    if (frame_decoder_enter(&self->decoder, byte)) {
+        device_enter(&self->device, frame_id(&self->decoder), frame_payload(&self->decoder));
+    } else if (frame_dropped(&self->decoder) != dropped) {
+        device_dropped(&self->device, 1U);
+    }
+}
+
+device_progress_t serial_device_run(serial_device_t* const self,
+                                    const uint8_t* const   in,
+                                    const size_t           in_n,
+                                    uint8_t* const         out,
+                                    const size_t           out_n) {
+    SERIAL_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
+    const uint32_t    hash     = self->decoder.catalogue_hash;
+    device_progress_t progress = { .taken = 0U, .given = 0U };
+    while ((out_n - progress.given) >= SERIAL_DEVICE_ANSWER) {
+        device_message_t answer;
+        if (device_answer(&self->device, &answer)) {
+            progress.given += frame_encode(hash, answer.id, answer.payload, &out[progress.given]);
+        } else if (progress.taken < in_n) {
+            enter(self, in[progress.taken++]);
+        } else {
+            break;
+        }
+    }
+    return progress;
+}
+
+size_t serial_device_size(void) { return sizeof(serial_device_t); }

@@ -1,0 +1,45 @@
+/// serial_device: the device on a line of bytes. The messages of device.h travel in the frames of frame.h.
+///
+/// No heap, no globals, no recursion. The caller owns the state, which belongs to one context.
+/// Distributed under the terms of the MIT License.
+
+#ifndef SERIAL_DEVICE_H_INCLUDED
+#define SERIAL_DEVICE_H_INCLUDED
+
+#include "device.h"
+#include "frame.h"
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/// Bytes of an answer.
+#define SERIAL_DEVICE_ANSWER FRAME_SIZE(DEVICE_ANSWER_LENGTH)
+
+/// The state of a device on a serial line. The fields are private, but for the device.
+typedef struct {
+    device_t        device;  ///< first
+    frame_decoder_t decoder;
+} serial_device_t;
+
+/// Makes the device ready: default configuration, stopped, at the beginning of a frame.
+void serial_device_init(serial_device_t* self, const device_identity_t* identity);
+
+/// Works until all input is taken and answered, or until the output has less than SERIAL_DEVICE_ANSWER bytes left: then call
+/// again, with the rest of the input and a new output (both counted in bytes). Call again too when all input was taken and the output was nearly
+/// full: device_is_busy() tells. Input is taken only as far as it could be answered.
+/// Cost: per byte O(1); per message as device_enter() and device_answer().
+device_progress_t serial_device_run(serial_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
+
+/// sizeof(serial_device_t), for callers in other languages.
+size_t serial_device_size(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif  // SERIAL_DEVICE_H_INCLUDED
