@@ -27,7 +27,7 @@ def main(spec: str, out: str) -> None:
             if not killed:
                 killed.append(next(iter(cluster.workers.values())).pid)
                 os.kill(killed[0], signal.SIGKILL)
-                print("killed a worker", flush=True)
+                sys.stdout.write("killed a worker\n")
 
         dask = Dask(cluster.scheduler_address)
         conduct(Plan.of(CampaignSpec.load(spec)), dask, Path(out), kill_one)

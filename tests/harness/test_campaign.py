@@ -119,7 +119,7 @@ def test_wrong_campaign_is_one_line_that_names_the_key(tmp_path: Path, spec: str
     assert "\n" not in str(error.value)
 
 
-# -------------------------------------------------------------------------------------------------- the same file always
+# ------------------------------------------------------------------------------------------------ the same file always
 
 
 def test_two_processes_give_the_file_of_one(tmp_path: Path, reference: Path) -> None:
@@ -167,7 +167,18 @@ def test_damaged_line_of_a_journal_is_played_again(tmp_path: Path, reference: Pa
 
 
 def started(spec: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "harness.cli", "campaign", spec, "--out", out, "--workers", "2", *more]
+    command: list[str | Path] = [
+        sys.executable,
+        "-m",
+        "harness.cli",
+        "campaign",
+        spec,
+        "--out",
+        out,
+        "--workers",
+        "2",
+        *more,
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -216,7 +227,7 @@ def _die(_: int) -> int:
 
 
 class DyingOnce:
-    """What a worker of the tests does; plain functions with arguments cross the border between processes."""
+    """``_die_once`` with its folder, as it crosses the border between processes."""
 
     def __init__(self, marks: Path) -> None:
         self.marks = str(marks)
@@ -255,7 +266,7 @@ def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:
 def test_campaign_on_dask_with_a_worker_killed_gives_the_file_of_one_process(tmp_path: Path, reference: Path) -> None:
     script = Path(__file__).with_name("campaign_on_dask.py")
     planned(tmp_path)
-    command = [sys.executable, script, tmp_path / "spec.toml", tmp_path / "dask.json"]
+    command: list[str | Path] = [sys.executable, script, tmp_path / "spec.toml", tmp_path / "dask.json"]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
     assert ran.returncode == 0, ran.stderr
     assert "killed a worker" in ran.stdout
@@ -285,11 +296,10 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
 
 
 def test_results_survive_the_file_and_are_not_played_again(tmp_path: Path, reference: Path) -> None:
-    class Nobody:
-        def play(self, work: object, tasks: object) -> Iterator[tuple[Chunk, object]]:
-            raise AssertionError
+    class Nobody(ThisProcess):
+        play = None  # type: ignore[assignment]  # never asked
 
-    again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]  # never asked
+    again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]
     again.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == reference.read_bytes()
 
