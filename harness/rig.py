@@ -41,6 +41,9 @@ from harness.plant import Plant
 from harness.run import CHANNELS, Channel, Run, Segment
 from harness.scenario import Scenario
 
+DEFAULT_RIG = "emulator"
+"""When neither the user nor the scenario says another."""
+
 BLOCK_SAMPLES = 256
 """Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
 
