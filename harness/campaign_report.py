@@ -103,7 +103,8 @@ def _maps(results: Results) -> str:
             if other == group
         }
         where = ", ".join(f"{name} {value}" for name, value in group)
-        sections += [_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES]
+        maps = "".join(_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES)
+        sections.append(f'<div class="maps">{maps}</div>')
     return f'<section aria-labelledby="maps"><h2 id="maps">Maps</h2>{"".join(sections)}</section>'
 
 
@@ -130,7 +131,7 @@ def _square(i: int, j: int, value: float | None, most: float, form: str) -> str:
     colour = "#" + "".join(f"{round(255 + share * (deep - 255)):02x}" for deep in _DEEPEST)
     x, y = _LEFT + i * _WIDTH, _TOP + j * _HEIGHT
     text = "–" if value is None else format(value, form)
-    ink = "#ffffff" if share > 0.55 else "#1a1a1a"
+    ink = "#ffffff" if share > 0.85 else "#1a1a1a"
     return (
         f'<rect x="{x}" y="{y}" width="{_WIDTH}" height="{_HEIGHT}" fill="{"#d5d5d5" if value is None else colour}"'
         f' stroke="#8a8a8a"/>{_words(x + 0.5 * _WIDTH, y + 0.62 * _HEIGHT, text, colour=ink)}'
