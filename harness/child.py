@@ -53,6 +53,10 @@ class Child:
     def tether_pid(self) -> int:
         return self._process.pid
 
+    @property
+    def has_ended(self) -> bool:
+        return self._process.poll() is not None
+
     def first_line(self) -> str:
         """What it says first.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status
+from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status, pack
 from harness.errors import DeviceError, LinkError, LinkTimeout
 from harness.link import Link
 
@@ -32,6 +32,8 @@ class Conversation:
         self.clock = link.clock
         self._seq = 0
         self._expected: int | None = None
+        self._heard: dict[int, Message] = {}
+        """The last message with each number."""
         self._last: Message | None = None
 
     @property
@@ -39,9 +41,16 @@ class Conversation:
         """The last message of the device, in a word or two."""
         return "none" if self._last is None else _brief(self._last)
 
+    @property
+    def so_far(self) -> str:
+        """What was heard last, and what the line itself has to say, to explain a silence."""
+        trouble = self.link.trouble
+        return f"last message: {self.last}{'; ' if trouble else ''}{trouble}"
+
     def begin(self) -> None:
         """Whatever number the device's next message has, it is the right one."""
         self._expected = None
+        self._heard.clear()
 
     def next_seq(self) -> int:
         """The number of the next message to the device."""
@@ -60,7 +69,7 @@ class Conversation:
     def receive(self, deadline_s: float) -> Message | None:
         """The next message of the device, or None if none comes in time. One that comes again is passed over.
 
-        :raises LinkError: messages before it were lost, or the line failed.
+        :raises LinkError: messages before it were lost, somebody else speaks as the device, or the line failed.
         """
         while (left_s := deadline_s - self.clock()) >= 0.0:  # also when messages never cease
             try:
@@ -71,13 +80,19 @@ class Conversation:
                 return None
             if self._expected is None or message.seq == self._expected:
                 self._expected = (message.seq + 1) % _SEQ
-                self._last = message
+                self._heard[message.seq] = self._last = message
                 return message
             if (self._expected - message.seq) % _SEQ > LATEST:
                 lost = (message.seq - self._expected) % _SEQ
                 raise LinkError(
                     f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
-                    f" ({self.link.dropped} frames were damaged)"
+                    f" ({self.link.counters['frames_dropped']} frames were damaged)"
+                )
+            before = self._heard.get(message.seq)
+            if before is not None and pack(before) != pack(message):
+                raise LinkError(
+                    f"device {self.name}: {_brief(before)} and {_brief(message)} have the same number, {message.seq}:"
+                    " it was reset, or two speak as this device"
                 )
         return None
 
@@ -102,7 +117,7 @@ class Conversation:
             if message is None:
                 raise LinkTimeout(
                     f"device {self.name}: no {kind.__name__} in answer to {type(request).__name__}"
-                    f" within {self.timeout_s:g} s (last message: {self.last})"
+                    f" within {self.timeout_s:g} s ({self.so_far})"
                 )
             if isinstance(message, kind) and message.answers == request.seq:
                 return message

@@ -5,24 +5,31 @@ A kind is one class, in the registry ``KINDS``; only the help of the command nam
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
+import re
 import secrets
 import shutil
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from urllib.parse import unquote
 
 from harness import config
 from harness.child import Child, ChildWire
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
+from harness.faulty_wire import FaultyWire
+from harness.line import CanLine, SerialLine
 from harness.link import FramedLink, Link
-from harness.timed_wire import TimedWire
 from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire, Wire
-from harness.wire_faults import FaultyWire, WireFaults
+from harness.wire_faults import WireFaults
+
+if TYPE_CHECKING:  # python-can takes longer to import than all the rest
+    from harness.can_bus import CanBus, PythonCanBus
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
@@ -34,6 +41,7 @@ DEFAULT_TIMEOUT_S = 2.0
 DEFAULT_WINDOW = 255
 LONGEST_TIMEOUT_S = 3600.0
 MOST_BAUD = 100_000_000
+MOST_BITRATE = 20_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,13 +53,12 @@ class DeviceDescription:
     """It may take so long to start, before it hears anything."""
     name: str
     exchange: Literal["sample", "block", "stream"] = "sample"
-    """Samples go one at a time, in blocks, or in blocks before the last one is answered. The answers are the same."""
+    """Samples go one at a time, in blocks, or before the last ones are answered; in blocks if the line carries them.
+    The answers are the same."""
     window: int = DEFAULT_WINDOW
-    """For stream: the most blocks that may be unanswered, if the device can hold them."""
+    """For stream: the most messages of samples that may be unanswered, if the device can hold them."""
     report_interval_n: int = 1
     """The device reports its estimate after every so many samples; alarms always."""
-    baud: int | None = None
-    """Bits per second of the line. Where there is no real line, the time that such a one would take is reported."""
     most_lost_n: int = 0
     """A run in which more samples were lost on the way to the device is INCONCLUSIVE."""
     timeout_s: float = DEFAULT_TIMEOUT_S
@@ -63,41 +70,53 @@ class DeviceDescription:
     def __post_init__(self) -> None:
         if not 0.0 < self.timeout_s <= LONGEST_TIMEOUT_S:
             raise ValueError(f"timeout_s must be more than 0 and at most {LONGEST_TIMEOUT_S:g}, not {self.timeout_s:g}")
-        if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
-            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
-        try:
-            WireFaults.parse(self.wire_faults)
-        except ConfigurationError as error:
-            raise ValueError(str(error)) from error
         for name, least, most in (("window", 1, 255), ("report_interval_n", 1, 65535), ("most_lost_n", 0, 2**31)):
             if not least <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be {least} to {most}, not {getattr(self, name)}")
+        try:
+            self.faults()
+        except ConfigurationError as error:
+            raise ValueError(str(error)) from error
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
-        """The device that is called ``name`` on the command line; ``rest`` is what follows the kind and a colon.
+        """The device that is called ``name`` on the command line; ``rest`` is what follows the kind and a colon, up to
+        a question mark.
 
         :raises ConfigurationError: ``rest`` makes no sense.
         """
-        if rest:
-            raise ConfigurationError(f"{name}: a device of the kind {cls.kind} has no {rest!r}")
-        return cls(name=name)
+        where, _, query = rest.partition("?")
+        table = cls._located(name, where) | {key: _value(cls, key, text) for key, text in _pairs(name, query)}
+        return config.build(cls, {"name": name, **table}, name)
+
+    @classmethod
+    def _located(cls, name: str, where: str) -> dict[str, Any]:
+        """What ``where`` says: keys and values."""
+        if where:
+            raise ConfigurationError(f"{name}: a device of the kind {cls.kind} has no {where!r}")
+        return {}
 
     def open(self) -> Link:
         """Start it, or reach it.
 
         :raises LinkError: it cannot be reached.
         """
-        wire = FaultyWire(self.wire, WireFaults.parse(self.wire_faults)) if self.wire_faults else self.wire()
-        return FramedLink(wire if self.baud is None else TimedWire(wire, self.baud))
-
-    def wire(self) -> Wire:
-        """As ``open``, for a device that is reached by bytes."""
         raise NotImplementedError
 
+    def fault_kinds(self) -> Collection[str]:
+        """What can go wrong on its line."""
+        raise NotImplementedError
+
+    def faults(self) -> WireFaults | None:
+        """What shall go wrong; None: nothing.
+
+        :raises ConfigurationError: the line has no such faults.
+        """
+        return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
+
     @property
-    def line(self) -> str:
-        """What to know about the line when nobody answers, if there is anything."""
+    def hint(self) -> str:
+        """What to know when nobody answers, if there is anything."""
         return ""
 
     @property
@@ -111,8 +130,129 @@ class DeviceDescription:
         return {key: value for key, value in table.items() if value is not None}
 
 
+def _pairs(name: str, query: str) -> list[tuple[str, str]]:
+    """KEY=VALUE between ampersands; what stands for other characters (%20) does.
+
+    :raises ConfigurationError: a word is something else.
+    """
+    words = [word.partition("=") for word in query.split("&") if word]
+    for key, equals, value in words:
+        if not (key and equals):
+            raise ConfigurationError(f"{name}: {key + equals + value!r} is not KEY=VALUE")
+    return [(unquote(key), unquote(value)) for key, _, value in words]
+
+
+def _value(cls: type[DeviceDescription], key: str, text: str) -> Any:
+    """A number or a truth if it looks like one, as python-can has it too."""
+    is_flag = isinstance(getattr(cls, key, None), bool)
+    if text.lower() in {"true", "false"} or (is_flag and text in {"1", "0"}):
+        return text.lower() in {"true", "1"}
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(text)
+    return text
+
+
 @dataclass(frozen=True, kw_only=True)
-class HostDevice(DeviceDescription):
+class ByteDevice(DeviceDescription):
+    """A device that is reached by bytes."""
+
+    baud: int | None = None
+    """Bits per second of the line. Where there is no real line, the time that such a one would take is reported."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+
+    def open(self) -> Link:
+        faults = self.faults()
+        line = None if self.baud is None else SerialLine(self.baud)
+        return FramedLink(self.wire() if faults is None else FaultyWire(self.wire, faults), line)
+
+    def wire(self) -> Wire:
+        """As ``open``, for the bytes."""
+        raise NotImplementedError
+
+    def fault_kinds(self) -> Collection[str]:
+        return FaultyWire.HAPPENS
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDevice(DeviceDescription):
+    """A device that is reached by CAN frames."""
+
+    bitrate: int | None = None
+    """Of the bus. Where there is no real one, the time that such a one would take is reported."""
+    data_bitrate: int | None = None
+    """Of the data of CAN FD; none: no faster."""
+    fd: bool = False
+    """Whether the bus, and the device, understand CAN FD, whose frames carry a block of samples."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("bitrate", "data_bitrate"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= MOST_BITRATE:
+                raise ValueError(f"{name} must be 1 to {MOST_BITRATE}, not {value}")
+        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
+            raise ValueError("data_bitrate is of CAN FD: say fd = true and the bitrate of the rest")
+
+    def open(self) -> Link:
+        from harness.can_link import CanLink
+        from harness.faulty_bus import FaultyBus
+
+        faults = self.faults()
+        return CanLink(self.bus() if faults is None else FaultyBus(self.bus, faults))
+
+    def bus(self) -> CanBus:
+        """As ``open``, for the frames."""
+        raise NotImplementedError
+
+    def line(self) -> CanLine | None:
+        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
+
+    def fault_kinds(self) -> Collection[str]:
+        from harness.faulty_bus import FaultyBus
+
+        return FaultyBus.HAPPENS
+
+
+@dataclass(frozen=True, kw_only=True)
+class EitherDevice(ByteDevice, FrameDevice):
+    """A device of this computer, which speaks what ``link`` says; each kind has its own way to carry CAN frames."""
+
+    CAN: ClassVar[str] = "slcan"
+    link: str = "serial"
+
+    def __post_init__(self) -> None:
+        if self.link not in {"serial", self.CAN}:
+            raise ValueError(f"link must be 'serial' or {self.CAN!r}, not {self.link!r}")
+        super().__post_init__()
+        if self._is_serial and (self.fd or self.bitrate is not None):
+            raise ValueError(f"bitrate and fd are of a CAN bus: say link = {self.CAN!r}")
+        if not self._is_serial and self.baud is not None:
+            raise ValueError(f"baud is of a serial line, and link is {self.link!r}: say bitrate")
+
+    @property
+    def _is_serial(self) -> bool:
+        return self.link == "serial"
+
+    def open(self) -> Link:
+        return ByteDevice.open(self) if self._is_serial else FrameDevice.open(self)
+
+    def fault_kinds(self) -> Collection[str]:
+        return ByteDevice.fault_kinds(self) if self._is_serial else FrameDevice.fault_kinds(self)
+
+    def _slcan(self, port: str) -> dict[str, Any]:
+        """The bus on a terminal, in the words of python-can; what speaks there needs no time to start."""
+        rates = {"bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
+        known = {key: value for key, value in rates.items() if value is not None}
+        return {"interface": "slcan", "channel": port, "fd": self.fd, "sleep_after_open": 0.0, **known}
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostDevice(EitherDevice):
     """A process of this computer, on a pseudo-terminal."""
 
     kind: ClassVar[str] = "host"
@@ -120,15 +260,33 @@ class HostDevice(DeviceDescription):
     def wire(self) -> Wire:
         return host_wire()
 
+    def bus(self) -> CanBus:
+        from harness.can_bus import ChildBus, PythonCanBus
+
+        child = host_child(["--slcan"])
+        try:
+            return ChildBus(child, PythonCanBus(self._slcan(child.first_line()), name="slcan"))
+        except BaseException:
+            child.end()
+            raise
+
+
+def host_child(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Child:
+    """A new process of the host port, which says in its first line where it listens.
+
+    :raises LinkError: it cannot be started.
+    """
+    if not program.is_file():
+        raise LinkError(f"{program} is absent: run `make setup`")
+    return Child([program, *arguments], "the device process")
+
 
 def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> ChildWire:
     """A new process of the host port.
 
     :raises LinkError: it cannot be started, or does not say where it listens.
     """
-    if not program.is_file():
-        raise LinkError(f"{program} is absent: run `make setup`")
-    child = Child([program, *arguments], "the device process")
+    child = host_child(arguments, program)
     try:
         return ChildWire(child, PortWire(child.first_line(), name="pty"))
     except BaseException:
@@ -137,17 +295,23 @@ def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Ch
 
 
 @dataclass(frozen=True, kw_only=True)
-class InprocDevice(DeviceDescription):
+class InprocDevice(EitherDevice):
     """The same C within this process."""
 
+    CAN: ClassVar[str] = "can"
     kind: ClassVar[str] = "inproc"
 
     def wire(self) -> Wire:
         return MemoryWire(boot_nonce=secrets.randbits(32))
 
+    def bus(self) -> CanBus:
+        from harness.can_device import MemoryBus
+
+        return MemoryBus(boot_nonce=secrets.randbits(32), is_fd=self.fd, line=self.line())
+
 
 @dataclass(frozen=True, kw_only=True)
-class QemuDevice(DeviceDescription):
+class QemuDevice(EitherDevice):
     """Cortex-M firmware on a board that QEMU emulates."""
 
     starting_s: ClassVar[float] = 5.0
@@ -157,10 +321,29 @@ class QemuDevice(DeviceDescription):
     """An ELF file; by default the project's own, which `make firmware` builds."""
 
     @classmethod
-    def named(cls, name: str, rest: str) -> Self:
-        return cls(name=name, firmware=rest or None)
+    def _located(cls, name: str, where: str) -> dict[str, Any]:  # noqa: ARG003
+        return {"firmware": where} if where else {}
 
     def wire(self) -> Wire:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            line = theirs.fileno()
+            child = self._boot(["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"], inherited=[line])
+            return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+
+    def bus(self) -> CanBus:
+        """On the second UART, as a terminal, since python-can's slcan opens nothing else as fast."""
+        from harness.can_bus import ChildBus, PythonCanBus
+
+        child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])
+        try:
+            (terminal,) = re.findall(r"/dev/\S+", child.first_line()) or [""]
+            return ChildBus(child, PythonCanBus(self._slcan(terminal), name="qemu slcan"))
+        except BaseException:
+            child.end()
+            raise
+
+    def _boot(self, line: Sequence[str], inherited: Sequence[int] = ()) -> Child:
         qemu = shutil.which(QEMU)
         if qemu is None:
             raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
@@ -175,13 +358,8 @@ class QemuDevice(DeviceDescription):
             self._image(),
             *_NO_SCREEN,
         ]
-        command += ["-semihosting-config", f"enable=on,target=native,{arguments}"]
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            line = theirs.fileno()
-            command += ["-chardev", f"socket,id=line,fd={line}", "-serial", "chardev:line"]
-            child = Child(command, f"QEMU ({self.machine})", inherited=[line])
-            return ChildWire(child, DescriptorWire(ours.detach(), "qemu"))
+        command += ["-semihosting-config", f"enable=on,target=native,{arguments}", *line]
+        return Child(command, f"QEMU ({self.machine})", inherited=inherited)
 
     @property
     def elsewhere(self) -> str:
@@ -225,7 +403,7 @@ class QemuM7(QemuDevice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SerialDevice(DeviceDescription):
+class SerialDevice(ByteDevice):
     """Whoever speaks at a serial port, or at any URL that pyserial can open."""
 
     kind: ClassVar[str] = "serial"
@@ -234,6 +412,7 @@ class SerialDevice(DeviceDescription):
 
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
+        """All of ``rest`` is the URL."""
         if not rest:
             raise ConfigurationError(f"{name}: say where it is: {cls.kind}:/dev/ttyACM0, or any URL of pyserial")
         return cls(name=name, url=rest)
@@ -242,7 +421,7 @@ class SerialDevice(DeviceDescription):
         return PortWire(self.url, self.baud or DEFAULT_BAUD)
 
     @property
-    def line(self) -> str:
+    def hint(self) -> str:
         return f"the line was opened at {self.baud} baud"
 
     @property
@@ -250,8 +429,78 @@ class SerialDevice(DeviceDescription):
         return f"{self.kind}:{self.url}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class CanDevice(FrameDevice):
+    """Whoever answers on a CAN bus that python-can can open."""
+
+    kind: ClassVar[str] = "can"
+    interface: str = ""
+    """As python-can names it; empty: as its own configuration says, and so for the channel."""
+    channel: str = ""
+    device: Literal["none", "inproc", "host"] | None = None
+    """Who answers: somebody else, the library in this process, or a process on the same SocketCAN channel. By default
+    ``inproc`` on a virtual bus, where nobody else can be, and otherwise ``none``."""
+    options: Mapping[str, bool | int | float | str] = field(default_factory=dict)
+    """What else python-can is to be told."""
+
+    @classmethod
+    def named(cls, name: str, rest: str) -> Self:
+        where, _, query = rest.partition("?")
+        interface, _, channel = where.partition("/")
+        pairs = {key: _value(cls, key, text) for key, text in _pairs(name, query)}
+        own = {key: value for key, value in pairs.items() if key in cls.__dataclass_fields__}
+        options = {key: value for key, value in pairs.items() if key not in own}
+        return config.build(
+            cls, {"name": name, "interface": interface, "channel": channel, "options": options, **own}, name
+        )
+
+    def bus(self) -> CanBus:
+        from harness.can_bus import PythonCanBus
+
+        asked = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
+        asked |= {"interface": self.interface or None, "channel": self.channel or None}
+        asked = {key: value for key, value in asked.items() if value is not None}
+        if self.interface == "virtual" and not self.channel:
+            asked["channel"] = f"analogrig-{secrets.token_hex(4)}"  # which nobody else in this process has
+        bus = PythonCanBus(asked)
+        try:
+            return self._answered(bus, asked)
+        except BaseException:
+            bus.close()
+            raise
+
+    def _answered(self, bus: PythonCanBus, asked: Mapping[str, Any]) -> CanBus:
+        """With the device that shall be on it."""
+        from harness.can_bus import ChildBus, PythonCanBus
+        from harness.can_device import InhabitedBus
+
+        who = self.device or ("inproc" if self.interface == "virtual" else "none")
+        if who == "inproc":
+            return InhabitedBus(bus, PythonCanBus(asked), boot_nonce=secrets.randbits(32))
+        if who == "none":
+            return bus
+        child = host_child(["--can", self.channel, *(["--fd"] if self.fd else [])])
+        try:
+            child.first_line()
+            return ChildBus(child, bus)
+        except BaseException:
+            child.end()
+            raise
+
+    @property
+    def hint(self) -> str:
+        return f"the bus was opened as {self._url()}: is the device on it, at the same bit rate?"
+
+    @property
+    def elsewhere(self) -> str:
+        return self._url() if self.interface != "virtual" else ""
+
+    def _url(self) -> str:
+        return f"{self.kind}:{self.interface}{'/' if self.channel else ''}{self.channel}"
+
+
 KINDS: Mapping[str, type[DeviceDescription]] = {
-    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice)
+    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice, CanDevice)
 }
 
 
@@ -260,9 +509,9 @@ def describe(name: str) -> DeviceDescription:
 
     :raises ConfigurationError: there is none, or it is wrong.
     """
-    kind, _, rest = name.partition(":")
+    kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
-        return KINDS[kind].named(name, rest)
+        return KINDS[kind].named(name, name[len(kind) :].removeprefix(":"))
     path = config.locate("devices", name)
     return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
 

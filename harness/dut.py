@@ -47,8 +47,8 @@ from harness.errors import (
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.exchange import Exchange, Packing, RaisedAlarm, Replies
-from harness.link import Link
+from harness.exchange import Exchange, Packing, RaisedAlarm, Replies, most_answers
+from harness.link import CanListener, Link
 from harness.pace import Pace, check_line
 
 _HELLO_AGAIN_S = 0.25
@@ -98,6 +98,11 @@ class Dut:
         return self._talk.link.name
 
     @property
+    def link_counters(self) -> dict[str, int]:
+        """What the line has shown since it was opened that was no message of the device, by name."""
+        return dict(self._talk.link.counters)
+
+    @property
     def line_s(self) -> float:
         """How long a line of the described speed would have taken for the samples; 0.0: none is described."""
         return self._talk.link.line_s - self._line_s
@@ -131,7 +136,13 @@ class Dut:
 
         :raises LinkTimeout: nobody answers.
         :raises CatalogueMismatch: it speaks another catalogue.
+        :raises ConfigurationError: the line does not carry the messages of the described exchange.
         """
+        if self._description.exchange == "block" and not self._talk.link.carries_blocks:
+            raise ConfigurationError(
+                f"device {self.name}: exchange: a block has 64 bytes, which a frame of classic CAN does not carry: say"
+                " sample or stream, or use CAN FD (fd)"
+            )
         self._identity = self._identify(starting_s=self._description.starting_s)
         self._control(Command.RESET)
         self._control(Command.REPORT_INTERVAL, self._description.report_interval_n)
@@ -169,7 +180,7 @@ class Dut:
 
         :raises ConfigurationError: that does not fit the line.
         """
-        check_line(self._description, period_s)
+        check_line(self._description, self._talk.link, period_s)
         return Pace(self._talk.clock, period_s)
 
     def start(self, pace: Pace | None = None) -> None:
@@ -206,11 +217,15 @@ class Dut:
         return 0 if Counter[counter.upper()] < Counter.FRAMES_DROPPED else self._counted[counter]
 
     def _packing(self) -> Packing:
-        """No more is on its way than the device can hold."""
-        exchange = self._description.exchange
-        window = self._description.window if exchange == "stream" else 1
-        room = window if self._identity is None else max(1, self._identity.input_blocks)
-        return Packing(in_blocks=exchange != "sample", window=min(window, room))
+        """No more is on its way than the device can hold, nor on its way back than the line can."""
+        description, link = self._description, self._talk.link
+        in_blocks = description.exchange != "sample" and link.carries_blocks
+        window = description.window if description.exchange == "stream" else 1
+        if self._identity is not None:
+            window = min(window, self._identity.input_blocks)
+        if link.unread_n is not None:
+            window = min(window, link.unread_n // most_answers(in_blocks, self.parameters))
+        return Packing(in_blocks=in_blocks, window=max(1, window))
 
     def status(self) -> dict[str, int]:
         """The device's counters by name."""
@@ -324,8 +339,10 @@ class Dut:
         return self._exchange
 
 
-def open_dut(name: str, **changes: Any) -> Dut:
+def open_dut(name: str, *, listener: CanListener | None = None, **changes: Any) -> Dut:
     """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
+
+    On a CAN bus, ``listener`` is told every frame from the opening of the bus on.
 
     ``changes`` are fields of its description that shall be otherwise; None: as described.
 
@@ -333,10 +350,10 @@ def open_dut(name: str, **changes: Any) -> Dut:
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    return connect(_changed(describe(name), changes))
+    return connect(_changed(describe(name), changes), listener)
 
 
-def reopen_dut(description: Mapping[str, Any], **changes: Any) -> Dut:
+def reopen_dut(description: Mapping[str, Any], *, listener: CanListener | None = None, **changes: Any) -> Dut:
     """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
 
     What a file names is not opened on its word alone: a device elsewhere must be named again.
@@ -347,20 +364,26 @@ def reopen_dut(description: Mapping[str, Any], **changes: Any) -> Dut:
         raise ConfigurationError(
             f"the recorded device was {recorded.elsewhere}: say --dut {recorded.elsewhere}, or another"
         )
-    return connect(_changed(recorded, changes))
+    return connect(_changed(recorded, changes), listener)
 
 
 def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
-    """:raises ConfigurationError: a value is out of range."""
+    """:raises ConfigurationError: a value is out of range, or such a device has none."""
+    wanted = {key: value for key, value in changes.items() if value is not None}
+    for key in wanted.keys() - {each.name for each in dataclasses.fields(description)}:
+        raise ConfigurationError(f"device {description.name}: a device of the kind {description.kind} has no {key}")
     try:
-        return dataclasses.replace(description, **{key: value for key, value in changes.items() if value is not None})
+        return dataclasses.replace(description, **wanted)
     except ValueError as error:
         raise ConfigurationError(f"device {description.name}: {error}") from error
 
 
-def connect(description: DeviceDescription) -> Dut:
+def connect(description: DeviceDescription, listener: CanListener | None = None) -> Dut:
     """Reach the device, shake hands, configure it; errors as ``open_dut``."""
-    dut = Dut(description.open(), description)
+    link = description.open()
+    if listener is not None:
+        link.listen(listener)
+    dut = Dut(link, description)
     try:
         _handshake(dut, description)
         dut.configure()
@@ -374,9 +397,9 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
     try:
         dut.handshake()
     except LinkTimeout as error:
-        if not description.line:
+        if not description.hint:
             raise
-        raise LinkTimeout(f"{error}; {description.line}") from error
+        raise LinkTimeout(f"{error}; {description.hint}") from error
 
 
 def _float32(value: float) -> float:

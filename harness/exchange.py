@@ -100,13 +100,18 @@ class Packing:
     """How samples travel."""
 
     in_blocks: bool
-    """Up to BLOCK_SAMPLES in a message, or one."""
+    """Up to BLOCK_SAMPLES in a message, or one, which any line carries."""
     window: int
     """The most messages that may be unanswered."""
 
     @property
     def per_message(self) -> int:
         return BLOCK_SAMPLES if self.in_blocks else 1
+
+
+def most_answers(in_blocks: bool, parameters: int) -> int:  # noqa: FBT001 - as in Packing
+    """To one message of samples: each has its estimates and Stepped; and there may be an alarm and a diagnosis."""
+    return (BLOCK_SAMPLES if in_blocks else 1) * (parameters + 2) + 2
 
 
 class _Rows:
@@ -357,7 +362,7 @@ class Exchange:
         """
         heard = (
             f"device {self._talk.name}: no estimate for sample {self._answered} within {self._talk.timeout_s:g} s"
-            f" (last message: {self._talk.last})"
+            f" ({self._talk.so_far})"
         )
         try:
             self._is_there()

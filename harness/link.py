@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Protocol
 
 from harness import frame
 from harness.catalogue import Message, pack, unpack
-from harness.timed_wire import TimedWire
+from harness.line import Line, SerialLine
 from harness.wire import Clock, Wire
+
+if TYPE_CHECKING:
+    import can
+
+CanListener = Callable[["can.Message"], object]
+"""Is told every frame on a CAN bus as it comes or goes: ``is_rx`` is False if it is the harness's own, ``timestamp`` is
+the clock of the link. python-can's writers of logs are such."""
 
 
 class Link(Protocol):
@@ -24,12 +31,31 @@ class Link(Protocol):
         """The time in which its time-outs are meant."""
 
     @property
-    def dropped(self) -> int:
-        """How many frames from the device were no good."""
+    def counters(self) -> Mapping[str, int]:
+        """What was seen on the line that was no message of the device, by name; ``frames_dropped``: was no good."""
+
+    @property
+    def trouble(self) -> str:
+        """What the line itself has to say if nothing comes, or nothing."""
+
+    @property
+    def line(self) -> Line | None:
+        """Its speed, if that is known."""
 
     @property
     def line_s(self) -> float:
         """How long a line of the described speed would have taken until now [s]; 0.0 if none is described."""
+
+    @property
+    def carries_blocks(self) -> bool:
+        """Whether a SampleBlock fits into a message, or only what has 8 bytes."""
+
+    @property
+    def unread_n(self) -> int | None:
+        """So many messages may come before one of them is read; None: as many as like to."""
+
+    def listen(self, listener: CanListener) -> bool:
+        """Tell the listener all that passes from now on; False: these are no CAN frames."""
 
     def send(self, messages: Iterable[Message]) -> None:
         """Send the messages, in one go where the line can.
@@ -50,24 +76,31 @@ class Link(Protocol):
 class FramedLink:
     """Messages as frames over a wire; they come in the order in which they were sent."""
 
-    def __init__(self, wire: Wire) -> None:
-        """Take over ``wire``."""
+    trouble = ""
+    carries_blocks = True
+    unread_n = None
+
+    def __init__(self, wire: Wire, line: SerialLine | None = None) -> None:
+        """Take over ``wire``; ``line`` is what it would be, or is, outside of this computer."""
         self.wire = wire
         self.name = wire.name
         self.clock = wire.clock
+        self.line_s = 0.0
+        self.line = line
         self._decoder = frame.FrameDecoder()
         self._messages: deque[Message] = deque()
 
     @property
-    def dropped(self) -> int:
-        return self._decoder.dropped
+    def counters(self) -> Mapping[str, int]:
+        return {"frames_dropped": self._decoder.dropped}
 
-    @property
-    def line_s(self) -> float:
-        return self.wire.line_s if isinstance(self.wire, TimedWire) else 0.0
+    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - there is nothing to tell it
+        return False
 
     def send(self, messages: Iterable[Message]) -> None:
-        self.wire.write(b"".join([frame.encode(pack(message)) for message in messages]))
+        sent = b"".join([frame.encode(pack(message)) for message in messages])
+        self._time(sent)
+        self.wire.write(sent)
 
     def receive(self, timeout_s: float) -> Message | None:
         if self._messages:
@@ -84,7 +117,13 @@ class FramedLink:
         self.wire.close()
 
     def _enter(self, received: bytes) -> None:
+        self._time(received)
         for packet in self._decoder.feed(received):
             message = unpack(packet)
             if message is not None:
                 self._messages.append(message)
+
+    def _time(self, passed: bytes) -> None:
+        """One direction after the other."""
+        if self.line is not None:
+            self.line_s += self.line.bytes_s(len(passed))

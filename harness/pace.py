@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-from harness import frame
 from harness.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from harness.devices import DeviceDescription
 from harness.errors import ConfigurationError
-from harness.timed_wire import BITS_PER_BYTE
+from harness.link import Link
 from harness.wire import Clock
 
 
@@ -37,24 +36,25 @@ class Pace:
         self.overruns += is_full or late_s > window * self._period_s
 
 
-def check_line(device: DeviceDescription, period_s: float) -> None:
-    """That a line of the described speed carries a sample every ``period_s``, alarms and the like not counted.
+def check_line(device: DeviceDescription, link: Link, period_s: float) -> None:
+    """That the line, if its speed is known, carries a sample every ``period_s``, alarms and the like not counted.
 
     :raises ConfigurationError: it does not; with the arithmetic.
     """
-    if device.baud is None:
+    line = link.line
+    if line is None:
         return
-    in_blocks = device.exchange != "sample"
-    there = frame.size(SampleBlock) / BLOCK_SAMPLES if in_blocks else frame.size(Sample)
+    in_blocks = device.exchange != "sample" and link.carries_blocks
+    to_s = line.message_s(SampleBlock) / BLOCK_SAMPLES if in_blocks else line.message_s(Sample)
     elements = device.estimator.parameters + 1
-    back = frame.size(Stepped) + elements * frame.size(Estimate) / device.report_interval_n
-    needed = BITS_PER_BYTE * max(there, back) / period_s
-    if needed > device.baud:
-        unreported = BITS_PER_BYTE * max(there, frame.size(Stepped)) / period_s
-        thinner = ", or more samples for each report" if unreported < device.baud else ""
+    stepped_s = line.message_s(Stepped)
+    from_s = stepped_s + elements * line.message_s(Estimate) / device.report_interval_n
+    load = line.together_s(to_s, from_s) / period_s
+    if load > 1.0:
+        thinner = ", or more samples for each report" if line.together_s(to_s, stepped_s) < period_s else ""
         raise ConfigurationError(
-            f"device {device.name}: real time does not fit its line: {1.0 / period_s:g} samples/s of {there:.4g} bytes"
-            f" to the device and {back:.4g} bytes back ({elements} estimates every {device.report_interval_n} samples)"
-            f" are {needed:.0f} bit/s, the line has {device.baud} baud;"
-            f" {math.ceil(10.0 * needed / device.baud) / 10.0:g} times slower would fit{thinner}"
+            f"device {device.name}: real time does not fit its line: {1.0 / period_s:g} samples/s, each of"
+            f" {to_s * 1e6:.4g} us to the device and {from_s * 1e6:.4g} us back ({elements} estimates every"
+            f" {device.report_interval_n} samples), are {load:.4g} times what {line.speed} carry;"
+            f" {math.ceil(10.0 * load) / 10.0:g} times slower would fit{thinner}"
         )

@@ -191,13 +191,13 @@ def _reason(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else str(error)
 
 
-class _Progress(ctypes.Structure):
-    """As serial_progress_t of estimator_c/device/serial_device.h."""
+class Progress(ctypes.Structure):
+    """As device_progress_t of estimator_c/device/device.h."""
 
     _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
 
 
-class _Identity(ctypes.Structure):
+class Identity(ctypes.Structure):
     """As device_identity_t of estimator_c/device/device.h."""
 
     _fields_ = (
@@ -206,6 +206,14 @@ class _Identity(ctypes.Structure):
         ("input_blocks", ctypes.c_uint8),
         ("firmware_id", ctypes.c_uint8),
     )
+
+
+def load_library(library: Path) -> ctypes.CDLL:
+    """:raises LinkError: it was not built."""
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
 
 
 class MemoryWire:
@@ -219,21 +227,19 @@ class MemoryWire:
         *,
         catalogue_hash: int = CATALOGUE_HASH,
         clock: VirtualClock | None = None,
+        input_blocks: int = _ALWAYS_ROOM,
         library: Path = LIBRARY,
     ) -> None:
         """Boot a device; another ``catalogue_hash`` makes it a stranger.
 
         :raises LinkError: the device library was not built.
         """
-        try:
-            c = ctypes.CDLL(str(library))
-        except OSError as error:
-            raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
-        c.serial_device_run.restype = _Progress
+        c = load_library(library)
+        c.serial_device_run.restype = Progress
         c.serial_device_size.restype = ctypes.c_size_t
         self._run = c.serial_device_run
         self._init = c.serial_device_init
-        self._catalogue_hash = catalogue_hash
+        self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
         self._device = ctypes.create_string_buffer(c.serial_device_size())
         self._output = ctypes.create_string_buffer(_READ_BYTES)
         self._answers = b""
@@ -244,7 +250,8 @@ class MemoryWire:
         """As if it had been switched off and on: it begins anew, and what it was saying is lost."""
         self._answers = b""
         self._init(
-            self._device, ctypes.byref(_Identity(self._catalogue_hash, boot_nonce, _ALWAYS_ROOM, FirmwareId.LIBRARY))
+            self._device,
+            ctypes.byref(Identity(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)),
         )
 
     def write(self, sent: bytes) -> None:

@@ -1,4 +1,4 @@
-"""A line with faults, from a seed: bytes and frames are spoilt on their way, or the device at its end is.
+"""Faults of a line, from a seed: how they are asked for, and what those do that befall any line, serial or CAN.
 
 A fault happens at a numbered frame of one direction, or at any frame with a given probability; the frames are counted
 from the opening of the line, from 0. harness/README.md says what becomes of a run with each of them.
@@ -9,17 +9,15 @@ from the opening of the line, from 0. harness/README.md says what becomes of a r
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
-from harness import frame
-from harness.catalogue import CATALOGUE_HASH, Hello, pack, unpack
 from harness.errors import ConfigurationError, LinkClosed
-from harness.timed_wire import BITS_PER_BYTE
-from harness.wire import DEFAULT_BAUD, MemoryWire, VirtualClock, Wire
+from harness.wire import Clock
 
 Direction = Literal["to", "from"]
 """To the device, or from it."""
@@ -28,12 +26,11 @@ DIRECTIONS: tuple[Direction, ...] = ("to", "from")
 LONGEST_DELAY_S = 3.0
 MOST_FRAMES_LATE = 40
 MOST_FRAMES_OUT = 600
-_BABBLE_BYTES = 1024
-_STRANGERS_HASH = CATALOGUE_HASH ^ 0x5A5A5A5A
 
-_FRAME = re.compile(rb"\0*[^\0]+\0")
 _FAULT = re.compile(r"([a-z-]+)@(?:(to|from):([0-9]{1,12})|([0-9.]+(?:e-?[0-9]+)?))")
 _SEED = re.compile(r"seed=([0-9]{1,18})")
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -55,16 +52,16 @@ class WireFaults:
     seed: int = 0
 
     @classmethod
-    def parse(cls, text: str) -> WireFaults:
+    def parse(cls, text: str, kinds: Collection[str]) -> WireFaults:
         """From words between commas: ``flip@to:81``, ``delay@from:0``, ``lose@0.001``, ``seed=7``.
 
-        :raises ConfigurationError: a word is none of these, or there is no such kind of fault.
+        :raises ConfigurationError: a word is none of these, or the line has no such kind of fault.
         """
         at, rates, seed = [], {}, 0
         for word in filter(None, (word.strip() for word in text.split(","))):
             if match := _SEED.fullmatch(word):
                 seed = int(match[1])
-            elif (match := _FAULT.fullmatch(word)) and match[1] in KINDS:
+            elif (match := _FAULT.fullmatch(word)) and match[1] in kinds:
                 if match[2]:
                     at.append(WireFault(match[1], "to" if match[2] == "to" else "from", int(match[3])))
                     if len({(fault.direction, fault.frame) for fault in at}) < len(at):
@@ -76,7 +73,7 @@ class WireFaults:
             else:
                 raise ConfigurationError(
                     f"wire faults: {word!r} is not KIND@to:FRAME, KIND@from:FRAME, KIND@PROBABILITY or seed=N,"
-                    f" where KIND is one of {', '.join(KINDS)}"
+                    f" where KIND is one of {', '.join(kinds)}"
                 )
         return cls(tuple(at), rates, seed)
 
@@ -91,53 +88,16 @@ def _probability(text: str, word: str) -> float:
     return probability
 
 
-# ---- one frame is spoilt
-
-
-def _flip(sent: bytes, rng: Random) -> bytes:
-    out = bytearray(sent)
-    for _ in range(rng.randint(1, 4)):
-        out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
-    return bytes(out)
-
-
-def _lose(sent: bytes, rng: Random) -> bytes:
-    at = rng.randrange(len(sent))
-    return sent[:at] + sent[at + rng.randint(1, 4) :]
-
-
-def _insert(sent: bytes, rng: Random) -> bytes:
-    at = rng.randint(0, len(sent))
-    return sent[:at] + rng.randbytes(rng.randint(1, 16)) + sent[at:]
-
-
-def _truncate(sent: bytes, rng: Random) -> bytes:
-    return sent[: rng.randrange(len(sent))]
-
-
-_SPOILT: Mapping[str, Callable[[bytes, Random], bytes]] = {
-    "flip": _flip,
-    "lose": _lose,
-    "insert": _insert,
-    "truncate": _truncate,
-    "drop": lambda _sent, _rng: b"",
-    "duplicate": lambda sent, _rng: sent + sent,
-}
-"""Up to four bits flipped, up to four bytes lost, up to sixteen inserted, the end lost, all lost, all of it twice."""
-
-
 @dataclass
-class _Lane:
+class Lane(Generic[T]):
     """One direction."""
 
     rng: Random
     """Its own: which of the two speaks first is a matter of timing."""
     frames: int = 0
-    begun: bytes = b""
-    """Of a frame that is not complete."""
-    held: list[tuple[int, bytes]] = field(default_factory=list)
+    held: list[tuple[int, T]] = field(default_factory=list)
     """Frames that come after so many others."""
-    queue: deque[tuple[float, bytes]] = field(default_factory=deque)
+    queue: deque[tuple[float, T]] = field(default_factory=deque)
     """What is on its way, and when it comes."""
     stalled_s: float = 0.0
     """Until then nothing comes."""
@@ -145,14 +105,7 @@ class _Lane:
     lost_n: int = 0
     """So many frames more are lost."""
 
-    def split(self, sent: bytes) -> list[bytes]:
-        """The frames that are complete."""
-        self.begun += sent
-        frames = _FRAME.findall(self.begun)
-        self.begun = self.begun[sum(map(len, frames)) :][-frame.MAX_ENCODED :]
-        return frames
-
-    def put(self, sent: bytes, now_s: float) -> None:
+    def put(self, sent: T, now_s: float) -> None:
         self.queue.append((max(now_s, self.stalled_s), sent))
 
     def release(self, now_s: float) -> None:
@@ -163,176 +116,190 @@ class _Lane:
                 self.put(sent, now_s)
         self.held = [(n, sent) for n, sent in self.held if n > 0]
 
-    def due(self, now_s: float) -> bytes:
+    def due(self, now_s: float) -> list[T]:
         """All that has come by now."""
         out = []
         while self.queue and self.queue[0][0] <= now_s:
             out.append(self.queue.popleft()[1])
-        return b"".join(out)
+        return out
 
 
-class FaultyWire:
-    """A wire that does to the bytes what ``faults`` say."""
+class FaultyLine(ABC, Generic[T]):
+    """Does to the frames of a line, which are of the type T, what its faults say."""
 
-    def __init__(self, open_wire: Callable[[], Wire], faults: WireFaults) -> None:
-        """Open the wire; a device that is reset is one that is opened again."""
-        self._open = open_wire
-        self._wire = open_wire()
-        self.name = self._wire.name
-        self.clock = self._wire.clock
+    name: str
+    clock: Clock
+
+    def __init__(self, faults: WireFaults) -> None:
+        """The line is open."""
         self._at = {(fault.direction, fault.frame): fault.kind for fault in faults.at}
         self._rates = dict(faults.rates)
-        self._lanes: dict[Direction, _Lane] = {
-            direction: _Lane(Random(f"{faults.seed} {direction}")) for direction in DIRECTIONS
+        self._lanes: dict[Direction, Lane[T]] = {
+            direction: Lane(Random(f"{faults.seed} {direction}")) for direction in DIRECTIONS
         }
-        self._is_closed = self._is_silent = self._is_garbled = self._is_stranger = False
+        self._boots = 0
+        self._is_closed = self._is_silent = self._is_stranger = False
 
     @property
     def frames(self) -> Mapping[Direction, int]:
         """How many frames have come by in each direction."""
         return {direction: lane.frames for direction, lane in self._lanes.items()}
 
-    def write(self, sent: bytes) -> None:
+    @property
+    def waiting(self) -> int:
+        """How many frames are kept."""
+        return sum(len(lane.queue) + len(lane.held) for lane in self._lanes.values())
+
+    # ---- what the line does
+
+    @abstractmethod
+    def _write(self, sent: Sequence[T]) -> None:
+        """To the device."""
+
+    @abstractmethod
+    def _read(self, timeout_s: float) -> list[T]:
+        """The frames that the device has completed."""
+
+    @abstractmethod
+    def _boot(self) -> None:
+        """Open the device again."""
+
+    @abstractmethod
+    def _noise(self, direction: Direction, passed: list[T]) -> list[T]:
+        """What comes when these would, and somebody babbles."""
+
+    @abstractmethod
+    def _stranger(self, sent: T) -> T:
+        """As if the device had been built from another catalogue."""
+
+    # ---- passing
+
+    def _send(self, sent: Sequence[T]) -> None:
         self._enter("to", sent)
         self._deliver()
 
-    def read(self, timeout_s: float) -> bytes:
+    def _receive(self, timeout_s: float) -> list[T]:
+        """What has come, at least one frame unless the time is over."""
         deadline_s, is_over = self.clock() + timeout_s, False
+        lane = self._lanes["from"]
         while True:
             self._deliver()
-            if self._lanes["from"].babbles:
-                return self._babble()
-            received = self._lanes["from"].due(self.clock())
+            if lane.babbles:
+                self._enter("from", self._read(0.0))
+                return self._noise("from", lane.due(self.clock()))
+            received = lane.due(self.clock())
             if received or is_over:
                 return received
             left_s = max(0.0, deadline_s - self.clock())
-            self._enter("from", self._wire.read(min(left_s, self._soon_s())))
+            self._enter("from", self._read(min(left_s, self._soon_s())))
             is_over = self.clock() >= deadline_s
-
-    def close(self) -> None:
-        self._wire.close()
 
     def _deliver(self) -> None:
         """To the device, what is due."""
         if self._is_closed:
             raise LinkClosed(f"{self.name}: the line is cut")
-        sent = self._lanes["to"].due(self.clock())
-        if self._lanes["to"].babbles:
-            sent += self._lanes["to"].rng.randbytes(_BABBLE_BYTES)
+        lane = self._lanes["to"]
+        sent = lane.due(self.clock())
+        if lane.babbles:
+            sent = self._noise("to", sent)
         if sent and not self._is_silent:
-            self._wire.write(sent)
+            self._write(sent)
 
     def _soon_s(self) -> float:
         """How long nothing will come of itself."""
         due_s = [lane.queue[0][0] for lane in self._lanes.values() if lane.queue]
         return max(0.0, min(due_s) - self.clock()) if due_s else LONGEST_DELAY_S
 
-    def _babble(self) -> bytes:
-        """Noise without end; what the line can carry, if time is virtual."""
-        if isinstance(self.clock, VirtualClock):
-            self.clock.advance(_BABBLE_BYTES * BITS_PER_BYTE / DEFAULT_BAUD)
-        return self._lanes["from"].rng.randbytes(_BABBLE_BYTES)
-
-    # ---- frame by frame
-
-    def _enter(self, direction: Direction, sent: bytes) -> None:
-        lane, wire = self._lanes[direction], self._wire
-        for each in lane.split(sent):
-            if direction == "from" and wire is not self._wire:
+    def _enter(self, direction: Direction, sent: Sequence[T]) -> None:
+        lane, boots = self._lanes[direction], self._boots
+        for each in sent:
+            if direction == "from" and boots != self._boots:
                 break  # of a device that has been reset meanwhile
             kind = self._due_kind(direction, lane)
             lane.frames += 1
             passed = self._changed(lane, each)
-            if kind is None or not passed:
-                lane.put(passed, self.clock())
-            elif kind in _SPOILT:
-                lane.put(_SPOILT[kind](passed, lane.rng), self.clock())
-            else:
-                self.HAPPENS[kind](self, lane, passed)
+            if passed is not None:
+                if kind is None:
+                    lane.put(passed, self.clock())
+                else:
+                    self.HAPPENS[kind](self, lane, passed)
             lane.release(self.clock())
 
-    def _due_kind(self, direction: Direction, lane: _Lane) -> str | None:
+    def _due_kind(self, direction: Direction, lane: Lane[T]) -> str | None:
         kind = self._at.get((direction, lane.frames))
         if kind is not None:
             return kind
         return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
 
-    def _changed(self, lane: _Lane, sent: bytes) -> bytes:
-        """By what lasts."""
+    def _changed(self, lane: Lane[T], sent: T) -> T | None:
+        """By what lasts; None: it is lost."""
         if self._is_silent:
-            return b""
+            return None
         if lane.lost_n:
             lane.lost_n -= 1
-            return b""
-        if self._is_garbled:
-            return lane.rng.randbytes(lane.rng.randint(1, 2 * len(sent)))
-        return _strange(sent) if self._is_stranger else sent
+            return None
+        return self._stranger(sent) if self._is_stranger else sent
 
-    def _lose_many(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002 - it is lost
+    # ---- what happens to a frame
+
+    def _drop(self, lane: Lane[T], sent: T) -> None:
+        """It is lost."""
+
+    def _duplicate(self, lane: Lane[T], sent: T) -> None:
+        lane.put(sent, self.clock())
+        lane.put(sent, self.clock())
+
+    def _lose_many(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002 - it is lost
         lane.lost_n = int(MOST_FRAMES_OUT ** lane.rng.random())
 
-    def _reorder(self, lane: _Lane, sent: bytes) -> None:
+    def _reorder(self, lane: Lane[T], sent: T) -> None:
         lane.held.append((1 + lane.rng.randint(1, 3), sent))
 
-    def _repeat(self, lane: _Lane, sent: bytes) -> None:
+    def _repeat(self, lane: Lane[T], sent: T) -> None:
         lane.put(sent, self.clock())
         lane.held.append((1 + lane.rng.randint(1, MOST_FRAMES_LATE), sent))
 
-    def _delay(self, lane: _Lane, sent: bytes) -> None:
+    def _delay(self, lane: Lane[T], sent: T) -> None:
         lane.stalled_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S
         lane.put(sent, self.clock())
 
-    def _start_babble(self, lane: _Lane, sent: bytes) -> None:
+    def _start_babble(self, lane: Lane[T], sent: T) -> None:
         lane.put(sent, self.clock())
         lane.babbles = True
 
-    def _disconnect(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
+    def _disconnect(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
         self._is_closed = True
 
-    def _hang(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
+    def _hang(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
         self._is_silent = True
 
-    def _garble(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
-        self._is_garbled = True
-
-    def _replace_catalogue(self, lane: _Lane, sent: bytes) -> None:  # noqa: ARG002
+    def _replace_catalogue(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
         self._is_stranger = True
 
-    def _reset(self, lane: _Lane, sent: bytes) -> None:
+    def _reset(self, lane: Lane[T], sent: T) -> None:
         """The device boots; what it was told and what it was saying is lost, but for what comes to it now."""
-        self._wire.close()
-        self._wire = self._open()
-        if isinstance(self._wire, MemoryWire) and isinstance(self.clock, VirtualClock):
-            self._wire.clock = self.clock
+        self._boots += 1
+        self._boot()
         self._lanes["from"].queue.clear()
         if lane is self._lanes["to"]:
             lane.put(sent, self.clock())
 
-    HAPPENS: ClassVar[Mapping[str, Callable[[FaultyWire, _Lane, bytes], None]]] = {
+    PASSES: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
+        "drop": _drop,
+        "duplicate": _duplicate,
         "outage": _lose_many,
         "reorder": _reorder,
         "repeat": _repeat,
         "delay": _delay,
+    }
+    """The kinds after which the line is as it was, of any line."""
+    LASTS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
         "babble": _start_babble,
         "disconnect": _disconnect,
         "hang": _hang,
-        "wrong-baud": _garble,
         "stranger": _replace_catalogue,
         "reset": _reset,
     }
-
-
-def _strange(sent: bytes) -> bytes:
-    """As if the device had been built from another catalogue."""
-    packets = frame.FrameDecoder().feed(sent)
-    message = unpack(packets[0]) if packets else None
-    if message is None:
-        return sent
-    if isinstance(message, Hello):
-        message = message._replace(catalogue_hash=_STRANGERS_HASH)
-    return frame.encode(pack(message), _STRANGERS_HASH)
-
-
-PASSING = (*_SPOILT, "outage", "reorder", "repeat", "delay")
-"""The kinds after which the line is as it was."""
-KINDS = (*_SPOILT, *FaultyWire.HAPPENS)
+    """The others of any line."""
+    HAPPENS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {**PASSES, **LASTS}
+    """All kinds of a line, by name."""

@@ -106,7 +106,24 @@ def check(database: Database) -> None:
         for before, after in pairwise(fields(message)):
             if before.start_byte >= after.start_byte:
                 raise CatalogueError(f"{message.name}: {after.name} overlaps {before.name}")
+        for signal in message.signals:
+            check_range(message, signal)
     enums(database)
+
+
+def check_range(message: Message, signal: Signal) -> None:
+    """A range that the field can hold and that holds all named values; of a floating-point number it excludes NaN.
+
+    Without a range cantools' ``..._is_in_range()`` is true for every floating-point number, NaN included.
+    """
+    lowest, highest = signal.minimum, signal.maximum
+    if lowest is None or highest is None:
+        raise CatalogueError(f"{message.name}: {signal.name} has no range")
+    if signal.conversion.is_float:
+        return
+    for value in (lowest, highest, *(signal.choices or {})):
+        if not max(lowest, 0) <= value <= min(highest, 2**signal.length - 1):
+            raise CatalogueError(f"{message.name}: {signal.name} cannot be {value}")
 
 
 def fields(message: Message) -> list[Field]:
@@ -169,7 +186,7 @@ def is_seeded(message: Message) -> bool:
 
 
 def catalogue_hash(database: Database) -> int:
-    """32 bits over all that matters to who reads a message: not over comments, and not over the order of the file."""
+    """32 bits over all that matters to who reads a message: not over ranges, comments, and the order of the file."""
     meaning = {
         message.name: [
             message.frame_id,

@@ -2,7 +2,6 @@
 
 #include "analogrig_codec.h"
 
-#include <float.h>
 #include <stddef.h>
 
 typedef struct {
@@ -88,7 +87,7 @@ static uint16_t get_whole(const uint8_t* const member, const uint8_t size) {
 /// A value that the field can hold. False for NaN too.
 static bool holds(const field_t field, const float value) {
     if (field.limit == 0U) {
-        return (value >= -FLT_MAX) && (value <= FLT_MAX);
+        return analogrig_configure_value_is_in_range(value);
     }
     return (value >= 0.0F) && (value <= (float)field.limit) && !((value - (float)(uint16_t)value) > 0.0F);
 }

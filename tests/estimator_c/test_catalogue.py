@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
+import math
+import random
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cantools
 import pytest
+from cantools.database.can import Database, Message
+from cantools.database.can.c_source import camel_to_snake_case
+from cantools.database.can.signal import Signal
 
-from harness.catalogue import CATALOGUE_HASH, Change, Hello, Identify, Key, Trigger, pack, unpack
+from harness.catalogue import CATALOGUE_HASH, LAYOUTS, Change, Hello, Identify, Key, SampleBlock, Trigger, pack, unpack
+from harness.wire import LIBRARY
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 DBC = ESTIMATOR / "catalogue" / "analogrig.dbc"
@@ -28,11 +37,28 @@ def generate() -> ModuleType:
     return module
 
 
-def changed(text: str, old: str, new: str) -> cantools.database.can.Database:
+@pytest.fixture(scope="module")
+def catalogue() -> Database:
+    return changed(DBC.read_text(), "", "")
+
+
+@pytest.fixture(scope="module")
+def codec() -> ctypes.CDLL:
+    """The generated C, as it is in the device of this process."""
+    return ctypes.CDLL(str(LIBRARY))
+
+
+def changed(text: str, old: str, new: str) -> Database:
     assert old in text
     database = cantools.database.load_string(text.replace(old, new), "dbc")
-    assert isinstance(database, cantools.database.can.Database)
+    assert isinstance(database, Database)
     return database
+
+
+def signals(database: Database) -> Iterator[tuple[Message, Signal]]:
+    for message in database.messages:
+        for signal in message.signals:
+            yield message, signal
 
 
 def test_introduction_never_changes_its_bytes() -> None:
@@ -94,11 +120,92 @@ def test_hash_does_not_see_comments(generate: ModuleType) -> None:
         ("SG_ Force : 32|16@1+ (1,0)", "SG_ Force : 32|16@1+ (0.5,0)", "no plain little-endian field"),
         ("SG_ Idle : 12|1@1+ (1,0)", "SG_ Idle : 12|1@1+ (2,0)", "Idle does not lie in one byte as a plain number"),
         ('VAL_ 53 Command 1 "START"', 'VAL_ 53 Command 1 "GO"', "another value table"),
+        ("SG_ Extent : 32|32@1- (1,0) [0|3.4028235E+38]", "SG_ Extent : 32|32@1- (1,0) [0|0]", "Extent has no range"),
+        ("SG_ Samples : 8|4@1+ (1,0) [1|14]", "SG_ Samples : 8|4@1+ (1,0) [1|16]", "Samples cannot be 16"),
+        ("SG_ Change : 8|8@1+ (1,0) [0|4]", "SG_ Change : 8|8@1+ (1,0) [0|3]", "Change cannot be 4"),
     ],
 )
 def test_catalogue_that_breaks_a_rule_is_refused(generate: ModuleType, old: str, new: str, complaint: str) -> None:
     with pytest.raises(generate.CatalogueError, match=complaint):
         generate.check(changed(DBC.read_text(), old, new))
+
+
+def test_every_message_and_field_is_explained(catalogue: Database) -> None:
+    """But for what the comment of the file says of all messages, and the later of numbered fields."""
+    said = {"Seq", "Answers", *(f"{name}{i}" for name in ("Force", "Displacement") for i in range(1, 14))}
+    assert [message.name for message in catalogue.messages if not message.comment] == []
+    assert [
+        f"{message.name}.{signal.name}"
+        for message, signal in signals(catalogue)
+        if not signal.comment and signal.name not in said
+    ] == []
+
+
+def test_every_message_goes_from_one_node_to_the_other(catalogue: Database) -> None:
+    other = {"HARNESS": ["DEVICE"], "DEVICE": ["HARNESS"]}
+    assert [node.name for node in catalogue.nodes] == list(other)
+    assert all(signal.receivers == other[message.senders[0]] for message, signal in signals(catalogue))
+
+
+def test_only_the_block_needs_can_fd(catalogue: Database) -> None:
+    assert {message.name: message.length for message in catalogue.messages if message.is_fd} == {"SampleBlock": 64}
+    assert {message.length for message in catalogue.messages if not message.is_fd} == {8}
+
+
+def test_catalogue_survives_a_tool_that_saves_it(generate: ModuleType, catalogue: Database) -> None:
+    saved = changed(catalogue.as_dbc_string(), "", "")
+    generate.check(saved)
+    assert generate.catalogue_hash(saved) == CATALOGUE_HASH
+
+
+def test_python_codec_reads_what_cantools_writes(catalogue: Database) -> None:
+    """Any payload of any message, field by field."""
+    rng = random.Random(6)  # noqa: S311 - no secret
+    for message in catalogue.messages * 20:
+        values = {signal.name: any_value(signal, rng) for signal in message.signals}
+        payload = message.encode(values, scaling=False, strict=False)
+        ours = unpack(bytes([message.frame_id]) + payload)
+        assert ours is not None
+        assert pack(ours) == bytes([message.frame_id]) + payload
+        fields = dict(zip(LAYOUTS[message.name].fields, flat(ours), strict=True))
+        for shared, (first, n) in LAYOUTS[message.name].bits.items():
+            fields[shared] = fields["flags"] >> first & (2**n - 1)
+        assert {name: fields[camel_to_snake_case(name)] for name in values} == values
+
+
+def any_value(signal: Signal, rng: random.Random) -> float:
+    """One that float32 holds exactly, if it is a float."""
+    return rng.randrange(-(2**24), 2**24) / 2**10 if signal.conversion.is_float else rng.getrandbits(signal.length)
+
+
+def flat(message: tuple[Any, ...]) -> tuple[Any, ...]:
+    return (*message[:-1], *message.codes) if isinstance(message, SampleBlock) else message
+
+
+def test_c_codec_has_every_length_and_sender(codec: ctypes.CDLL, catalogue: Database) -> None:
+    lengths = {message.frame_id: message.length for message in catalogue.messages}
+    of_harness = {message.frame_id for message in catalogue.messages if message.senders == ["HARNESS"]}
+    codec.analogrig_is_from_harness.restype = ctypes.c_bool
+    assert [codec.analogrig_length(i) for i in range(256)] == [lengths.get(i, 0) for i in range(256)]
+    assert {i for i in range(256) if codec.analogrig_is_from_harness(i)} == of_harness
+
+
+def test_c_codec_finds_every_number_out_of_its_range(codec: ctypes.CDLL, catalogue: Database) -> None:
+    for message, signal in signals(catalogue):
+        name = f"analogrig_{camel_to_snake_case(message.name)}_{camel_to_snake_case(signal.name)}_is_in_range"
+        is_in_range = codec[name]
+        is_in_range.restype = ctypes.c_bool
+        assert signal.minimum is not None
+        assert signal.maximum is not None
+        if signal.conversion.is_float:
+            is_in_range.argtypes = [ctypes.c_float]
+            assert not any(map(is_in_range, (math.nan, math.inf, -math.inf))), name
+            assert is_in_range(signal.maximum), name
+        else:
+            is_in_range.argtypes = [ctypes.c_uint32]
+            assert is_in_range(int(signal.minimum)), name
+            assert is_in_range(int(signal.maximum)), name
+            assert signal.maximum == 2**signal.length - 1 or not is_in_range(int(signal.maximum) + 1), name
 
 
 def declarations(struct: str, path: str = "core/est.h") -> set[str]:

@@ -13,7 +13,7 @@ import re
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,19 +26,23 @@ from numpy.typing import NDArray
 
 from emulator.excitation import Excitation
 from harness.bench import Bench
-from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag, unpack
+from harness.can_bus import CanBus
+from harness.can_device import MemoryBus
+from harness.can_link import CanLink
+from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
 from harness.devices import InprocDevice
 from harness.dut import Dut, Replies
 from harness.errors import AnalogrigError
 from harness.estimator_config import EstimatorConfig
-from harness.frame import FrameDecoder
-from harness.link import FramedLink
+from harness.faulty_bus import FaultyBus
+from harness.faulty_wire import FaultyWire
+from harness.link import FramedLink, Link
 from harness.rig import Block, Performance
 from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
 from harness.wire import MemoryWire, Wire
-from harness.wire_faults import DIRECTIONS, KINDS, PASSING, Direction, FaultyWire, WireFault, WireFaults
+from harness.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 
 N = 60
 MOST_N = 480
@@ -58,9 +62,22 @@ STEPS = ("handshake", "configuration", "start", "samples", "stop")
 
 ExchangeKind = Literal["sample", "block", "stream"]
 README = Path(__file__).parents[2] / "harness" / "README.md"
+TABLES = {"serial": "fault of a serial line", "can": "fault of a CAN bus", "can-fd": "fault of a CAN bus"}
+"""How the first column of its table is headed."""
 DOCUMENTED_AS = {"same": "as without", "LOST": "lost", "INCONCLUSIVE": "inconclusive"}
 
 EXCHANGES: tuple[ExchangeKind, ...] = ("sample", "block", "stream")
+
+LinkKind = Literal["serial", "can", "can-fd"]
+FAULTY: Mapping[LinkKind, type[FaultyWire | FaultyBus]] = {"serial": FaultyWire, "can": FaultyBus, "can-fd": FaultyBus}
+WAYS: tuple[tuple[LinkKind, ExchangeKind], ...] = (
+    *(("serial", exchange) for exchange in EXCHANGES),
+    ("can", "sample"),
+    ("can", "stream"),
+    ("can-fd", "block"),
+    ("can-fd", "stream"),
+)
+"""How samples travel; a classic frame carries no block."""
 
 
 def signals() -> NDArray[np.uint16]:
@@ -118,6 +135,7 @@ class Case:
 
     faults: WireFaults
     exchange: ExchangeKind = "sample"
+    link: LinkKind = "serial"
     first_seq: int = 0
     """Of the harness's messages; the device's wrap around several times in any run."""
     samples: int = N
@@ -137,15 +155,17 @@ class Played:
     frames: Mapping[Direction, int] = field(default_factory=dict)
 
 
-def play(case: Case, open_wire: Callable[[], Wire] | None = None, timeout_s: float = TIMEOUT_S) -> Played:
-    """Play it, by default with a device in this process and in virtual time.
+Opened = Callable[[], Wire] | Callable[[], CanBus]
+
+
+def play(case: Case, opened: Opened | None = None, timeout_s: float = TIMEOUT_S) -> Played:
+    """Play it, by default with a device in this process and in virtual time, or with who is on the line ``opened``.
 
     :raises AssertionError: a wrong estimate counts as valid, or it took too long or too much.
     """
-    nonces = itertools.count(1)
-    wire = FaultyWire(open_wire or (lambda: MemoryWire(next(nonces))), case.faults)
-    clock, started_s = wire.clock, wire.clock()
-    link = FramedLink(wire)
+    faulty: Any = FAULTY[case.link]
+    line = faulty(opened or _in_memory(case.link), case.faults)
+    clock, started_s = line.clock, line.clock()
     description = InprocDevice(
         name="bob",
         exchange=case.exchange,
@@ -153,18 +173,34 @@ def play(case: Case, open_wire: Callable[[], Wire] | None = None, timeout_s: flo
         most_lost_n=case.most_lost_n,
         estimator=ESTIMATOR,
     )
+    link = _link(line, case.link)
     played = _play(link, description, case)
     link.close()
-    played.took_s, played.frames = clock() - started_s, wire.frames
+    played.took_s, played.frames = clock() - started_s, line.frames
     assert played.took_s < LONGEST_RUN_S, f"{case}: it took {played.took_s:.1f} s"
-    waiting = len(link._messages) + len(link._decoder._begun) + sum(len(lane.queue) for lane in wire._lanes.values())
-    assert waiting < MOST_WAITING, f"{case}: {waiting} wait"
+    assert line.waiting + _kept(link) < MOST_WAITING, f"{case}: too much waits"
     if played.run is not None and played.outcome in {"as without", "lost"}:
         _check_estimates(played.run, case)
     return played
 
 
-def _play(link: FramedLink, description: InprocDevice, case: Case) -> Played:
+def _in_memory(link: LinkKind) -> Callable[[], Any]:
+    """A device of this process, which has another boot nonce each time."""
+    nonces = itertools.count(1)
+    if link == "serial":
+        return lambda: MemoryWire(next(nonces))
+    return lambda: MemoryBus(next(nonces), is_fd=link == "can-fd")
+
+
+def _link(line: Any, link: LinkKind) -> Link:
+    return FramedLink(line) if link == "serial" else CanLink(line)
+
+
+def _kept(link: Link) -> int:
+    return len(link._messages) + len(link._decoder._begun) if isinstance(link, FramedLink) else 0
+
+
+def _play(link: Link, description: InprocDevice, case: Case) -> Played:
     dut = Dut(link, description)
     dut._talk._seq = case.first_seq
     scenario = Scenario(samples=case.samples, excitation=EXCITATION, name="faults")
@@ -212,39 +248,38 @@ def _check_estimates(run: Run, case: Case) -> None:
 
 
 class _Tap:
-    """A wire that notes what passes."""
+    """A link that notes what passes."""
 
-    def __init__(self, wire: Wire) -> None:
-        self.name, self.clock = wire.name, wire.clock
-        self._wire = wire
-        self.passed: dict[Direction, bytes] = {"to": b"", "from": b""}
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self.passed: dict[Direction, list[Message]] = {"to": [], "from": []}
 
-    def write(self, sent: bytes) -> None:
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._link, name)
+
+    def send(self, messages: Iterable[Message]) -> None:
+        sent = list(messages)
         self.passed["to"] += sent
-        self._wire.write(sent)
+        self._link.send(sent)
 
-    def read(self, timeout_s: float) -> bytes:
-        received = self._wire.read(timeout_s)
-        self.passed["from"] += received
-        return received
-
-    def close(self) -> None:
-        self._wire.close()
+    def receive(self, timeout_s: float) -> Message | None:
+        message = self._link.receive(timeout_s)
+        self.passed["from"] += [] if message is None else [message]
+        return message
 
 
 @functools.cache
-def steps(exchange: ExchangeKind) -> dict[Direction, list[str]]:
+def steps(exchange: ExchangeKind, link: LinkKind = "serial") -> dict[Direction, list[str]]:
     """Of a run without faults, to which of STEPS each frame belongs."""
-    tap = _Tap(MemoryWire(1))
+    tap: Any = _Tap(_link(_in_memory(link)(), link))
     description = InprocDevice(name="bob", exchange=exchange, estimator=ESTIMATOR)
-    played = _play(FramedLink(tap), description, Case(WireFaults(), exchange))
+    played = _play(tap, description, Case(WireFaults(), exchange, link))
     assert played.outcome == "as without"
-    sent = _messages(tap.passed["to"])
     out: dict[Direction, list[str]] = {"to": [], "from": []}
     step = iter(STEPS)
     now = next(step)
     owner: dict[int, str] = {}
-    for message in sent:
+    for message in tap.passed["to"]:
         is_next = {
             "handshake": isinstance(message, Configure),
             "configuration": isinstance(message, Control),
@@ -257,35 +292,33 @@ def steps(exchange: ExchangeKind) -> dict[Direction, list[str]]:
         out["to"].append(now)
         owner[message.seq] = now
     now = STEPS[0]
-    for message in _messages(tap.passed["from"]):
+    for message in tap.passed["from"]:
         answers = getattr(message, "answers", None)
         now = "samples" if answers is None else owner[answers]
         out["from"].append(now)
     return out
 
 
-def _messages(passed: bytes) -> list[Message]:
-    return [message for packet in FrameDecoder().feed(passed) if (message := unpack(packet)) is not None]
-
-
-def everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Iterator[tuple[str, Direction, Case]]:
+def everywhere(
+    link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1
+) -> Iterator[tuple[str, Direction, Case]]:
     """A fault at every frame, or at every so many from each step's first: the step, the direction, the run."""
-    for direction, names in steps(exchange).items():
+    for direction, names in steps(exchange, link).items():
         for step in STEPS:
             numbers = [number for number, name in enumerate(names) if name == step]
             for number in {*numbers[:2], *numbers[::stride], *numbers[-2:]}:
                 fault = WireFault(kind, direction, number)
                 first_seq = 250 if number % 2 else 0  # which wraps around in the handshake
-                yield step, direction, Case(WireFaults((fault,), seed=number), exchange, first_seq)
+                yield step, direction, Case(WireFaults((fault,), seed=number), exchange, link, first_seq)
 
 
 @functools.cache
-def documented() -> dict[tuple[str, Direction], dict[str, set[str]]]:
+def documented(link: LinkKind) -> dict[tuple[str, Direction], dict[str, set[str]]]:
     """The table of harness/README.md: by kind and direction, for each of STEPS, what may come of it."""
     table: dict[tuple[str, Direction], dict[str, set[str]]] = {}
-    for kinds, way, cells in re.findall(
-        r"^\| (`[a-z`, -]+`) (to|from|both) \|(.*)\|$", README.read_text(), re.MULTILINE
-    ):
+    heading = TABLES[link]
+    text = README.read_text().partition(f"\n| {heading} |")[2].partition("\n\n")[0]
+    for kinds, way, cells in re.findall(r"^\| (`[a-z`, -]+`) (to|from|both) \|(.*)\|$", text, re.MULTILINE):
         outcomes = [{DOCUMENTED_AS.get(word, word) for word in re.findall(r"\w+", cell)} for cell in cells.split("|")]
         for kind in re.findall(r"[a-z-]+", kinds):
             for direction in DIRECTIONS:
@@ -294,15 +327,17 @@ def documented() -> dict[tuple[str, Direction], dict[str, set[str]]]:
     return table
 
 
-def outcomes_everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> Counter[str]:
+def outcomes_everywhere(link: LinkKind, kind: str, exchange: ExchangeKind, stride: int = 1) -> Counter[str]:
     """Play a fault everywhere; how often each outcome came.
 
     :raises AssertionError: one is not documented, or ``play`` did.
     """
     counted: Counter[str] = Counter()
-    for step, direction, case in everywhere(kind, exchange, stride):
+    for step, direction, case in everywhere(link, kind, exchange, stride):
         played = play(case)
-        assert played.outcome in documented()[kind, direction][step], f"{step}: {case}: {played.outcome}: {played.why}"
+        assert played.outcome in documented(link)[kind, direction][step], (
+            f"{step}: {case}: {played.outcome}: {played.why}"
+        )
         counted[played.outcome] += 1
     return counted
 
@@ -310,27 +345,28 @@ def outcomes_everywhere(kind: str, exchange: ExchangeKind, stride: int = 1) -> C
 # ---- by chance
 
 
-def by_chance(seed: int) -> Case:
+def by_chance(seed: int, links: Collection[LinkKind] = FAULTY) -> Case:
     """One to four faults anywhere, or a line that is bad all the time."""
     rng = Random(seed)
-    exchange: ExchangeKind = rng.choice(EXCHANGES)
-    frames = {direction: len(names) for direction, names in steps(exchange).items()}
+    link, exchange = rng.choice([way for way in WAYS if way[0] in links])
+    kinds, passing = tuple(FAULTY[link].HAPPENS), tuple(FAULTY[link].PASSES)
+    owners = steps(exchange, link)
     in_samples = {
-        direction: [i for i, name in enumerate(names) if name == "samples"]
-        for direction, names in steps(exchange).items()
+        direction: [i for i, name in enumerate(names) if name == "samples"] for direction, names in owners.items()
     }
     at: list[WireFault] = []
     rates: dict[str, float] = {}
     if rng.random() < 0.8:
         for _ in range(rng.choice((1, 1, 2, 3, 4))):
             direction = rng.choice(DIRECTIONS)
-            kind = rng.choice(KINDS if rng.random() < 0.3 else PASSING)
-            number = rng.choice(in_samples[direction]) if rng.random() < 0.7 else rng.randrange(frames[direction])
+            kind = rng.choice(kinds if rng.random() < 0.3 else passing)
+            anywhere = rng.randrange(len(owners[direction]))
+            number = rng.choice(in_samples[direction]) if rng.random() < 0.7 else anywhere
             at.append(WireFault(kind, direction, number))
     else:
-        rates = {rng.choice(PASSING): 10 ** rng.uniform(-4.0, -2.0) for _ in range(rng.randint(1, 3))}
+        rates = {rng.choice(passing): 10 ** rng.uniform(-4.0, -2.0) for _ in range(rng.randint(1, 3))}
     first_seq = rng.choice((0, 250, rng.randrange(256)))
-    return Case(WireFaults(tuple(at), rates, seed), exchange, first_seq, most_lost_n=rng.choice((0, 3, N)))
+    return Case(WireFaults(tuple(at), rates, seed), exchange, link, first_seq, most_lost_n=rng.choice((0, 3, N)))
 
 
 def outcomes_by_chance(seeds: range) -> Counter[str]:
@@ -344,7 +380,7 @@ def main() -> int:
     started_s = time.monotonic()
     total: Counter[str] = Counter()
     chunks = [range(start, min(start + 500, first + n)) for start in range(first, first + n, 500)]
-    each = list(itertools.product(KINDS, EXCHANGES))
+    each = [(link, kind, exchange) for link, exchange in WAYS for kind in FAULTY[link].HAPPENS]
     with ProcessPoolExecutor(2) as pool:
         for counted in pool.map(outcomes_everywhere, *zip(*each, strict=True)):
             total += counted

@@ -6,9 +6,9 @@ import dataclasses
 import itertools
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ from harness.errors import (
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.link import FramedLink, Link
+from harness.link import CanListener, FramedLink, Link
 from harness.run import LOST
 from harness.wire import MemoryWire, VirtualClock
 from tests.harness.processes import children
@@ -226,7 +226,7 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ('kind = "hots"', "'qemu-m7', 'serial', not 'hots'"),
+        ('kind = "hots"', "'serial', 'can', not 'hots'"),
         ('kind = "serial"', "the key 'url' is lacking"),
         ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, exchange, "),
         ("timeout_s = 1.0", "kind: must be one of 'host', 'inproc', "),
@@ -285,8 +285,12 @@ class FaultyLink:
     """Passes messages through two functions, each of which may lose, change or repeat them."""
 
     name = "faulty"
-    dropped = 0
+    counters: ClassVar[Mapping[str, int]] = {"frames_dropped": 0}
+    trouble = ""
+    line = None
     line_s = 0.0
+    carries_blocks = True
+    unread_n = None
 
     def __init__(self) -> None:
         self.clock = VirtualClock()
@@ -300,6 +304,9 @@ class FaultyLink:
 
     def reboot(self) -> None:
         self.inner = FramedLink(MemoryWire(boot_nonce=2, clock=self.clock))
+
+    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - no CAN frames
+        return False
 
     def send(self, messages: Iterable[Message]) -> None:
         self.inner.send([passed for message in messages for passed in self.to_device(message)])

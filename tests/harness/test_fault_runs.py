@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from harness.devices import describe
-from harness.wire_faults import DIRECTIONS, KINDS, Direction, WireFault, WireFaults
+from harness.faulty_wire import FaultyWire
+from harness.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from tests.harness.fault_runs import (
     BACK_AT,
-    EXCHANGES,
+    FAULTY,
     MOST_N,
+    WAYS,
     Case,
     ExchangeKind,
+    LinkKind,
     documented,
     outcomes_by_chance,
     outcomes_everywhere,
@@ -23,13 +28,14 @@ from tests.harness.firmware import needs_firmware
 
 
 def test_every_fault_is_documented() -> None:
-    assert {*documented()} == {(kind, direction) for kind in KINDS for direction in DIRECTIONS}
+    for link, faulty in FAULTY.items():
+        assert {*documented(link)} == {(kind, direction) for kind in faulty.HAPPENS for direction in DIRECTIONS}
 
 
-@pytest.mark.parametrize("exchange", EXCHANGES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_fault_at_every_step_leads_to_what_is_documented(kind: str, exchange: ExchangeKind) -> None:
-    assert outcomes_everywhere(kind, exchange, stride=12).total() > 20
+@pytest.mark.parametrize(("link", "exchange"), WAYS)
+def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
+    for kind in FAULTY[link].HAPPENS:
+        assert outcomes_everywhere(link, kind, exchange, stride=12).total() > 20
 
 
 @pytest.mark.parametrize("first", range(0, 3000, 500))
@@ -67,7 +73,7 @@ PLACES: tuple[tuple[Direction, str, int], ...] = (("to", "handshake", 0), ("to",
 """Direction, step, and which of the frames of that step."""
 SOME = ("flip", "drop", "duplicate", "disconnect", "hang", "wrong-baud", "reset")
 REAL = [
-    *(("host", kind) for kind in KINDS if kind != "delay"),
+    *(("host", kind) for kind in FaultyWire.HAPPENS if kind != "delay"),
     *(pytest.param("qemu-m4", kind, marks=needs_firmware) for kind in SOME),
 ]
 
@@ -77,5 +83,6 @@ REAL = [
 def test_fault_leads_to_the_same_over_a_real_line(device: str, kind: str, place: tuple[Direction, str, int]) -> None:
     direction, step, nth = place
     number = steps("sample")[direction].index(step) + nth
-    played = play(Case(WireFaults((WireFault(kind, direction, number),))), describe(device).wire, timeout_s=1.0)
-    assert played.outcome in documented()[kind, direction][step], played.why
+    opened: Any = describe(device)
+    played = play(Case(WireFaults((WireFault(kind, direction, number),))), opened.wire, timeout_s=1.0)
+    assert played.outcome in documented("serial")[kind, direction][step], played.why

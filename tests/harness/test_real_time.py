@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from harness.bench import Bench
-from harness.catalogue import BLOCK_SAMPLES
+from harness.catalogue import BLOCK_SAMPLES, Sample
 from harness.devices import DeviceDescription, HostDevice, InprocDevice
 from harness.dut import Dut, connect
 from harness.errors import ConfigurationError
+from harness.line import SerialLine
 from harness.link import FramedLink
 from harness.rig import open_rig
 from harness.run import UNREPORTED, Run
 from harness.scenario import Scenario
-from harness.timed_wire import TimedWire
 from harness.verdict import judge
 from harness.wire import MemoryWire, VirtualClock
 
@@ -119,8 +119,8 @@ def test_real_time_that_does_not_fit_the_line_is_refused_with_the_arithmetic() -
     with pytest.raises(ConfigurationError) as caught:
         play(InprocDevice(name="bob", exchange="stream", baud=921_600), 1.0)
     assert str(caught.value) == (
-        "device bob: real time does not fit its line: 20000 samples/s of 5.143 bytes to the device and 128 bytes back"
-        " (7 estimates every 1 samples) are 25600000 bit/s, the line has 921600 baud; 27.8 times slower would fit"
+        "device bob: real time does not fit its line: 20000 samples/s, each of 55.8 us to the device and 1389 us back"
+        " (7 estimates every 1 samples), are 27.78 times what 921600 baud carry; 27.8 times slower would fit"
     )
 
 
@@ -153,7 +153,7 @@ def test_what_fits_is_played(exchange: str, baud: int, factor: float, report_int
 
 
 class Echo:
-    """Answers with half of what it is told, in two pieces."""
+    """Answers with half of what it is told, in two pieces: 16 bytes of a Sample, then 8."""
 
     name = "echo"
     clock = staticmethod(VirtualClock())
@@ -173,11 +173,11 @@ class Echo:
 
 
 def test_every_byte_takes_ten_bits_one_direction_after_the_other() -> None:
-    wire = TimedWire(Echo(), 1000)
+    link = FramedLink(Echo(), SerialLine(1000))
     for exchanges in (1, 2, 3):
-        wire.write(bytes(20))
-        assert wire.read(0.0) + wire.read(0.0) + wire.read(0.0) == bytes(10)
-        assert wire.line_s == pytest.approx(0.3 * exchanges)
+        link.send([Sample(exchanges, 0, 0, 1000, 2000)])
+        assert link.receive(0.0) is None and link.receive(0.0) is None
+        assert link.line_s == pytest.approx(0.24 * exchanges)
 
 
 def test_time_of_the_line_is_the_same_every_time_and_for_every_device() -> None:

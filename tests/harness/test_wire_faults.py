@@ -12,8 +12,9 @@ from harness import frame
 from harness.catalogue import Sample, pack
 from harness.devices import describe
 from harness.errors import ConfigurationError, LinkClosed
+from harness.faulty_wire import FaultyWire
 from harness.wire import VirtualClock
-from harness.wire_faults import FaultyWire, WireFault, WireFaults
+from harness.wire_faults import WireFault, WireFaults
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 
@@ -43,7 +44,7 @@ class Line:
 
 def faulty(text: str) -> tuple[Line, FaultyWire]:
     line = Line()
-    return line, FaultyWire(lambda: line, WireFaults.parse(text))
+    return line, FaultyWire(lambda: line, WireFaults.parse(text, FaultyWire.HAPPENS))
 
 
 def sent_through(text: str) -> bytes:
@@ -126,7 +127,7 @@ def test_babble_has_no_end_but_takes_time() -> None:
 def test_reset_opens_the_device_again_and_forgets_what_it_was_saying() -> None:
     old, new = Line(), Line()
     boots = iter((old, new))
-    wire = FaultyWire(lambda: next(boots), WireFaults.parse("reset@from:1"))
+    wire = FaultyWire(lambda: next(boots), WireFaults.parse("reset@from:1", FaultyWire.HAPPENS))
     old.said.append(b"".join(FRAMES[:5]))
     new.said.append(FRAMES[7])
     assert wire.read(0.0) == b""
@@ -154,7 +155,7 @@ def test_faults_of_one_direction_are_the_same_whenever_the_other_speaks() -> Non
 
 
 def test_faults_are_words_between_commas() -> None:
-    assert WireFaults.parse(" flip@to:81, wrong-baud@from:0,drop@1e-3,seed=7 ") == WireFaults(
+    assert WireFaults.parse(" flip@to:81, wrong-baud@from:0,drop@1e-3,seed=7 ", FaultyWire.HAPPENS) == WireFaults(
         (WireFault("flip", "to", 81), WireFault("wrong-baud", "from", 0)), {"drop": 0.001}, 7
     )
 
@@ -164,13 +165,13 @@ def test_faults_are_words_between_commas() -> None:
 )
 def test_wrong_word_is_named(text: str) -> None:
     with pytest.raises(ConfigurationError, match=re.escape(f"'{text}'")):
-        WireFaults.parse(text)
+        WireFaults.parse(text, FaultyWire.HAPPENS)
 
 
 @pytest.mark.parametrize("text", ["drop@to:3,flip@to:3", "flip@0.1,flip@0.2"])
 def test_fault_that_would_hide_another_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"^wire faults: {re.escape(repr(text.split(',')[1]))}: .* already$"):
-        WireFaults.parse(text)
+        WireFaults.parse(text, FaultyWire.HAPPENS)
 
 
 def test_device_file_may_ask_for_faults(tmp_path: Path) -> None:

@@ -1,0 +1,228 @@
+"""CAN buses: what carries frames to a device and back, as they are, and nothing else; opened by python-can.
+
+python-can's exceptions end here: what they mean is one line that names the bus, the cause and the cure.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
+
+import can
+
+from harness.child import Child
+from harness.errors import ConfigurationError, LinkClosed, LinkError
+from harness.line import CanLine
+from harness.wire import WRITE_TIMEOUT_S, Clock
+
+RECEIVED_AHEAD_N = 200
+"""So many frames the system keeps for us at least: half of what a socket's buffer of 208 kB holds."""
+
+_FULL_QUEUE_S = 1e-3
+"""Linux says that the queue of a controller is full (ENOBUFS), and not when it is no longer."""
+
+_MEANING = {
+    errno.EAFNOSUPPORT: "this kernel has no CAN (no address family AF_CAN); try `modprobe can can-raw`, or can:virtual",
+    errno.ENODEV: "there is no such interface; `ip -details link show type can` lists those that there are",
+    errno.ENETDOWN: "the interface is down: ip link set CHANNEL up type can bitrate N",
+    errno.EINVAL: "the interface is no CAN interface, or refuses what it is asked",
+}
+"""Of what Linux says."""
+
+logging.getLogger("can").addHandler(logging.NullHandler())  # what it has to say is in the exceptions, too
+
+
+class CanBus(Protocol):
+    """A bus on which one device is, and perhaps others."""
+
+    @property
+    def name(self) -> str:
+        """What it is, for errors and records."""
+
+    @property
+    def clock(self) -> Clock:
+        """The time in which its time-outs are meant."""
+
+    @property
+    def is_fd(self) -> bool:
+        """Whether frames of CAN FD may be sent."""
+
+    @property
+    def line(self) -> CanLine | None:
+        """Its bit rates, if they are known."""
+
+    @property
+    def unread_n(self) -> int | None:
+        """So many frames may come before one of them is read; None: as many as like to."""
+
+    @property
+    def damaged(self) -> int:
+        """How often something came that was no frame."""
+
+    def send(self, frame: can.Message) -> None:
+        """Send one frame; waits while the controller has no room for it.
+
+        :raises LinkError: it cannot be sent.
+        :raises LinkClosed: the bus is gone.
+        """
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        """The next frame, of whatever kind and whoever sent it; None if none comes in time, or nearly so.
+
+        :raises LinkClosed: the bus is gone.
+        """
+
+    def close(self) -> None:
+        """Let go of the bus. May be called twice."""
+
+
+class PythonCanBus:
+    """Any bus that python-can can open."""
+
+    unread_n = RECEIVED_AHEAD_N
+
+    def __init__(self, asked: Mapping[str, Any], *, name: str | None = None) -> None:
+        """Open what ``asked`` says in the words of ``can.Bus``; python-can's own configuration says the rest.
+
+        :raises ConfigurationError: there is no such kind of interface, or it cannot be as it is asked to be.
+        :raises LinkError: it cannot be opened.
+        """
+        config = _complete(asked)
+        self.name = f"{config['interface']}/{config['channel']}" if name is None else name
+        self.clock: Clock = time.monotonic
+        self.is_fd = bool(config.get("fd"))
+        bitrate, data_bitrate = config.get("bitrate"), config.get("data_bitrate")
+        self.line = CanLine(bitrate, data_bitrate) if isinstance(bitrate, int) else None
+        self.damaged = 0
+        self._bus = _opened(config, self.name)
+
+    def send(self, frame: can.Message) -> None:
+        deadline_s = self.clock() + WRITE_TIMEOUT_S
+        while not self._take(frame, deadline_s):
+            time.sleep(_FULL_QUEUE_S)
+
+    def _take(self, frame: can.Message, deadline_s: float) -> bool:
+        """Whether the controller had room for it."""
+        try:
+            self._bus.send(frame, max(0.0, deadline_s - self.clock()))
+        except Exception as error:  # the interfaces raise whatever their drivers make them
+            number = _errno(error)
+            if number == errno.ENOBUFS and self.clock() < deadline_s:
+                return False
+            raise self._failed(error, number) from error
+        return True
+
+    def _failed(self, error: Exception, number: int | None) -> LinkError:
+        if number == errno.ENOBUFS or isinstance(error, can.CanTimeoutError) or "buffer full" in str(error):
+            return LinkError(
+                f"{self.name}: nothing can be sent, the controller's queue has been full for {WRITE_TIMEOUT_S:g} s:"
+                " nobody acknowledges (wrong bit rate, nobody else on the bus, no termination), or it is bus-off"
+            )
+        kind = LinkError if number is None else LinkClosed
+        return kind(f"{self.name}: {_reason(error, number)}")
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        try:
+            return self._bus.recv(timeout_s)
+        except Exception as error:  # as above; what is no system's error is a frame that makes no sense
+            number = _errno(error)
+            if number is not None:
+                raise LinkClosed(f"{self.name}: {_reason(error, number)}") from error
+            self.damaged += 1
+            return None
+
+    def close(self) -> None:
+        with contextlib.suppress(Exception):  # of a bus that is gone
+            self._bus.shutdown()
+
+
+def _complete(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """With what python-can's files and environment say."""
+    try:
+        return dict(can.util.load_config(config=dict(asked)))
+    except can.CanInterfaceNotImplementedError as error:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        interface = asked.get("interface")
+        if interface is None:
+            raise ConfigurationError(
+                "can: say which interface: can:virtual, can:socketcan/can0, ..., or name it in python-can's own"
+                f" configuration (CAN_INTERFACE, ~/can.conf): {error}; python-can knows {known}"
+            ) from error
+        raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
+    except Exception as error:  # of a configuration file, whatever is wrong with it
+        raise ConfigurationError(f"can: python-can's configuration: {_reason(error, _errno(error))}") from error
+
+
+def _opened(config: Mapping[str, Any], name: str) -> can.BusABC:
+    try:
+        return can.Bus(**config, ignore_config=True)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"can:{name}: {_reason(error, None)}") from error
+    except can.CanInterfaceNotImplementedError as error:
+        raise LinkError(f"cannot open can:{name}: {_reason(error, None)}; is its driver installed?") from error
+    except Exception as error:  # the interfaces raise whatever their drivers make them
+        raise LinkError(f"cannot open can:{name}: {_reason(error, _errno(error))}") from error
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _errno(error: Exception) -> int | None:
+    """What the system has said, if it was the system."""
+    for each in _causes(error):
+        if isinstance(each, can.CanError) and isinstance(each.error_code, int):
+            return each.error_code
+        if isinstance(each, OSError) and not isinstance(each, can.CanError):
+            return each.errno or 0
+    return None
+
+
+def _reason(error: Exception, number: int | None) -> str:
+    """In one line."""
+    if number in _MEANING:
+        return _MEANING[number]
+    if number is not None and number > 0:
+        return os.strerror(number)
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class ChildBus:
+    """A bus with a device that is a child: it ends with the bus, and its death is told for what it is."""
+
+    def __init__(self, child: Child, bus: CanBus) -> None:
+        """Take over both."""
+        self.child = child
+        self.name, self.clock, self.is_fd = bus.name, bus.clock, bus.is_fd
+        self.line, self.unread_n = bus.line, bus.unread_n
+        self._bus = bus
+
+    @property
+    def damaged(self) -> int:
+        return self._bus.damaged
+
+    def send(self, frame: can.Message) -> None:
+        try:
+            self._bus.send(frame)
+        except LinkClosed as error:
+            raise LinkClosed(self.child.obituary()) from error
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        try:
+            frame = self._bus.receive(timeout_s)
+        except LinkClosed as error:
+            raise LinkClosed(self.child.obituary()) from error
+        if frame is None and self.child.has_ended:
+            raise LinkClosed(self.child.obituary())
+        return frame
+
+    def close(self) -> None:
+        self._bus.close()
+        self.child.end()
