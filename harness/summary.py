@@ -35,10 +35,17 @@ def summary(run: Run, verdict: Verdict) -> str:
         lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
     if verdict.overloads:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
+    if seen := line_text(conditions.link_counters):
+        lines += [f"  on the line: {seen}"]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
     return "\n".join(lines)
+
+
+def line_text(link_counters: Mapping[str, int]) -> str:
+    """What was on the line besides the device's messages: ``12 frames foreign, 1 error frames``."""
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in link_counters.items() if n)
 
 
 def lamps_text(overloads: Mapping[str, int]) -> str:

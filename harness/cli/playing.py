@@ -72,6 +72,7 @@ def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
         "dut": dict(conditions.dut),
         "link": conditions.link,
         "line_s": conditions.line_s,
+        "link_counters": dict(conditions.link_counters),
         "real_time": conditions.real_time,
         "seed": conditions.seed,
         "samples": run.samples,

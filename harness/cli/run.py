@@ -6,7 +6,7 @@ import argparse
 import os
 from typing import Any
 
-from harness.cli.options import add_dut, add_output, add_what_to_play, changes_of_dut, what_to_play
+from harness.cli.options import add_dut, add_output, add_what_to_play, changes_of_dut, opened
 from harness.cli.playing import play, prepare
 
 
@@ -20,10 +20,8 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from harness.dut import open_dut
-    from harness.rig import open_rig
 
-    with open_rig(arguments.rig) as rig:
-        scenario, seed = what_to_play(rig, arguments)
+    with opened(arguments) as (rig, scenario, seed):
         prepare(arguments.out, rig)
         with open_dut(arguments.dut, **changes_of_dut(arguments)) as dut:
             return play(rig, dut, scenario, seed, arguments)

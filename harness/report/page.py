@@ -34,10 +34,10 @@ def render(run: Run, verdict: Verdict) -> str:
 
     :raises RecordingError: the build has not put uPlot in its place.
     """
-    styles = [_part(name) for name in _STYLES]
-    scripts = [_part(name) for name in _SCRIPTS]
-    return Template(_part("page.html")).substitute(
-        policy=_policy(styles, scripts),
+    styles = [part(name) for name in _STYLES]
+    scripts = [part(name) for name in _SCRIPTS]
+    return Template(part("page.html")).substitute(
+        policy=policy(styles, scripts),
         styles="\n".join(f"<style>{style}</style>" for style in styles),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         data=as_script(payload(run, verdict)),
@@ -53,7 +53,7 @@ def render(run: Run, verdict: Verdict) -> str:
     )
 
 
-def _policy(styles: list[str], scripts: list[str]) -> str:
+def policy(styles: list[str], scripts: list[str]) -> str:
     """A content security policy under which nothing is loaded and only these very styles and scripts work."""
     return f"default-src 'none'; style-src {_hashes(styles)}; script-src {_hashes(scripts)}"
 
@@ -63,7 +63,11 @@ def _hashes(sources: list[str]) -> str:
     return " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
 
 
-def _part(name: str) -> str:
+def part(name: str) -> str:
+    """A file beside this one.
+
+    :raises RecordingError: it is not there.
+    """
     path = _FOLDER / name
     try:
         return path.read_text(encoding="utf-8")
