@@ -151,7 +151,7 @@ class EstimatorConfig:
         """
         said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
         table: dict[str, Any] = {}
-        kinds = {each.name: type(each.default) for each in dataclasses.fields(cls)}
+        kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
         for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
             if Key[name.upper()] in said:
                 kind = kinds[name] if kinds[name] in (int, bool) else float
