@@ -16,7 +16,7 @@ import pytest
 
 from harness.bench import Bench
 from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
-from harness.catalogue import LAYOUTS, Hello, pack
+from harness.catalogue import LAYOUTS, Hello, Key, pack
 from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
@@ -176,6 +176,11 @@ def test_settings_give_the_estimator_back() -> None:
         ),
     ):
         assert EstimatorConfig.from_settings(dict(estimator.settings()), "here") == estimator
+
+
+def test_setting_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="here: na = nan is no setting of an estimator"):
+        EstimatorConfig.from_settings({Key.NA: float("nan")}, "here")
 
 
 def test_foreign_frames_and_times_of_others_change_nothing(
