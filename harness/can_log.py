@@ -169,17 +169,24 @@ class CapturedFrames:
         """The others, which cannot be read on after a fault."""
         import can
 
+        readers: Mapping[str, Any] = {
+            "blf": can.BLFReader,
+            "asc": can.ASCReader,
+            "mf4": can.MF4Reader,
+            "trc": can.TRCReader,
+        }
+        suffix = self.path.suffix[1:].lower()
         n = 0
-        try:
-            with can.LogReader(self.path) as reader:
-                for frame in reader:
+        # Opened here, since readers that fail leave the file open.
+        with self.path.open("rb") as raw:
+            file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
+            try:
+                for frame in readers[suffix](file):
                     yield frame
                     n += 1
-        except GeneratorExit:
-            raise
-        except Exception as error:  # noqa: BLE001 - as above
-            said = " ".join(str(error).split()) or type(error).__name__
-            self.end = f"{self.path} is damaged after {n} frames: {said}"
+            except Exception as error:  # noqa: BLE001 - as above
+                said = " ".join(str(error).split()) or type(error).__name__
+                self.end = f"{self.path} is damaged after {n} frames: {said}"
 
 
 class Dictionary:

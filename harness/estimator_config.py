@@ -12,6 +12,7 @@ import numpy as np
 
 from harness import config
 from harness.catalogue import Key, Trigger
+from harness.errors import ConfigurationError
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
 ResetName = Literal["covariance", "all"]
@@ -150,8 +151,11 @@ class EstimatorConfig:
         :raises ConfigurationError: no device can have that; ``where`` leads.
         """
         said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
+        for key, value in said.items():
+            if not math.isfinite(value):
+                raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
         table: dict[str, Any] = {}
-        kinds: dict[str, type[Any]] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
+        kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
         for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
             if Key[name.upper()] in said:
                 kind = kinds[name] if kinds[name] in (int, bool) else float

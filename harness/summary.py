@@ -62,10 +62,9 @@ def load_text(load: BusLoad) -> str:
     """What the exchange asks of its CAN bus."""
     faster = "" if load.data_bitrate is None else f", data {load.data_bitrate} bit/s"
     late = "" if load.latency_s is None else f", answers within {load.latency_s * 1e3:.3g} ms"
-    return (
-        f"{load.bitrate} bit/s{faster}: {load.utilisation:.1%} of it in real time{late};"
-        f" at most {load.most_samples_per_s:.5g} samples/s"
-    )
+    fits = load.utilisation <= 1.0
+    used = f"{load.utilisation:.1%} of it" if fits else f"{load.utilisation:.3g} times what it carries,"
+    return f"{load.bitrate} bit/s{faster}: {used} in real time{late}; at most {load.most_samples_per_s:.5g} samples/s"
 
 
 def _false_alarms(verdict: Verdict) -> str:
