@@ -31,6 +31,7 @@ _ENVIRONMENT = {
 }
 _PYTEST = (
     *(sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider"),
+    *("-W", "ignore:unclosed <socket:ResourceWarning"),  # python-can's, when there is no such interface
     *("--color=no", "--verbose", "--durations=10", f"--junitxml={guest.RESULTS / REPORT}", HERE / "suite"),
 )
 

@@ -11,7 +11,7 @@ from typing import Any
 import can
 
 VIRTUAL = "vcan0"
-CONTROLLERS = ("can0", "can1")
+CONTROLLERS = ("can0", "can1", "can2")
 """On one bus. Classic: an SJA1000 knows no CAN FD."""
 
 
