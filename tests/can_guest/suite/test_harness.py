@@ -17,8 +17,8 @@ from harness.rig import open_rig
 from harness.run import Run
 from harness.scenario import Scenario
 
-from .interfaces import CONTROLLERS, VIRTUAL, down, queue, socketcan
-from .test_port import FOREIGN, device
+from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
+from .test_port import FOREIGN
 
 SAMPLES = 120
 AT = 60
