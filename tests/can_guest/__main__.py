@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
@@ -31,6 +33,7 @@ _ENVIRONMENT = {
 }
 _PYTEST = (
     *(sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider"),
+    *("-W", "ignore:unclosed <socket:ResourceWarning"),  # python-can's, when there is no such interface
     *("--color=no", "--verbose", "--durations=10", f"--junitxml={guest.RESULTS / REPORT}", HERE / "suite"),
 )
 
@@ -50,6 +53,25 @@ def run_suite(results: Path, arguments: Sequence[str] = (), console: IO[bytes] |
         time_limit_s=TIME_LIMIT_S,
         console=console,
     )
+
+
+def throughput_in_guest() -> dict[str, float]:
+    """Samples per second over SocketCAN; emulated, so slower than any real machine; none where there is no guest."""
+    if guest.lacking() is not None:
+        return {}
+    report = "throughput.json"
+    with tempfile.TemporaryDirectory() as results, (Path(results) / "console").open("w+b") as console:
+        status = guest.run(
+            [sys.executable, "-m", "tests.can_guest.throughput", guest.RESULTS / report],
+            Path(results),
+            folder=ROOT,
+            environment=_ENVIRONMENT,
+            time_limit_s=TIME_LIMIT_S,
+            console=console,
+        )
+        if status != 0:
+            raise guest.GuestError(Path(console.name).read_text(errors="replace"))
+        return dict(json.loads((Path(results) / report).read_text()))
 
 
 def main(arguments: Sequence[str]) -> int:
