@@ -2,8 +2,8 @@
 
 python -m tests.benchmarks trials
 
-Rates are by CPU time, which neighbours on the machine spoil less than time on the wall; of the certificate both are given,
-its start included.
+Rates are by CPU time, which neighbours on the machine spoil less than time on the wall; of the certificate both are
+given, its start included.
 """
 
 from __future__ import annotations
