@@ -405,6 +405,23 @@ def test_device_that_cannot_be_had_is_inconclusive_and_what_is_done_is_kept(
     assert complaint.count("\n") == 1
 
 
+def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path, "trials = 1\nsamples = 600\ndevices = ['host']\n")
+    out = tmp_path / "out.json"
+
+    def interrupted(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("harness.dut.Dut.play", interrupted)
+        assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
+    assert "interrupted: what is done is kept in" in capsys.readouterr().err
+    assert journal_of(out).read_bytes().count(b"\n") == 1
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 0
+
+
 def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     planned(tmp_path, "devices = ['serial:/dev/absent']\n")
     assert main(["campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "out.json")]) == 2
