@@ -62,9 +62,9 @@ def test_c_stays_as_it_is_where_the_last_edge_is_long_past(estimator: Estimator)
     """A forgetting of 0.99 remembers 100 samples; after twice that A comes from noise, and would lead C anywhere."""
     u, y = suspension([(0, FRONT)], np.arange(10.0, 400.0, 50.0), 1400, 1.0, 3)
     assert estimator.init(kind=NONE)
-    before = estimator.run(u[:600], y[:600]).counters["refreshes"]
+    before = estimator.run(u[:700], y[:700]).counters["refreshes"]
     assert before > 0
-    assert estimator.run(u[600:], y[600:]).counters["refreshes"] == before
+    assert estimator.run(u[700:], y[700:]).counters["refreshes"] == before
 
 
 def test_displacement_may_rest_while_the_force_does(estimator: Estimator) -> None:
