@@ -205,7 +205,7 @@
     const place = document.querySelector("[data-figure]");
     new ResizeObserver(() => {
       const width = place.clientWidth;
-      if (isPrinting() || plots[0].width === width) return;
+      if (!width || isPrinting() || plots[0].width === width) return;
       for (const plot of plots) plot.setSize({ width, height: HEIGHT_PX });
     }).observe(place);
   }
