@@ -41,7 +41,7 @@ export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults \
-        wheel lock clean distclean
+        can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 help: ## show this list
@@ -70,6 +70,9 @@ format: $(PRODUCTS) ## lay out the Python sources
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+can-guest: $(PRODUCTS) $(BUILD)/can_guest/linux ## CAN on real SocketCAN, in a Linux that QEMU emulates; ARGS="-k fd" goes to its pytest
+	@$(BIN)/python -m tests.can_guest $(ARGS)
 
 firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F and M7, into build/firmware; needs gcc-arm-none-eabi
 	@arm-none-eabi-size $(FIRMWARE)
@@ -119,6 +122,10 @@ clean: ## remove what was built, but not the environment
 
 distclean: clean ## remove the environment too
 	@if test -e $(VENV)/.made-by-make; then rm -rf $(VENV); fi
+
+# Debian's kernel for the guest: 70 MB are downloaded, and nothing is installed.
+$(BUILD)/can_guest/linux: tests/can_guest/linux.py
+	@$(PYTHON) -m tests.can_guest.linux
 
 # The environment, in two steps. Each ends with its stamp, so that one which was interrupted is made again from nothing.
 

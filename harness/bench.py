@@ -136,7 +136,8 @@ class Bench:
             late = f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"
             conditions = dataclasses.replace(conditions, faults=(*conditions.faults, late))
         lit = {amplifier: sample for amplifier, sample in performance.lamps().items() if sample < collected.samples}
-        return collected.run(dataclasses.replace(conditions, overloads=lit), self.dut.parameters)
+        conditions = dataclasses.replace(conditions, overloads=lit, link_counters=self.dut.link_counters)
+        return collected.run(conditions, self.dut.parameters)
 
     def _paced(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
         """The pace of the samples, and what to send."""

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 import can
+from can.interfaces.slcan import slcanBus
 
 from harness.child import Child
 from harness.errors import ConfigurationError, LinkClosed, LinkError
@@ -26,13 +27,13 @@ RECEIVED_AHEAD_N = 200
 _FULL_QUEUE_S = 1e-3
 """Linux says that the queue of a controller is full (ENOBUFS), and not when it is no longer."""
 
-_MEANING = {
+_SOCKETCAN = {
     errno.EAFNOSUPPORT: "this kernel has no CAN (no address family AF_CAN); try `modprobe can can-raw`, or can:virtual",
     errno.ENODEV: "there is no such interface; `ip -details link show type can` lists those that there are",
     errno.ENETDOWN: "the interface is down: ip link set CHANNEL up type can bitrate N",
     errno.EINVAL: "the interface is no CAN interface, or refuses what it is asked",
 }
-"""Of what Linux says."""
+"""What Linux means."""
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # what it has to say is in the exceptions, too
 
@@ -93,13 +94,35 @@ class PythonCanBus:
         :raises LinkError: it cannot be opened.
         """
         config = _complete(asked)
-        self.name = f"{config['interface']}/{config['channel']}" if name is None else name
+        interface, self.channel = str(config["interface"]), config["channel"]
+        where = interface if self.channel is None else f"{interface}/{self.channel}"
+        self.name = where if name is None else name
+        self._meaning = _SOCKETCAN if interface == "socketcan" else {}
         self.clock: Clock = time.monotonic
         self.is_fd = bool(config.get("fd"))
         bitrate, data_bitrate = config.get("bitrate"), config.get("data_bitrate")
         self.line = CanLine(bitrate, data_bitrate) if isinstance(bitrate, int) else None
         self.damaged = 0
-        self._bus = _opened(config, self.name)
+        self._bus = self._open(config)
+
+    def _open(self, config: Mapping[str, Any]) -> can.BusABC:
+        """:raises ConfigurationError, LinkError: it cannot be."""
+        try:
+            return can.Bus(**config, ignore_config=True)
+        except (TypeError, ValueError) as error:
+            if self.channel is None:
+                raise ConfigurationError(f"can:{self.name}: say which channel: can:{self.name}/CHANNEL") from error
+            raise ConfigurationError(f"can:{self.name}: {_words(error)}") from error
+        except Exception as error:  # the interfaces raise whatever their drivers make them
+            number = _errno(error)
+            cure = "" if number is not None else "; is its driver installed, and the adapter there?"
+            raise LinkError(f"cannot open can:{self.name}: {self._reason(error, number)}{cure}") from error
+
+    def _reason(self, error: Exception, number: int | None) -> str:
+        """In one line, from an error of the system if it was one."""
+        if number in self._meaning:
+            return self._meaning[number]
+        return os.strerror(number) if number is not None and number > 0 else _words(error)
 
     def send(self, frame: can.Message) -> None:
         deadline_s = self.clock() + WRITE_TIMEOUT_S
@@ -124,7 +147,7 @@ class PythonCanBus:
                 " nobody acknowledges (wrong bit rate, nobody else on the bus, no termination), or it is bus-off"
             )
         kind = LinkError if number is None else LinkClosed
-        return kind(f"{self.name}: {_reason(error, number)}")
+        return kind(f"{self.name}: {self._reason(error, number)}")
 
     def receive(self, timeout_s: float) -> can.Message | None:
         try:
@@ -132,9 +155,15 @@ class PythonCanBus:
         except Exception as error:  # as above; what is no system's error is a frame that makes no sense
             number = _errno(error)
             if number is not None:
-                raise LinkClosed(f"{self.name}: {_reason(error, number)}") from error
-            self.damaged += 1
+                raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
+            self._forget_damage(error)
             return None
+
+    def _forget_damage(self, error: Exception) -> None:
+        """python-can's slcan keeps a line that is no text for ever, and fails with each one after it."""
+        self.damaged += 1
+        if any(isinstance(each, UnicodeDecodeError) for each in _causes(error)) and isinstance(self._bus, slcanBus):
+            self._bus.flush()
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # of a bus that is gone
@@ -150,23 +179,12 @@ def _complete(asked: Mapping[str, Any]) -> dict[str, Any]:
         interface = asked.get("interface")
         if interface is None:
             raise ConfigurationError(
-                "can: say which interface: can:virtual, can:socketcan/can0, ..., or name it in python-can's own"
-                f" configuration (CAN_INTERFACE, ~/can.conf): {error}; python-can knows {known}"
+                "can: say which interface, can:virtual or can:socketcan/can0, or name it in python-can's own"
+                f" configuration (CAN_INTERFACE, ~/can.conf); python-can knows {known}"
             ) from error
         raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
     except Exception as error:  # of a configuration file, whatever is wrong with it
-        raise ConfigurationError(f"can: python-can's configuration: {_reason(error, _errno(error))}") from error
-
-
-def _opened(config: Mapping[str, Any], name: str) -> can.BusABC:
-    try:
-        return can.Bus(**config, ignore_config=True)
-    except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"can:{name}: {_reason(error, None)}") from error
-    except can.CanInterfaceNotImplementedError as error:
-        raise LinkError(f"cannot open can:{name}: {_reason(error, None)}; is its driver installed?") from error
-    except Exception as error:  # the interfaces raise whatever their drivers make them
-        raise LinkError(f"cannot open can:{name}: {_reason(error, _errno(error))}") from error
+        raise ConfigurationError(f"can: python-can's configuration: {_words(error)}") from error
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -185,12 +203,8 @@ def _errno(error: Exception) -> int | None:
     return None
 
 
-def _reason(error: Exception, number: int | None) -> str:
+def _words(error: Exception) -> str:
     """In one line."""
-    if number in _MEANING:
-        return _MEANING[number]
-    if number is not None and number > 0:
-        return os.strerror(number)
     return " ".join(str(error).split()) or type(error).__name__
 
 

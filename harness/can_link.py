@@ -122,7 +122,7 @@ class CanLink:
             self._note_echo(frame)
         else:
             packet = bytes((frame.arbitration_id,)) + frame.data
-            message = unpack(packet) if frame.is_fd == (len(frame.data) > CLASSIC_BYTES) else None
+            message = unpack(packet) if self.carries_blocks or not frame.is_fd else None
             self._counted["frames_dropped"] += message is None
             return message
         return None

@@ -7,10 +7,12 @@ the file, the table and the key. Nothing read from a file is ever executed.
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,7 +21,7 @@ from harness.errors import ConfigurationError
 
 T = TypeVar("T")
 
-Kind = Literal["scenarios", "rigs", "devices"]
+Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
 
 MAX_FILE_BYTES = 1_000_000
 
@@ -80,6 +82,44 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+
+
+def to_toml(table: Mapping[str, Any]) -> str:
+    """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out."""
+    return "\n".join(_toml_lines(table, ())) + "\n"
+
+
+def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    given = {key: value for key, value in table.items() if value is not None}
+    tables = {key: value for key, value in given.items() if isinstance(value, Mapping)}
+    lists = {key: value for key, value in given.items() if _is_tables(value)}
+    for key, value in given.items():
+        if key not in tables and key not in lists:
+            yield f"{_toml_key(key)} = {_toml_value(value)}"
+    for key, value in tables.items():
+        yield f"\n[{'.'.join(map(_toml_key, (*path, key)))}]"
+        yield from _toml_lines(value, (*path, key))
+    for key, values in lists.items():
+        for value in values:
+            yield f"\n[[{'.'.join(map(_toml_key, (*path, key)))}]]"
+            yield from _toml_lines(value, (*path, key))
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(item, Mapping) for item in value)
+
+
+def _toml_key(key: str) -> str:
+    return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
+
+
+def _toml_value(value: Any) -> str:
+    """Strings, numbers, truth values and arrays of them; what JSON writes of them is TOML too."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_value, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "nan" if math.isnan(value) else "inf" if value > 0.0 else "-inf"
+    return json.dumps(value)
 
 
 def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:

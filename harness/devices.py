@@ -443,6 +443,11 @@ class CanDevice(FrameDevice):
     options: Mapping[str, bool | int | float | str] = field(default_factory=dict)
     """What else python-can is to be told."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.device == "host" and self.interface not in {"", "socketcan"}:
+            raise ValueError(f"device: a host process answers on SocketCAN, not on {self.interface}: say inproc")
+
     @classmethod
     def named(cls, name: str, rest: str) -> Self:
         where, _, query = rest.partition("?")
@@ -479,7 +484,7 @@ class CanDevice(FrameDevice):
             return InhabitedBus(bus, PythonCanBus(asked), boot_nonce=secrets.randbits(32))
         if who == "none":
             return bus
-        child = host_child(["--can", self.channel, *(["--fd"] if self.fd else [])])
+        child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])])
         try:
             child.first_line()
             return ChildBus(child, bus)

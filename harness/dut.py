@@ -108,6 +108,11 @@ class Dut:
         return self._talk.link.line_s - self._line_s
 
     @property
+    def estimator(self) -> EstimatorConfig:
+        """How its estimator is configured."""
+        return self._description.estimator
+
+    @property
     def parameters(self) -> int:
         """Elements of theta."""
         return self._description.estimator.parameters

@@ -4,6 +4,7 @@ AnalogrigError
 ├── ConfigurationError          a file, key, value or command-line argument is wrong
 ├── RecordingError              a recording cannot be read or written
 ├── RigError                    the rig failed
+├── WorkerError                 the workers of a campaign cannot be had or kept
 ├── LinkError                   the link failed
 │   ├── LinkTimeout             nothing came in time
 │   └── LinkClosed              the other end is gone
@@ -31,6 +32,10 @@ class RecordingError(AnalogrigError):
 
 class RigError(AnalogrigError):
     """The rig failed."""
+
+
+class WorkerError(AnalogrigError):
+    """The workers of a campaign cannot be had or kept."""
 
 
 class LinkError(AnalogrigError):

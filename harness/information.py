@@ -14,14 +14,20 @@ become and the likeliest plant in which another parameter alone had changed reac
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.excitation import TICKS_PER_SAMPLE, Edges
+from emulator.suspension import PROGRAMS
 from harness.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State
 from harness.run import Run
+
+if TYPE_CHECKING:
+    from harness.scenario import Scenario
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
 
@@ -58,12 +64,54 @@ def changes(run: Run) -> list[NDArray[np.float64]]:
     Samples that the device could not use carry no information.
     """
     period_s = run.conditions.sample_period_problem_s
-    out = []
-    for change in _changes(run):
-        unchanged = [SampledPlant.of(change.before, period_s)] * len(change.steps)
-        difference_m = _course(change, change.steps) - _course(change, unchanged)
-        out.append(np.cumsum(difference_m**2 * change.weight))
-    return out
+    return [_information(change, period_s) for change in _changes(run)]
+
+
+def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
+    """I(1), I(2), ... of one change."""
+    unchanged = [SampledPlant.of(change.before, period_s)] * len(change.steps)
+    difference_m = _course(change, change.steps) - _course(change, unchanged)
+    return np.cumsum(difference_m**2 * change.weight)
+
+
+def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
+    """Whether every change of a scenario can be seen before the next: I(n) reaches ln ARL0 there.
+
+    Told beforehand, from plant and excitation as the scenario has them (its own phase, though one be drawn), for a
+    displacement channel with that noise (rms) and resolution; a run's bounds come from the force that was measured.
+    """
+    return all(bound is not None for bound in predicted_bounds(scenario, arl0, noise_lsb=noise_lsb, lsb_v=lsb_v))
+
+
+def predicted_bounds(
+    scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096, rate_hz: float = 20e3
+) -> list[int | None]:
+    """For each change of a scenario the samples after which it can be seen; None: not before the next or the end."""
+    scales = PROGRAMS[scenario.plant.set].scales
+    lsb_m = lsb_v / scales.volts("displacement")
+    weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
+    volts = _levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
+    force_n = (volts / scales.volts("force")).tolist()
+    segments = scenario.segments()
+    stretches = [
+        (segment.start, following, segment.plant)
+        for segment, following in zip(
+            segments, [*(segment.start for segment in segments[1:]), scenario.samples], strict=True
+        )
+    ]
+    ramps_n = {segment.start: segment.ramp_n for segment in segments}
+    period_s = scales.time / rate_hz
+    return [
+        first_reaching(_information(change, period_s), math.log(arl0))
+        for change in _courses_of(stretches, ramps_n, force_n, weight, period_s)
+    ]
+
+
+def _levels(edges: Edges, samples: int) -> NDArray[np.float64]:
+    """(n,) volts in the period after each sample, on average."""
+    ticks = np.append(edges.ticks, samples * TICKS_PER_SAMPLE).astype(np.float64) / TICKS_PER_SAMPLE
+    integral = np.interp(np.arange(samples + 1), ticks, np.append(0.0, np.cumsum(edges.levels_v * np.diff(ticks))))
+    return np.asarray(np.diff(integral))
 
 
 def isolation_bounds(run: Run) -> list[int | None]:
@@ -92,14 +140,26 @@ def _changes(run: Run) -> Iterator[_Change]:
     variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
     weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
+    return _courses_of(run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s)
+
+
+def _courses_of(
+    stretches: Iterable[tuple[int, int, Plant]],
+    ramps_n: Mapping[int, int],
+    force_n: Sequence[float],
+    weight: NDArray[np.float64],
+    period_s: float,
+) -> Iterator[_Change]:
+    """The changes between stretches (start, end, plant) under a force."""
     state = AT_REST
     before: Plant | None = None
-    for start, end, plant in run.segments:
-        steps = _steps(before or plant, plant, ramps_n[start], end - start, conditions.sample_period_problem_s)
+    for start, end, plant in stretches:
+        steps = _steps(before or plant, plant, ramps_n[start], end - start, period_s)
         if before is not None:
             yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
-        for step, force in zip(steps, force_n[start:end], strict=True):
-            state = step.next(state, force)
+        if end < len(force_n):
+            for step, force in zip(steps, force_n[start:end], strict=True):
+                state = step.next(state, force)
         before = plant
 
 

@@ -41,6 +41,9 @@ from harness.plant import Plant
 from harness.run import CHANNELS, Channel, Run, Segment
 from harness.scenario import Scenario
 
+DEFAULT_RIG = "emulator"
+"""When neither the user nor the scenario says another."""
+
 BLOCK_SAMPLES = 256
 """Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
 
@@ -248,6 +251,12 @@ class EmulatorRig:
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
 
+    @property
+    def force_zero(self) -> float:
+        """The code of no force; it may lie outside the range."""
+        channel = CHANNELS.index("force")
+        return -self._card.ranges_v[channel][0] / float(self._card.lsb_v[channel])
+
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
         """The machine as the scenario starts it, and what will be played on it.
 
@@ -264,13 +273,14 @@ class EmulatorRig:
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
 
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
+    def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
+        """As Rig.perform; the length of the blocks changes nothing but speed."""
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with _emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
             jitter = _Stream.APERTURE.generator(seed)
             volts = acquired(
-                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=BLOCK_SAMPLES
+                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
             )
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
@@ -333,7 +343,11 @@ class RecordingRig:
     @classmethod
     def open(cls, path: Path) -> RecordingRig:
         """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
-        run = Run.load(path)
+        return cls.of(Run.load(path), path)
+
+    @classmethod
+    def of(cls, run: Run, path: Path) -> RecordingRig:
+        """As ``open``, of what was read from ``path``."""
         if run.samples == 0:
             raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
         return cls(run, path)

@@ -131,6 +131,8 @@ class Conditions:
     """Of each amplifier whose overload lamp lit, the first sample that was taken with the lamp lit."""
     real_time: float = 0.0
     """By how much the machine's time was stretched to be that of the clock on the wall; 0: lock-step, in no time."""
+    link_counters: Mapping[str, int] = field(default_factory=dict)
+    """What was on the line since it was opened that was no message of the device: damaged frames, those of others..."""
     line_s: float = 0.0
     """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
 

@@ -19,11 +19,16 @@ from harness.verdict import Expectations
 
 MAX_RAMP_N = 100_000
 
+DEFAULT_SEED = 1995
+"""When neither the user nor the scenario says another."""
+
 _MASS_DAMPER_SPRING = ("front", "shock")
 """The programs that are one, which is what the harness's plant, its bounds and its estimates describe."""
 
 PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
 """The parameters with which each program of the computer starts."""
+
+MOST_SEED = 2**63
 
 MAX_SAMPLES = 10_000_000
 """A run is kept in memory, some 70 bytes a sample."""
@@ -87,10 +92,16 @@ class Scenario:
     expect: Expectations = field(default_factory=Expectations)
     random_phase: bool = False
     """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
+    seed: int | None = None
+    """Of all that is random, unless the user says another."""
+    rig: str = ""
+    """The rig that plays it, unless the user says another; a .toml file is meant from the scenario's own folder."""
     description: str = ""
     name: str = ""
 
     def __post_init__(self) -> None:
+        if self.seed is not None and not 0 <= self.seed < MOST_SEED:
+            raise ValueError(f"seed must be 0 to 2^63 - 1, not {self.seed}")
         if not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
         instants = [tweak.sample for tweak in self.tweaks]
@@ -112,7 +123,10 @@ class Scenario:
         :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
         """
         path = config.locate("scenarios", name)
-        return cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
+        scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
+        if scenario.rig.endswith(".toml"):
+            scenario = dataclasses.replace(scenario, rig=str(path.parent / scenario.rig))
+        return scenario
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:

@@ -171,11 +171,11 @@ def judge(run: Run) -> Verdict:
     )
 
 
-def trajectory(run: Run) -> NDArray[np.float64]:
-    """M, B, K after every sample: (n, 3), NaN where theta describes no mass, damper and spring."""
+def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
+    """M, B, K after every sample, or those named: (n, 3), NaN where theta describes no mass, damper and spring."""
     channels = run.conditions.channels
     return physical_parameters(
-        run.theta,
+        run.theta[samples],
         run.conditions.dut["estimator"],
         n_per_code=channels["force"].lsb,
         m_per_code=channels["displacement"].lsb,
@@ -334,10 +334,10 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
 
 
 def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
-    values = trajectory(run)
+    segments = run.segments
+    lasts = trajectory(run, [end - 1 for _, end, _ in segments])
     out = []
-    for start, end, plant in run.segments:
-        last = values[end - 1]
+    for (start, end, plant), last in zip(segments, lasts, strict=True):
         estimate = None if np.isnan(last).any() else dict(zip(PARAMETERS, last.tolist(), strict=True))
         out.append(SegmentEstimate(start, end, plant.parameters(), estimate))
     return tuple(out)

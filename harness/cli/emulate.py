@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from harness.cli.options import add_what_to_play, what_to_play
+from harness.cli.options import add_what_to_play, opened
 from harness.cli.terminal import PASSED, progress_line, show
 
 
@@ -27,11 +27,9 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from harness.emulate import write_signals
-    from harness.rig import open_rig
     from harness.summary import lamps_text
 
-    with open_rig(arguments.rig) as rig:
-        scenario, seed = what_to_play(rig, arguments)
+    with opened(arguments) as (rig, scenario, seed):
         written = write_signals(rig, scenario, seed, arguments.out, progress=progress_line())
     if arguments.json:
         show(json.dumps({"file": str(arguments.out), "seed": seed, **written}))

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from harness.cli.options import add_what_to_play, what_to_play
+from harness.cli.options import add_what_to_play, opened
 from harness.cli.terminal import PASSED, show
 
 
@@ -21,11 +21,9 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from harness.netlist import netlist
-    from harness.rig import open_rig
     from harness.storage import replacing
 
-    with open_rig(arguments.rig) as rig:
-        scenario, seed = what_to_play(rig, arguments)
+    with opened(arguments) as (rig, scenario, seed):
         deck = netlist(rig, scenario, seed)
     text = deck.text()
     if arguments.out is not None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from harness.rig import Rig
+    from harness.run import Run
     from harness.scenario import Scenario
 
 DEFAULT_SCENARIO = "thesis"
-DEFAULT_SEED = 1995
 
 
 def add_what_to_play(command: argparse.ArgumentParser) -> None:
@@ -26,12 +28,15 @@ def add_what_to_play(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--rig",
-        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
+        default=os.environ.get("ANALOGRIG_RIG"),
         metavar="NAME",
-        help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG or emulator)",
+        help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)",
     )
     command.add_argument(
-        "--seed", type=seed, metavar="N", help=f"of all that is random (default: {DEFAULT_SEED}, or that recorded)"
+        "--seed",
+        type=seed,
+        metavar="N",
+        help="of all that is random (default: that of the scenario or recording, else the same as ever)",
     )
 
 
@@ -61,7 +66,8 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
         "--dut",
         default=default,
         metavar="NAME",
-        help=f"shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], or serial:URL (default: {shown})",
+        help="shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
+        f" can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
     )
     command.add_argument(
         "--exchange",
@@ -69,6 +75,9 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
         help="how samples go to the device, instead of as described",
     )
     command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
+    command.add_argument(
+        "--bitrate", type=int, metavar="N", help="of a CAN bus; without a real one its time is reported"
+    )
     command.add_argument(
         "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
     )
@@ -82,6 +91,15 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
         const=1.0,
         metavar="FACTOR",
         help="samples go out as the machine takes them, or FACTOR times slower; a stream, unless --exchange is given",
+    )
+
+
+def add_can_log(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--can-log",
+        choices=("log", "blf", "asc", "mf4", "none"),
+        default="log",
+        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz",
     )
 
 
@@ -102,25 +120,80 @@ def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
     return {
         "exchange": arguments.exchange or in_real_time,
         "baud": arguments.baud,
+        "bitrate": arguments.bitrate,
         "report_interval_n": arguments.report_interval,
         "wire_faults": arguments.wire_faults,
     }
 
 
-def what_to_play(rig: Rig, arguments: argparse.Namespace) -> tuple[Scenario, int]:
-    """Scenario and seed: those asked for; by default those of the recording if the rig is one."""
+@contextlib.contextmanager
+def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
+    """The rig, the scenario and the seed that were asked for; what was not, as the scenario or the recording has it."""
     from dataclasses import replace
 
-    from harness.rig import RecordingRig
+    from harness.rig import DEFAULT_RIG, RecordingRig, open_rig
+    from harness.scenario import DEFAULT_SEED, Scenario
+
+    asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG) as rig:
+        recording = rig if isinstance(rig, RecordingRig) else None
+        scenario = asked or (recording.scenario() if recording else Scenario.load(DEFAULT_SCENARIO))
+        if arguments.program is not None:
+            scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
+        recorded = None if recording is None else recording.run.conditions.seed
+        seeds = (arguments.seed, scenario.seed, recorded, DEFAULT_SEED)
+        yield rig, scenario, next(seed for seed in seeds if seed is not None)
+
+
+def add_capture(command: argparse.ArgumentParser) -> None:
+    """What a CAN log does not say itself."""
+    command.add_argument(
+        "--scenario", metavar="NAME", help="what was played: shipped name or .toml file; a run.npz says it itself"
+    )
+    command.add_argument(
+        "--rig",
+        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
+        metavar="NAME",
+        help="on which a CAN log was captured: shipped name or .toml file (default: $ANALOGRIG_RIG or emulator)",
+    )
+    command.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
+    )
+    command.add_argument("--run", type=int, metavar="N", help="which of several runs in a CAN log, from 1")
+    command.add_argument(
+        "--most-lost", type=int, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
+    )
+
+
+def is_capture(path: Path) -> bool:
+    """Whether it is, by its name, no recording of ours."""
+    return path.suffix != ".npz"
+
+
+def recorded(arguments: argparse.Namespace) -> Run:
+    """The run in the file that is named.
+
+    :raises RecordingError: it cannot be read.
+    :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.
+    """
+    from harness.can_log import captured_run, retold
+    from harness.errors import ConfigurationError
+    from harness.rig import open_rig
+    from harness.run import Run
     from harness.scenario import Scenario
 
-    recording = rig if isinstance(rig, RecordingRig) else None
-    if recording is not None and arguments.scenario is None:
-        scenario = recording.scenario()
-    else:
-        scenario = Scenario.load(arguments.scenario or DEFAULT_SCENARIO)
-    if arguments.program is not None:
-        scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
-    if arguments.seed is not None:
-        return scenario, arguments.seed
-    return scenario, DEFAULT_SEED if recording is None else recording.run.conditions.seed
+    scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    if not is_capture(arguments.file):
+        run = Run.load(arguments.file)
+        return run if scenario is None else retold(run, scenario)
+    if scenario is None:
+        raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
+    with open_rig(arguments.rig) as rig:
+        return captured_run(
+            arguments.file,
+            scenario,
+            rig,
+            dbc=arguments.dbc,
+            number=arguments.run,
+            most_lost_n=arguments.most_lost,
+        )

@@ -15,10 +15,10 @@ from harness.run import Run
 from harness.storage import replacing
 from harness.verdict import Verdict
 
-_FOLDER = Path(__file__).parent
-STYLES = (_FOLDER / "uPlot.min.css", _FOLDER / "page.css")
+FOLDER = Path(__file__).parent
+STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
 """Of every page with plots."""
-PLOTTER = _FOLDER / "uPlot.iife.min.js"
+PLOTTER = FOLDER / "uPlot.iife.min.js"
 
 
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
@@ -37,9 +37,9 @@ def render(run: Run, verdict: Verdict) -> str:
     :raises RecordingError: the build has not put uPlot in its place.
     """
     return assembled(
-        _FOLDER / "page.html",
+        FOLDER / "page.html",
         STYLES,
-        (PLOTTER, _FOLDER / "page.js"),
+        (PLOTTER, FOLDER / "page.js"),
         data=as_script(payload(run, verdict)),
         title=tables.title(run, verdict),
         outcome=tables.outcome(run, verdict),
@@ -62,7 +62,7 @@ def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *
     return Template(_part(template)).substitute(
         texts,
         policy=_policy(style, script),
-        licence=_part(_FOLDER / "licence.html").rstrip("\n"),
+        licence=_part(FOLDER / "licence.html").rstrip("\n"),
         styles="\n".join(f"<style>{each}</style>" for each in style),
         scripts="\n".join(f"<script>{each}</script>" for each in script),
     )

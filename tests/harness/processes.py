@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import select
 from pathlib import Path
+
+LONG_S = 20.0
+"""For what comes at once unless something is broken."""
 
 
 def children(pid: int) -> list[int]:
@@ -12,3 +17,15 @@ def children(pid: int) -> list[int]:
 def descendants(pid: int) -> list[int]:
     """Children, and theirs."""
     return [each for child in children(pid) for each in (child, *descendants(child))]
+
+
+def ends(pid: int, within_s: float = LONG_S) -> bool:
+    """Whether a process ends in time, or has ended."""
+    try:
+        fd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(select.select([fd], [], [], within_s)[0])
+    finally:
+        os.close(fd)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import stat
 import subprocess
@@ -19,10 +18,7 @@ from harness.child import TETHER, Child, ChildWire
 from harness.devices import host_wire
 from harness.errors import LinkClosed, LinkError
 from harness.link import FramedLink, Link
-from tests.harness.processes import children
-
-LONG_S = 20.0
-"""For what comes at once unless something is broken."""
+from tests.harness.processes import LONG_S, children, ends
 
 
 def hello(link: Link) -> Hello:
@@ -30,18 +26,6 @@ def hello(link: Link) -> Hello:
     answer = link.receive(LONG_S)
     assert isinstance(answer, Hello)
     return answer
-
-
-def ends(pid: int, within_s: float = LONG_S) -> bool:
-    """Whether a process ends in time, or has ended."""
-    try:
-        fd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        return bool(select.select([fd], [], [], within_s)[0])
-    finally:
-        os.close(fd)
 
 
 def device_pid(wire: ChildWire) -> int:

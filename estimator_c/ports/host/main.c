@@ -247,7 +247,7 @@ bool port_idle(const bool wants_input, const bool has_output) {
         return false;
     }
     if (has_hung_up(fds[1].revents)) {
-        lose(EIO);
+        lose(line.is_socket ? socket_can_error(line.fd) : EIO);
     }
     return !line.lost;
 }

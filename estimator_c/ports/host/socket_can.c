@@ -122,3 +122,9 @@ ssize_t socket_can_transmit(const int fd, const uint8_t* const bytes, const size
     }
     return (sent > 0U) ? (ssize_t)sent : -1;
 }
+
+int socket_can_error(const int fd) {
+    int       reason = 0;
+    socklen_t size   = sizeof(reason);
+    return ((getsockopt(fd, SOL_SOCKET, SO_ERROR, &reason, &size) == 0) && (reason != 0)) ? reason : EIO;
+}

@@ -18,4 +18,7 @@ ssize_t socket_can_receive(int fd, uint8_t* bytes, size_t n, uint32_t* lost);
 /// Sends what frames the interface takes, in their order; returns bytes, -1 with errno if it takes none.
 ssize_t socket_can_transmit(int fd, const uint8_t* bytes, size_t n);
 
+/// What the system has against the socket: an interface that went down, for one.
+int socket_can_error(int fd);
+
 #endif  // SOCKET_CAN_H_INCLUDED

@@ -1,0 +1,115 @@
+"""A campaign: many trials, played by whoever is there, to one file of results.
+
+The results are a function of the plan alone: neither the number of workers, nor the order in which they are done, nor
+how often the campaign was interrupted changes a byte of them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from harness.campaign_journal import Journal
+from harness.campaign_results import Results
+from harness.campaign_spec import Chunk, Plan
+from harness.campaign_trial import Row, close_devices, play_chunk, samples_of
+from harness.campaign_workers import Workers
+from harness.statistics import ConfidenceSequence, Decision
+
+_EXPOSURE = {"missed": "visible", "false_alarms": "samples"}
+"""Of what each quantity that can stop a cell is a rate."""
+
+
+@dataclass
+class Tally:
+    """What has come, in any order, and what of it counts: of each cell the rounds without a gap, up to its end."""
+
+    plan: Plan
+    cells: int
+    came: dict[Chunk, list[Row]] = field(default_factory=dict)
+    counted: list[list[Row]] = field(init=False)
+    rounds: list[int] = field(init=False)
+    ended: list[bool] = field(init=False)
+    trials: int = 0
+    counts: list[dict[str, int]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.counted = [[] for _ in range(self.cells)]
+        self.rounds = [0] * self.cells
+        self.ended = [False] * self.cells
+        self.counts = [dict(samples_of([])) for _ in range(self.cells)]
+
+    def add(self, chunk: Chunk, rows: list[Row]) -> None:
+        """Count it, and what it completes."""
+        self.came[chunk] = rows
+        cell = chunk.cell
+        while not self.ended[cell]:
+            following = self.came.get(Chunk((self.rounds[cell], cell)))
+            if following is None:
+                return
+            self._count(cell, following)
+
+    def _count(self, cell: int, rows: list[Row]) -> None:
+        self.counted[cell] += rows
+        self.rounds[cell] += 1
+        self.trials += len(rows)
+        for name, count in samples_of(rows).items():
+            self.counts[cell][name] += count
+        stop = self.plan.spec.stop
+        if stop is not None:
+            counts = self.counts[cell]
+            known = ConfidenceSequence(
+                stop.confidence, stop.rate, trials=counts[_EXPOSURE[stop.quantity]], events=counts[stop.quantity]
+            )
+            self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
+
+    def total(self) -> dict[str, int]:
+        """The counts of all cells together."""
+        return {name: sum(counts[name] for counts in self.counts) for name in samples_of([])}
+
+
+Progress = Callable[[Tally], None]
+
+
+def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None = None) -> Results:
+    """Play the plan to ``out``. Interrupted by whatever, it goes on where it was when it is asked for again.
+
+    :raises ConfigurationError: ``out`` holds what another plan gave; or a trial cannot be played.
+    :raises RecordingError: ``out`` cannot be written.
+    :raises WorkerError: the workers cannot be had or kept.
+    :raises LinkError, DeviceError, RigError: a device or rig cannot be had.
+    """
+    if out.exists():
+        return Results.load(out).of_plan(plan, out)
+    tally = Tally(plan, len(plan.cells()))
+    with Journal(journal_of(out), plan.digest()) as journal:
+        for chunk, rows in journal.rows.items():
+            tally.add(chunk, rows)
+        work: Any = functools.partial(play_chunk, plan.as_json())
+        try:
+            for chunk, rows in workers.play(work, _open_chunks(plan, tally)):
+                journal.add(chunk, rows)
+                tally.add(chunk, rows)
+                if progress is not None:
+                    progress(tally)
+        finally:
+            close_devices()
+        results = Results(plan, tuple(tuple(rows) for rows in tally.counted))
+        results.save(out)
+        journal.remove()
+    return results
+
+
+def journal_of(out: Path) -> Path:
+    """Where a campaign that has not ended keeps what it has got."""
+    return out.with_name(f"{out.name}.journal")
+
+
+def _open_chunks(plan: Plan, tally: Tally) -> Iterator[Chunk]:
+    """What is still to be played, at the time it is asked."""
+    for chunk in plan.chunks():
+        if chunk not in tally.came and not tally.ended[chunk.cell]:
+            yield chunk

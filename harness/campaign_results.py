@@ -1,0 +1,252 @@
+"""The results of a campaign: one JSON file without dates, and what it says in tables."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness import config
+from harness.campaign_spec import Cell, Plan
+from harness.campaign_trial import Row, samples_of
+from harness.errors import ConfigurationError, RecordingError
+from harness.statistics import ConfidenceSequence
+from harness.storage import replacing
+
+FORMAT, FORMAT_VERSION = "analogrig-campaign", 1
+
+MAX_FILE_BYTES = 4_000_000_000
+
+CONFIDENCE = 0.95
+"""Of the bounds in the tables, which hold whenever a campaign was ended."""
+
+_EXPECTED_MISS_RATE, _EXPECTED_FALSE_ALARM_RATE = 0.05, 1e-6
+"""Where those bounds are tightest."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """The rows of every cell, in the order of ``Plan.cells``."""
+
+    plan: Plan
+    rows: tuple[tuple[Row, ...], ...]
+
+    def save(self, path: Path) -> None:
+        """Write atomically; the same results give the same bytes.
+
+        :raises RecordingError: the file cannot be written.
+        """
+        head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": json.loads(self.plan.as_json())}
+        with replacing(path) as file:
+            file.write(f'{json.dumps(head, sort_keys=True)[:-1]}, "cells": [\n'.encode())
+            for i, rows in enumerate(self.rows):
+                lines = ",\n".join(json.dumps(row, sort_keys=True, separators=(",", ":")) for row in rows)
+                file.write(f"{',' if i else ''}[\n{lines}\n]\n".encode())
+            file.write(b"]}\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Results:
+        """:raises RecordingError: absent, or not the results of a campaign."""
+        try:
+            if path.stat().st_size > MAX_FILE_BYTES:
+                raise RecordingError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
+            table = json.loads(path.read_bytes())
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror or error}") from error
+        except (ValueError, RecursionError) as error:
+            raise RecordingError(f"{path}: not the results of a campaign") from error
+        if not isinstance(table, dict) or (table.get("format"), table.get("version")) != (FORMAT, FORMAT_VERSION):
+            raise RecordingError(f"{path}: not of the format {FORMAT} {FORMAT_VERSION}")
+        try:
+            results = cls(config.build(Plan, table["plan"], str(path)), tuple(map(tuple, table["cells"])))
+            results._check()
+        except (ConfigurationError, KeyError, TypeError, ValueError, AttributeError) as error:
+            raise RecordingError(f"{path}: damaged results of a campaign ({error})") from error
+        return results
+
+    def of_plan(self, plan: Plan, path: Path) -> Results:
+        """These, if they are that plan's.
+
+        :raises ConfigurationError: they are another's.
+        """
+        if self.plan.digest() != plan.digest():
+            raise ConfigurationError(
+                f"{path}: holds the results of another campaign: choose another --out, or remove it"
+            )
+        return self
+
+    def cells(self) -> list[tuple[Cell, Summary]]:
+        """What each cell gave."""
+        return [(cell, Summary.of(rows)) for cell, rows in zip(self.plan.cells(), self.rows, strict=True)]
+
+    def total(self) -> Summary:
+        return Summary.of([row for rows in self.rows for row in rows])
+
+    def outcome(self) -> str:
+        """``failed`` if a trial failed; ``inconclusive`` if one was not valid; else ``passed``."""
+        outcomes = {row["outcome"] for rows in self.rows for row in rows}
+        return next((each for each in ("failed", "inconclusive") if each in outcomes), "passed")
+
+    def _check(self) -> None:
+        if len(self.rows) != len(self.plan.cells()):
+            raise ValueError(f"{len(self.rows)} cells, where the plan has {len(self.plan.cells())}")
+        for row in (row for rows in self.rows for row in rows):
+            _check_row(row)
+
+
+def _check_row(row: Any) -> None:
+    if row["outcome"] not in ("passed", "failed", "inconclusive"):
+        raise ValueError("a row without an outcome")
+    counts = [row[name] for name in ("seed", "samples", "false_alarms")]
+    if not all(type(count) is int and count >= 0 for count in counts) or row["false_alarms"] > row["samples"]:
+        raise ValueError("a row whose counts cannot be")
+    if not all(_is_change(*change) for change in row["changes"]):
+        raise ValueError("a change that is none")
+
+
+def _is_change(latency_n: object, bound_n: object, missed: object, late: object) -> bool:
+    counts = all(value is None or type(value) is int for value in (latency_n, bound_n))
+    return counts and isinstance(missed, bool) and isinstance(late, bool)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of some trials; inconclusive ones are counted, and nothing of them is."""
+
+    trials: int
+    passed: int
+    failed: int
+    inconclusive: int
+    samples: int
+    false_alarms: int
+    false_alarm_rate: tuple[float, float]
+    """Bounds, per sample."""
+    visible: int
+    missed: int
+    late: int
+    miss_rate: tuple[float, float]
+    latency_n: float | None
+    """Mean; None: nothing was detected."""
+    latency_p95_n: float | None
+    bound_n: float | None
+    """Mean information bound of the changes that were detected and could be."""
+    error: Mapping[str, float]
+    """rms relative error of M, B and K at the end."""
+
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> Summary:
+        counts = samples_of(list(rows))
+        valid = [row for row in rows if row["outcome"] != "inconclusive"]
+        changes = [change for row in valid for change in row["changes"]]
+        latencies = sorted(change[0] for change in changes if change[0] is not None)
+        bounds = [change[1] for change in changes if change[0] is not None and change[1] is not None]
+        errors = [row["errors"] for row in valid if row["errors"]]
+        return cls(
+            trials=len(rows),
+            passed=sum(row["outcome"] == "passed" for row in rows),
+            failed=sum(row["outcome"] == "failed" for row in rows),
+            inconclusive=len(rows) - len(valid),
+            samples=counts["samples"],
+            false_alarms=counts["false_alarms"],
+            false_alarm_rate=ConfidenceSequence(
+                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["samples"], events=counts["false_alarms"]
+            ).bounds,
+            visible=counts["visible"],
+            missed=counts["missed"],
+            late=sum(change[3] for change in changes),
+            miss_rate=ConfidenceSequence(
+                CONFIDENCE, _EXPECTED_MISS_RATE, trials=counts["visible"], events=counts["missed"]
+            ).bounds,
+            latency_n=statistics.fmean(latencies) if latencies else None,
+            latency_p95_n=float(latencies[-(-95 * len(latencies) // 100) - 1]) if latencies else None,
+            bound_n=statistics.fmean(bounds) if bounds else None,
+            error={
+                name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5 for i, name in enumerate("MBK") if errors
+            },
+        )
+
+
+def label(plan: Plan, cell: Cell) -> dict[str, str]:
+    """What tells a cell from the others: rig and device where there are several, and the values of the grid."""
+    out = {}
+    if len(plan.rigs) > 1:
+        out["rig"] = str(plan.rigs[cell.rig]["name"])
+    if len(plan.devices) > 1:
+        out["device"] = str(plan.devices[cell.device]["name"])
+    return out | {axis: f"{value:g}" for axis, value in cell.values.items()}
+
+
+def anytime_text(counts: Mapping[str, int]) -> str:
+    """What ``samples_of`` has counted, with bounds, in one line."""
+    parts = []
+    for name, exposure, expected, unit in (
+        ("missed", "visible", _EXPECTED_MISS_RATE, "changes"),
+        ("false_alarms", "samples", _EXPECTED_FALSE_ALARM_RATE, "samples"),
+    ):
+        if counts[exposure]:
+            known = ConfidenceSequence(CONFIDENCE, expected, trials=counts[exposure], events=counts[name])
+            what = name.replace("_", " ")
+            parts.append(f"{counts[name]} {what} in {counts[exposure]} {unit} (rate below {known.bounds[1]:.2g})")
+    return ", ".join(parts)
+
+
+_COLUMNS = (
+    "trials",
+    "failed",
+    "inconcl.",
+    "missed",
+    "of",
+    "at most",
+    "false al.",
+    "rate below",
+    "latency",
+    "p95",
+    "bound",
+)
+
+
+def text(results: Results) -> str:
+    """Several lines, without a final newline."""
+    spec, total = results.plan.spec, results.total()
+    cells = results.cells()
+    labels = [label(results.plan, cell) for cell, _ in cells]
+    names = list(labels[0]) if len(cells) > 1 else []
+    head = f"campaign {spec.name}: {len(cells)} cells, {total.trials} trials, {total.samples} samples: "
+    rows = [[*names, *_COLUMNS]]
+    rows += [
+        [*(each[name] for name in names), *_numbers(summary)] for each, (_, summary) in zip(labels, cells, strict=True)
+    ]
+    if len(cells) > 1:
+        rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
+    note = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"
+    return "\n".join([head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", f"  {note}"])
+
+
+def as_json(results: Results) -> dict[str, Any]:
+    """In plain values; rates as [low, high]."""
+    cells = [{**label(results.plan, cell), **vars(summary)} for cell, summary in results.cells()]
+    return {
+        "campaign": results.plan.spec.name,
+        "outcome": results.outcome(),
+        "total": vars(results.total()),
+        "cells": cells,
+    }
+
+
+def _numbers(summary: Summary) -> list[str]:
+    averages = (summary.latency_n, summary.latency_p95_n, summary.bound_n)
+    return [
+        *(
+            str(each)
+            for each in (summary.trials, summary.failed, summary.inconclusive, summary.missed, summary.visible)
+        ),
+        f"{summary.miss_rate[1]:.2g}" if summary.visible else "-",
+        str(summary.false_alarms),
+        f"{summary.false_alarm_rate[1]:.2g}" if summary.samples else "-",
+        *("-" if each is None else f"{each:.1f}" for each in averages),
+    ]

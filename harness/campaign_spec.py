@@ -1,0 +1,337 @@
+"""What a campaign plays: a TOML file, and the trials that it means.
+
+A *cell* is one combination of rig, device and values of the grid. Each cell has the same number of trials, with the
+same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* is some consecutive trials of one cell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from harness import config
+from harness.devices import DeviceDescription, QemuDevice, describe, from_table
+from harness.errors import ConfigurationError
+from harness.rig import EmulatorDescription, EmulatorRig, RecordingRig, Rig, open_rig
+from harness.scenario import Scenario, Tweak
+
+MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
+
+_DRAWS = 20_000
+"""Of the seeds: the stream of the campaign's own draws, apart from those of the rig."""
+
+AXES = (
+    *("mass_kg", "damping_n_s_per_m", "stiffness_n_per_m"),
+    *("mass_factor", "damping_factor", "stiffness_factor"),
+    "noise_lsb",
+)
+"""What can be varied. The plant at the start; by what it is multiplied at the change; rms noise of the card."""
+
+_CHANGES = {
+    "mass_factor": "mass_kg",
+    "damping_factor": "damping_n_s_per_m",
+    "stiffness_factor": "stiffness_n_per_m",
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The ``[grid]`` table: every combination of these values is a cell."""
+
+    mass_kg: tuple[float, ...] = ()
+    damping_n_s_per_m: tuple[float, ...] = ()
+    stiffness_n_per_m: tuple[float, ...] = ()
+    mass_factor: tuple[float, ...] = ()
+    damping_factor: tuple[float, ...] = ()
+    stiffness_factor: tuple[float, ...] = ()
+    noise_lsb: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for axis, values in vars(self).items():
+            if len(set(values)) != len(values):
+                raise ValueError(f"{axis} has a value twice")
+
+    def axes(self) -> dict[str, tuple[float, ...]]:
+        """Those that are given."""
+        return {axis: values for axis, values in vars(self).items() if values}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The ``[draw]`` table: values drawn for each trial from its seed, evenly between the ends."""
+
+    mass_kg: tuple[float, float] | None = None
+    damping_n_s_per_m: tuple[float, float] | None = None
+    stiffness_n_per_m: tuple[float, float] | None = None
+    mass_factor: tuple[float, float] | None = None
+    damping_factor: tuple[float, float] | None = None
+    stiffness_factor: tuple[float, float] | None = None
+    noise_lsb: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for axis, ends in self.axes().items():
+            if not ends[0] < ends[1]:
+                raise ValueError(f"{axis} must be (low, high), not ({ends[0]:g}, {ends[1]:g})")
+
+    def axes(self) -> dict[str, tuple[float, float]]:
+        """Those that are given."""
+        return {axis: ends for axis, ends in vars(self).items() if ends is not None}
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The ``[stop]`` table: a cell ends when it is certain on which side of ``rate`` it is.
+
+    Certain in the sense of a confidence sequence, which may be looked at after every trial.
+    """
+
+    quantity: Literal["missed", "false_alarms"]
+    """``missed``: changes missed of those that could be seen; ``false_alarms``: per sample."""
+    rate: float
+    confidence: float = 0.99
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "confidence"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name):g}")
+
+
+@dataclass(frozen=True)
+class CampaignSpec:
+    """A campaign's file."""
+
+    scenario: str = "healthy"
+    rigs: tuple[str, ...] = ("emulator",)
+    devices: tuple[str, ...] = ("inproc",)
+    trials: int = 100
+    """Of each cell, with the seeds from ``first_seed`` on."""
+    first_seed: int = 0
+    chunk: int = 10
+    """Trials that a worker is given at a time."""
+    samples: int | None = None
+    """Of each trial, instead of the scenario's."""
+    change_at: int = 1000
+    """The sample at which what a factor multiplies changes."""
+    grid: Grid = field(default_factory=Grid)
+    draw: Draw = field(default_factory=Draw)
+    stop: Stop | None = None
+    description: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("rigs", "devices"):
+            values = getattr(self, name)
+            if not values or len(set(values)) != len(values):
+                raise ValueError(f"{name} must name at least one, and each once")
+        for name, most in (("trials", MAX_TRIALS), ("chunk", MAX_TRIALS), ("change_at", 2**31)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be 1 to {most}, not {getattr(self, name)}")
+        if not 0 <= self.first_seed < 2**62:
+            raise ValueError(f"first_seed must be 0 to 2^62, not {self.first_seed}")
+        twice = set(self.grid.axes()) & set(self.draw.axes())
+        if twice:
+            raise ValueError(f"{', '.join(sorted(twice))}: in the grid and drawn as well")
+
+    @classmethod
+    def load(cls, name: str) -> CampaignSpec:
+        """A shipped campaign by name, or a user's .toml file.
+
+        :raises ConfigurationError: absent, not TOML, or no campaign; names the file and the key.
+        """
+        path = config.locate("campaigns", name)
+        return config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination."""
+
+    rig: int
+    """Index in ``Plan.rigs``."""
+    device: int
+    values: Mapping[str, float]
+    """Of the grid's axes."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One trial, ready to be played."""
+
+    rig: Mapping[str, Any]
+    device: Mapping[str, Any]
+    scenario: Scenario
+    seed: int
+    drawn: Mapping[str, float] = field(default_factory=dict)
+
+
+class Chunk(tuple[int, int]):
+    """(round, cell): the trials of one cell that are given to a worker at a time."""
+
+    __slots__ = ()
+
+    @property
+    def round(self) -> int:
+        return self[0]
+
+    @property
+    def cell(self) -> int:
+        return self[1]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign with everything that its file names read in: plain values, which any worker anywhere understands."""
+
+    spec: CampaignSpec
+    scenario: Mapping[str, Any]
+    rigs: tuple[Mapping[str, Any], ...]
+    devices: tuple[Mapping[str, Any], ...]
+
+    @classmethod
+    def of(cls, spec: CampaignSpec) -> Plan:
+        """:raises ConfigurationError: a rig, device or scenario is absent or wrong, or a cell cannot be played."""
+        scenario = Scenario.load(spec.scenario)
+        if spec.samples is not None:
+            scenario = dataclasses.replace(scenario, samples=spec.samples)
+        plan = cls(
+            spec=spec,
+            scenario=scenario.as_table(),
+            rigs=tuple(rig_table(name) for name in spec.rigs),
+            devices=tuple(describe(name).as_table() for name in spec.devices),
+        )
+        plan._check()
+        return plan
+
+    @classmethod
+    def from_json(cls, text: str) -> Plan:
+        return config.build(cls, json.loads(text), "the plan of the campaign")
+
+    def as_json(self) -> str:
+        """The same plan gives the same text."""
+        table = dataclasses.asdict(self)
+        table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
+        return json.dumps(table, sort_keys=True, separators=(",", ":"))
+
+    def digest(self) -> str:
+        """SHA-256 of all that decides the results."""
+        return hashlib.sha256(self.as_json().encode()).hexdigest()
+
+    def cells(self) -> list[Cell]:
+        """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
+        axes = self.spec.grid.axes()
+        combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+        return [
+            Cell(rig, device, values)
+            for rig, device, values in itertools.product(range(len(self.rigs)), range(len(self.devices)), combinations)
+        ]
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Round by round, so that all cells progress together."""
+        rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
+        return (Chunk((number, cell)) for number in range(rounds) for cell in range(cells))
+
+    def seeds(self, chunk: Chunk) -> range:
+        first = chunk.round * self.spec.chunk
+        return range(
+            self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
+        )
+
+    def case(self, cell: Cell, seed: int) -> Case:
+        """:raises ConfigurationError: the values make no scenario."""
+        rng = np.random.default_rng([seed, _DRAWS])
+        drawn = {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+        values = {**cell.values, **drawn}
+        try:
+            scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
+        except ValueError as error:
+            raise ConfigurationError(f"campaign {self.spec.name}: {_said(values)}: {error}") from error
+        rig = dict(self.rigs[cell.rig])
+        if "noise_lsb" in values:
+            rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
+        return Case(rig, self.devices[cell.device], scenario, seed, drawn)
+
+    def one_worker_only(self) -> str:
+        """As the function, of the first of the devices that is alone."""
+        return next(filter(None, map(one_worker_only, self.devices)), "")
+
+    def _check(self) -> None:
+        spec = self.spec
+        count = (
+            len(self.rigs) * len(self.devices) * int(np.prod([len(v) for v in spec.grid.axes().values()], dtype=int))
+        )
+        where = f"campaign {spec.name}"
+        if count > MAX_CELLS or count * spec.trials > MAX_TRIALS:
+            raise ConfigurationError(
+                f"{where}: {count} cells of {spec.trials} trials;"
+                f" at most {MAX_CELLS} cells and {MAX_TRIALS} trials in all"
+            )
+        axes = {*spec.grid.axes(), *spec.draw.axes()}
+        if axes & set(_CHANGES) and self.scenario.get("tweaks"):
+            raise ConfigurationError(f"{where}: the scenario {spec.scenario} has tweaks of its own: no factors besides")
+        if "noise_lsb" in axes and any("card" not in table for table in self.rigs):
+            raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
+        for cell in self.cells():
+            case = self.case(cell, spec.first_seed)
+            rig = open_table(case.rig)
+            if isinstance(rig, EmulatorRig):
+                rig.set_up(case.scenario, case.seed)
+
+
+def open_table(table: Mapping[str, Any]) -> Rig:
+    """The rig of a plan's table.
+
+    :raises ConfigurationError: it is wrong.
+    """
+    if "card" in table:
+        return EmulatorRig(config.build(EmulatorDescription, table, f"rig {table['name']}"))
+    return open_rig(table["name"])
+
+
+def device_of(table: Mapping[str, Any]) -> DeviceDescription:
+    return from_table(table, f"device {table['name']}")
+
+
+def one_worker_only(table: Mapping[str, Any]) -> str:
+    """The name of a device of which there is only one, so that two workers cannot both have it; "" for any other."""
+    device = device_of(table)
+    return device.elsewhere if not isinstance(device, QemuDevice) else ""
+
+
+def rig_table(name: str) -> Mapping[str, Any]:
+    """A rig by its name, as plain values that ``open_table`` takes.
+
+    :raises ConfigurationError: there is none, or it can play but one scenario.
+    """
+    with open_rig(name) as rig:
+        if isinstance(rig, RecordingRig):
+            raise ConfigurationError(
+                f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
+            )
+        return _given(rig.description()) if isinstance(rig, EmulatorRig) else {"name": name}
+
+
+def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:
+    start: dict[str, Any] = {axis: values[axis] for axis in AXES[:3] if axis in values}
+    plant = dataclasses.replace(base.plant, **start)
+    before = vars(plant.plant())
+    changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
+    tweaks = (*base.tweaks, Tweak(spec.change_at, **changed)) if changed else base.tweaks
+    return dataclasses.replace(base, plant=plant, tweaks=tweaks)
+
+
+def _given(value: Any) -> Any:
+    """Plain values, without what is not given."""
+    if isinstance(value, Mapping):
+        return {key: _given(item) for key, item in value.items() if item is not None}
+    return [_given(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _said(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{axis} = {value:g}" for axis, value in values.items())

@@ -1,0 +1,114 @@
+"""``analogrig campaign``: many trials over plants, changes, noise, rigs and devices."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show
+
+if TYPE_CHECKING:
+    from harness.campaign import Tally
+    from harness.campaign_spec import Plan
+    from harness.campaign_workers import Workers
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "campaign", help="many trials over plants, changes, noise, rigs and devices, to one file of results"
+    )
+    command.add_argument("spec", metavar="SPEC", help="a shipped name or a .toml file; see harness/README.md")
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", help="the results; beside them a page (default: build/campaign/NAME.json)"
+    )
+    add_workers(command)
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def add_workers(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes (default: one for each processor, or for a device of its own)",
+    )
+    command.add_argument(
+        "--cluster", metavar="URL", help="the scheduler of a Dask cluster that plays instead, such as tcp://host:8786"
+    )
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from harness.campaign import conduct, journal_of
+    from harness.campaign_report import write_page
+    from harness.campaign_results import as_json, text
+    from harness.campaign_spec import CampaignSpec, Plan
+    from harness.errors import DeviceError, LinkError, RigError, WorkerError
+
+    plan = Plan.of(CampaignSpec.load(arguments.spec))
+    out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
+    kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
+    try:
+        with workers(arguments, plan.one_worker_only(), len(list(plan.chunks()))) as crew:
+            results = conduct(plan, crew, out, progress(plan))
+    except KeyboardInterrupt:
+        return complain(f"interrupted: {kept}", INTERRUPTED)
+    except (DeviceError, LinkError, RigError, WorkerError) as error:
+        return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
+    page = out.with_suffix(".html")
+    write_page(results, page)
+    if arguments.json:
+        show(json.dumps({**as_json(results), "results": str(out), "page": str(page)}))
+    else:
+        show(f"{text(results)}\nresults: {out}\npage:    {page}")
+    return STATUS[results.outcome()]
+
+
+@contextlib.contextmanager
+def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
+    """Those that the command line asks for, by default at most as many as are useful.
+
+    ``alone``: a device that cannot be shared, or "".
+
+    :raises ConfigurationError: they would have to share it.
+    """
+    from harness.campaign_workers import Dask, Processes, ThisProcess
+    from harness.errors import ConfigurationError
+
+    if alone and (arguments.cluster or (arguments.workers or 1) > 1):
+        raise ConfigurationError(f"{alone} is one device: it cannot be shared by several workers; say --workers 1")
+    if arguments.cluster:
+        with contextlib.closing(Dask(arguments.cluster)) as cluster:
+            yield cluster
+        return
+    count = arguments.workers if arguments.workers is not None else min(len(os.sched_getaffinity(0)), useful)
+    yield ThisProcess() if alone or count == 1 else Processes(count)
+
+
+def progress(plan: Plan) -> Callable[[Tally], None] | None:
+    """One line on standard error, at most once a second; None when nobody watches."""
+    if not sys.stderr.isatty():
+        return None
+    import time
+
+    from harness.campaign_results import anytime_text
+
+    most = len(plan.cells()) * plan.spec.trials
+    next_s = 0.0
+
+    def tell(tally: Tally) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s or tally.trials == most:
+            next_s = time.monotonic() + 1.0
+            end = "\n" if tally.trials == most else ""
+            line = f"{tally.trials} of {most} trials; {anytime_text(tally.total())}"
+            sys.stderr.write(f"\r{line:<110}{end}")
+            sys.stderr.flush()
+
+    return tell

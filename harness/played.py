@@ -1,0 +1,133 @@
+"""A Run as a test speaks of it: what it shows, and why.
+
+``played.detects(within=1.5)`` and its like give a Finding: true or false, and a sentence that pytest shows when an
+assertion about it fails.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from harness.run import Run
+from harness.statistics import upper_rate
+from harness.verdict import TweakVerdict, Verdict, judge
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Whether something holds, and why or why not. Its truth is that of the statement."""
+
+    holds: bool
+    why: str
+
+    def __bool__(self) -> bool:
+        return self.holds
+
+    def __repr__(self) -> str:
+        return f"<{'yes' if self.holds else 'no'}: {self.why}>"
+
+
+@dataclass(frozen=True)
+class Played:
+    """One play of a scenario, valid (``Bench`` and the fixture ``play`` give no other), and its verdict."""
+
+    run: Run
+    repeat: str = ""
+    """The command that repeats it."""
+
+    @functools.cached_property
+    def verdict(self) -> Verdict:
+        return judge(self.run)
+
+    def detects(self, within: float | None = None) -> Finding:
+        """Every change that could be seen raised an alarm before the next one.
+
+        :param within: and not later than so many times its information bound (and the bound's own sample); None: than
+            the scenario's ``[expect]`` says.
+        """
+        if not self.verdict.tweaks:
+            return Finding(holds=False, why="nothing has changed, so nothing could be detected")
+        seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None]
+        if not seeable:
+            return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
+        wrong = [why for tweak in seeable if (why := _not_detected(tweak, within))]
+        latencies = ", ".join(f"{tweak.what} after {tweak.latency_n} (bound {tweak.bound_n})" for tweak in seeable)
+        return Finding(not wrong, "; ".join(wrong) or latencies)
+
+    def stays_quiet(self) -> Finding:
+        """No alarm but one for each change."""
+        alarms = self.verdict.false_alarms
+        where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
+        return Finding(not alarms, f"{len(alarms)} false alarms in {self.run.samples} samples: {where}".rstrip(": "))
+
+    def isolates(self) -> Finding:
+        """Whatever was said to have changed has changed. Silence is allowed."""
+        said = [(tweak, tweak.diagnosis) for tweak in self.verdict.tweaks if tweak.diagnosis is not None]
+        wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
+                 if not diagnosis.right]  # fmt: skip
+        return Finding(
+            not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.tweaks)} changes named, rightly"
+        )
+
+    def estimates(self, within: float) -> Finding:
+        """M, B and K at the end of every stretch are right to a part ``within``."""
+        off = []
+        for segment in self.verdict.estimates:
+            if segment.estimate is None:
+                off.append(f"samples {segment.start} to {segment.end}: no mass, damper and spring")
+            off += [
+                f"{name} is off by {error:+.2%} at sample {segment.end}"
+                for name, error in segment.error.items()
+                if abs(error) > within
+            ]
+        return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
+
+    def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:
+        """The estimate goes the way of another one, in a tube around it.
+
+        :param reference: (n, p) what theta should be after each sample; NaN: any.
+        :param tolerance: how far it may be off; of a shape that broadcasts to (n, p).
+        :param time_tolerance: so many samples earlier or later it may have been so.
+        """
+        theta = self.run.theta.astype(np.float64)
+        wanted = np.asarray(reference, dtype=np.float64)
+        if wanted.shape != theta.shape:
+            raise ValueError(f"reference has the shape {wanted.shape}, theta {theta.shape}")
+        allowed = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), theta.shape)
+        inside = np.zeros(theta.shape, dtype=bool)
+        for shift in range(-time_tolerance, time_tolerance + 1):
+            at = np.clip(np.arange(len(theta)) + shift, 0, len(theta) - 1)
+            inside |= ~(np.abs(theta - wanted[at]) > allowed[at])
+        outside = np.argwhere(~inside)
+        if not len(outside):
+            return Finding(holds=True, why=f"{len(theta)} samples within the tolerance")
+        sample, element = (int(i) for i in outside[0])
+        why = f"theta[{element}] leaves the tube at sample {sample}: {theta[sample, element]:g}"
+        return Finding(holds=False, why=f"{why}, not {wanted[sample, element]:g} +- {allowed[sample, element]:g}")
+
+
+def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
+    """Why a change that could be seen was not detected in time; empty if it was."""
+    if tweak.latency_n is None:
+        return f"{tweak.what} at {tweak.sample} was missed (bound {tweak.bound_n})"
+    if within is None:
+        late, limit = tweak.late, tweak.deadline_n
+    else:
+        limit = round(within * (tweak.bound_n or 0)) + 1
+        late = tweak.latency_n > limit
+    return f"{tweak.what} at {tweak.sample}: {tweak.latency_n} samples, allowed {limit}" if late else ""
+
+
+def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
+    """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand."""
+    plays = list(played)
+    events = sum(len(each.verdict.false_alarms) for each in plays)
+    samples = sum(each.run.samples for each in plays)
+    bound = upper_rate(events, samples, confidence)
+    why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
+    return Finding(bound <= rate, why)

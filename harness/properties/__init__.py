@@ -1,0 +1,6 @@
+"""The properties that any estimator behind the catalogue's messages should have, as tests to run against yours.
+
+    pytest --pyargs harness.properties --dut serial:/dev/ttyACM0 --hil-profile nightly
+
+What fails is shrunk to the simplest scenario that still fails, and left as files (see --runs-dir).
+"""

@@ -1,0 +1,120 @@
+"""Closed-loop trials without a line: circuit, card and the C estimator in this process, whole blocks at a time.
+
+A trial is what Bench plays with the device ``inproc``, to the bit: the same codes, the same estimates, the same alarms.
+Only what the messages around them say is lacking: isolation's diagnoses, and the flags RESTARTED and IDLE.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.catalogue import SteppedFlag, Trigger
+from harness.devices import DeviceDescription, InprocDevice
+from harness.estimator import Estimator, Steps, StepStatus
+from harness.rig import Block, EmulatorRig, Performance, Rig
+from harness.run import CHANNELS, Conditions, Run, missing_to_device
+from harness.scenario import Scenario
+
+BLOCK_SAMPLES = 16_384
+"""Samples that pass from the circuit to the card and on to the estimator at a time: they stay within the cache."""
+
+_FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
+
+_FLAGS = np.zeros(len(StepStatus), np.uint8)
+_FLAGS[StepStatus.MISSING] = SteppedFlag.MISSING
+_FLAGS[StepStatus.REFUSED] = SteppedFlag.REFUSED
+_FLAGS[StepStatus.GATHERING] = SteppedFlag.GATHERING
+
+
+def are_possible(rig: Rig, device: DeviceDescription) -> bool:
+    """Whether trials give what Bench gives: an emulated rig, and a device whose line does nothing to the samples."""
+    return (
+        isinstance(rig, EmulatorRig)
+        and isinstance(device, InprocDevice)
+        and not device.wire_faults
+        and device.report_interval_n == 1
+    )
+
+
+class Trials:
+    """An emulated rig and an estimator, for any number of trials, one after the other."""
+
+    def __init__(self, rig: EmulatorRig, device: DeviceDescription) -> None:
+        """:raises ConfigurationError: the estimator refuses its configuration.
+        :raises LinkError: the library was not built.
+        """
+        self._rig = rig
+        zero = rig.force_zero
+        self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
+        self._estimator = Estimator(self._device.estimator)
+
+    def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
+        """The samples with an alarm, (a,), and nothing else: the fastest way.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        :raises RigError: the emulator failed.
+        """
+        self._estimator.restart()
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        found = [block.first + self._estimator.alarms(*_entered(block)) for block in performance.blocks]
+        return np.concatenate(found)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The estimator's, of the last trial."""
+        return self._estimator.counters
+
+    def run(self, scenario: Scenario, seed: int) -> Run:
+        """One trial, for ``judge``; errors as ``alarms``."""
+        self._estimator.restart()
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        blocks: list[Block] = []
+        parts: list[Steps] = []
+        for block in performance.blocks:
+            blocks.append(block)
+            parts.append(self._estimator.run(*_entered(block)))
+        return self._run(scenario, seed, performance, blocks, parts)
+
+    def _run(
+        self, scenario: Scenario, seed: int, performance: Performance, blocks: list[Block], parts: list[Steps]
+    ) -> Run:
+        statistic = np.concatenate([steps.statistic for steps in parts])
+        alarms = np.concatenate([block.first + steps.alarms for block, steps in zip(blocks, parts, strict=True)])
+        trigger = Trigger[self._device.estimator.trigger.replace("-", "_").upper()]
+        return Run(
+            conditions=self._conditions(scenario, seed, performance),
+            codes=np.concatenate([block.codes for block in blocks]),
+            clipped=np.concatenate([block.clipped for block in blocks]),
+            theta=np.concatenate([steps.theta for steps in parts]),
+            innovation=np.concatenate([steps.innovation for steps in parts]),
+            statistic=statistic,
+            flags=_FLAGS[np.concatenate([steps.status for steps in parts])],
+            alarm_index=alarms,
+            alarm_kind=np.full(len(alarms), trigger, np.uint8),
+            alarm_statistic=statistic[alarms],
+        )
+
+    def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        return Conditions(
+            seed=seed,
+            samples_asked=scenario.samples,
+            sample_period_s=performance.sample_period_s,
+            time_scale=performance.time_scale,
+            channels=performance.channels,
+            segments=performance.segments,
+            scenario=scenario.as_table(),
+            rig=self._rig.description(),
+            dut=self._device.as_table(),
+            link="none",
+            counters=self._estimator.counters,
+            faults=scenario.caveats,
+            overloads=performance.lamps(),
+        )
+
+
+def _entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)

@@ -1,0 +1,192 @@
+"""The plugin as a user's tests see it, each in a pytest of its own."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from harness import cli
+
+SHORT = """\
+samples = 400
+{head}
+[excitation]
+low_v = 0.1
+high_v = 9.9
+frequency_hz = 200.0
+
+[[tweaks]]
+sample = 300
+stiffness_n_per_m = 18000.0
+
+[expect]
+missed = 0
+{expect}
+"""
+PLAYS = """\
+def test_it(play):
+    played = play("short.toml")
+    assert played.run.samples == 400
+    {assertion}
+"""
+
+
+@pytest.fixture
+def user(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
+    """A user's folder, with a short scenario."""
+    for variable in [name for name in os.environ if name.startswith("ANALOGRIG_")]:
+        monkeypatch.delenv(variable)
+    pytester.path.joinpath("short.toml").write_text(SHORT.format(head="", expect=""))
+    return pytester
+
+
+def run(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
+    return user.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:xdist", *arguments)
+
+
+def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]:
+    """Those of the first test case."""
+    case = ET.parse(user.path / file).getroot().find(".//testcase")  # noqa: S314 - written a moment ago
+    assert case is not None
+    return {each.attrib["name"]: each.attrib["value"] for each in case.iter("property")}
+
+
+def test_play_of_a_scenario_is_a_test_and_junit_knows_its_figures(user: pytest.Pytester) -> None:
+    user.makepyfile(PLAYS.format(assertion="assert played.detects(within=3.0) and played.stays_quiet()"))
+    run(user, "--dut", "inproc", "--junitxml", "junit.xml").assert_outcomes(passed=1)
+    told = properties(user)
+    assert told["dut"] == "inproc"
+    assert told["rig"] == "emulator"
+    assert told["firmware"] == "LIBRARY"
+    assert told["outcome"] == "passed"
+    assert int(told["latency_n"]) <= 3 * int(told["bound_n"]) + 1
+    assert re.fullmatch("[0-9a-f]{64}", told["theta_hash"])
+    assert told["seed"] == "1995"
+    assert told["overruns"] == "0"
+
+
+def test_option_is_taken_from_command_line_then_environment_then_ini(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user.makepyfile("def test_it(hil_profile, runs_dir):\n    print(f'<{hil_profile} {runs_dir}>')")
+    run(user, "-s").stdout.fnmatch_lines(["*<ci build/runs>*"])
+    user.makeini("[pytest]\nanalogrig_hil_profile = soak\nanalogrig_runs_dir = a")
+    run(user, "-s").stdout.fnmatch_lines(["*<soak a>*"])
+    monkeypatch.setenv("ANALOGRIG_HIL_PROFILE", "nightly")
+    run(user, "-s").stdout.fnmatch_lines(["*<nightly a>*"])
+    run(user, "-s", "--hil-profile", "ci").stdout.fnmatch_lines(["*<ci a>*"])
+
+
+def test_indirect_parametrization_of_a_fixture_comes_first(user: pytest.Pytester) -> None:
+    user.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
+        @pytest.mark.parametrize("dut", ["inproc"], indirect=True)
+        def test_it(bench):
+            assert bench.rig.description()["name"] == "emulator-ideal"
+            assert bench.dut.name == "inproc"
+        """
+    )
+    run(user, "--rig", "no-such-rig", "--dut", "no-such-device").assert_outcomes(passed=1)
+
+
+def test_profile_that_does_not_exist_is_a_usage_error_in_one_line(user: pytest.Pytester) -> None:
+    result = run(user, "--hil-profile", "tea")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["*--hil-profile: must be one of ci, nightly, soak, not 'tea'*"])
+
+
+def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) -> None:
+    user.makepyfile(
+        "import pytest\n\n@pytest.mark.needs('tweak', 'fly')\ndef test_it(rig):\n    pass\n\n"
+        "@pytest.mark.needs('tweak')\ndef test_other(rig):\n    pass\n"
+    )
+    result = run(user, "-rs")
+    result.assert_outcomes(passed=1, skipped=1)
+    result.stdout.fnmatch_lines(["*rig emulator cannot fly (it can excite, tweak)*"])
+
+
+def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
+    user: pytest.Pytester, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user.path.joinpath("noisy.toml").write_text(
+        "[computer]\noffset_v = 0.001\n[card]\nnoise_lsb = 0.5\n[card.range_v]\nforce = [-1.0, 11.0]\n"
+        "displacement = [-1.0, 9.0]\nvelocity = [-10.0, 10.0]\nnet_force = [-12.5, 12.5]\n"
+    )
+    user.makepyfile(
+        PLAYS.replace('"short.toml"', '"short.toml", seed=77').format(assertion="assert played.detects(within=0.0)")
+    )
+    result = run(user, "--dut", "inproc", "--rig", "noisy.toml", "--junitxml", "junit.xml")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        ["E*<no: K at 300: * samples, allowed 1>*", "repeat it with: analogrig run --scenario *"]
+    )
+    (line,) = [line for line in result.outlines if line.startswith("repeat it with: ")]
+    monkeypatch.chdir(user.path)
+    status = cli.main([*line.split()[4:], "--json", "--out", str(user.path / "again")])
+    assert status == 0
+    assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
+
+
+def test_folder_of_scenarios_is_a_suite(user: pytest.Pytester) -> None:
+    folder = user.mkdir("suite")
+    (folder / "good.toml").write_text(SHORT.format(head="seed = 5", expect=""))
+    (folder / "impatient.toml").write_text(
+        SHORT.format(head='rig = "rig.toml"', expect="late_slack_n = 0\nlate_information_ratio = 1.0")
+    )
+    shipped = Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-0-10v.toml"
+    (folder / "rig.toml").write_text(shipped.read_text())
+    (folder / "wrong.toml").write_text("samples = -1\n[excitation]\n")
+    result = run(user, "--dut", "inproc", "--scenario-dir", "suite", "-v", "-rA")
+    result.stdout.fnmatch_lines(["*good*PASSED*"])
+    result.stdout.fnmatch_lines(["*wrong.toml*samples must be in 1 .. *"])
+    assert result.parseoutcomes() == {"passed": 1, "failed": 2}
+    assert list(user.path.glob("build/runs/*impatient*/scenario.toml"))
+
+
+def test_inconclusive_play_fails_the_test_with_its_reason(user: pytest.Pytester) -> None:
+    user.path.joinpath("deaf.toml").write_text('kind = "inproc"\nwire_faults = "hang@from:150"\n')
+    user.makepyfile(PLAYS.format(assertion="pass"))
+    result = run(user, "--dut", "deaf.toml")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*INCONCLUSIVE: device deaf: no estimate for sample *"])
+
+
+def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Pytester) -> None:
+    user.makepyfile(
+        """
+        def test_first(play, dut):
+            dut.configure(dut.estimator.__class__(warm_up_n=33))
+            dut.close()
+
+        def test_second(play, dut):
+            assert dut.estimator.warm_up_n != 33
+            assert play("short.toml").detects()
+        """
+    )
+    run(user, "--dut", "host").assert_outcomes(passed=2)
+
+
+def test_device_elsewhere_belongs_to_one_worker(user: pytest.Pytester) -> None:
+    user.makepyfile("import pytest\n\n@pytest.mark.parametrize('n', range(4))\ndef test_it(n, dut):\n    pass\n")
+    result = user.runpytest_subprocess("-n", "2", "--dist", "load", "--dut", "serial:/dev/null")
+    result.stdout.fnmatch_lines(["*device serial:/dev/null: one worker owns it*"])
+
+
+def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
+    heavy = "{'numpy', 'hypothesis', 'scipy', 'can'}"
+    collect = "pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider', '/dev/null'])"
+    script = f"import sys, pytest; {collect}; print(sorted({heavy} & set(sys.modules)))"
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "harness.pytest_plugin"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment, cwd="/"
+    )
+    assert done.stdout.splitlines()[-1] == "[]"

@@ -1,0 +1,71 @@
+"""Trials without a line: what Bench plays, to the bit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from harness.bench import Bench
+from harness.devices import describe
+from harness.dut import open_dut
+from harness.rig import EmulatorRig, open_rig
+from harness.scenario import Scenario
+from harness.trials import BLOCK_SAMPLES, Trials, are_possible
+from harness.verdict import judge
+
+
+def emulator(name: str) -> EmulatorRig:
+    rig = open_rig(name)
+    assert isinstance(rig, EmulatorRig)
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("scenario_name", "rig_name"),
+    [("thesis", "emulator"), ("thesis", "emulator-0-10v"), ("shock", "emulator-skewed"), ("slow", "emulator-real")],
+)
+def test_trial_is_the_run_of_the_bench_to_the_bit(scenario_name: str, rig_name: str) -> None:
+    scenario, rig = Scenario.load(scenario_name), emulator(rig_name)
+    scenario = dataclasses.replace(scenario, samples=min(scenario.samples, 2000))
+    trial = Trials(rig, describe("inproc")).run(scenario, 7)
+    with open_dut("inproc", exchange="block") as dut:
+        run = Bench(rig, dut).play(scenario, 7)
+    assert trial.codes.tobytes() == run.codes.tobytes()
+    assert trial.clipped.tobytes() == run.clipped.tobytes()
+    assert trial.theta_hash() == run.theta_hash()
+    assert trial.alarm_index.tolist() == run.alarm_index.tolist()
+    assert trial.alarm_statistic.tobytes() == run.alarm_statistic.tobytes()
+    assert trial.conditions.segments == run.conditions.segments
+    assert trial.conditions.overloads == run.conditions.overloads
+    assert dict(trial.conditions.counters).items() <= dict(run.conditions.counters).items()
+    ours, theirs = (dataclasses.replace(judge(each), tweaks=()) for each in (trial, run))
+    assert ours == theirs
+    for mine, other in zip(judge(trial).tweaks, judge(run).tweaks, strict=True):
+        assert mine == dataclasses.replace(other, diagnosis=None)
+
+
+def test_alarms_alone_are_those_of_the_run_across_blocks() -> None:
+    thesis = Scenario.load("thesis")
+    late = tuple(dataclasses.replace(tweak, sample=tweak.sample + BLOCK_SAMPLES) for tweak in thesis.tweaks)
+    scenario = dataclasses.replace(thesis, samples=thesis.samples + BLOCK_SAMPLES, tweaks=late)
+    trials = Trials(emulator("emulator"), describe("inproc"))
+    alarms = trials.alarms(scenario, 3)
+    assert len(alarms) >= len(late)
+    assert alarms.tolist() == trials.run(scenario, 3).alarm_index.tolist()
+    assert alarms.tolist() == trials.alarms(scenario, 3).tolist()  # a trial leaves nothing behind
+
+
+def test_length_of_blocks_changes_no_code() -> None:
+    rig, scenario = emulator("emulator-real"), Scenario.load("thesis")
+    parts = [[block.codes for block in rig.perform(scenario, 5, n).blocks] for n in (64, 5000)]
+    assert np.concatenate(parts[0]).tobytes() == np.concatenate(parts[1]).tobytes()
+
+
+def test_device_whose_line_is_spoiled_needs_the_bench() -> None:
+    rig, device = emulator("emulator"), describe("inproc")
+    assert are_possible(rig, device)
+    assert not are_possible(rig, dataclasses.replace(device, wire_faults="flip@0.001"))
+    assert not are_possible(rig, dataclasses.replace(device, report_interval_n=10))
+    assert not are_possible(rig, describe("host"))
