@@ -184,7 +184,8 @@ def _comparison(comparison: Comparison) -> str:
         " shape n = 5 (estimator_c/README.md, <code>make cost</code>). The bound is the latency that no detector with"
         " a false alarm in 100,000 samples can beat on average. Ceilings: 1500 units for the prediction error, 300"
         " (simulation) and 500 (circuit) for the mean. Read missed and extra together: a scheme that raises an alarm"
-        f" every few samples misses nothing.</p>{tables}{_seeds(comparison)}</section>"
+        " every few samples misses nothing, and its samples without an equation are"
+        f" cheap.</p>{tables}{_seeds(comparison)}</section>"
     )
 
 
