@@ -99,6 +99,13 @@ _ERRATA = (
         " sides differ by R φ(k+1).",
     ),
     Erratum(
+        "Equ. A.2.3",
+        "φᵀ(t+1)φ(t+1) = [φᵀ(t) φ(t+1)][φ(t) φᵀ(t+1)], a product",
+        "φᵀ(t)φ(t) + φ(t+1)φᵀ(t+1), a sum",
+        "One more measurement adds a row φᵀ(t+1) to the matrix φ(t): stacked, the product of the two block matrices"
+        " is the sum. Equ. A.2.9, the inverse of P, has it right.",
+    ),
+    Erratum(
         "Sections 3.7 and 4.4.3",
         "the text between “…random walk modifications to the” and “It is visible from Fig. 3.8”, and between"
         " “…when the system changes the mean” and “between detectable faults to 0.04s”",

@@ -89,7 +89,7 @@ def chapter(circuit: Circuit) -> Chapter:
         " the 12 bits. Every estimate was made by the C device in a process of its own, over a serial line, from"
         " codes. Codes have a zero of their own, so an offset d is estimated along with θ; it takes the place of the"
         " detrending of section 4.3, which nobody can do while the data still come.",
-        figures=(*_circuit_figures(circuit, model), *_tracking_figures(circuit.noisy)),
+        figures=(*_circuit_figures(circuit, model), *_tracking_figures(circuit.noisy, circuit.quantised)),
         numbers=_numbers(circuit.identification, model),
         errata=_errata(model),
         claims=(*_identification_claims(circuit, model), *_tracking_claims(circuit)),
@@ -383,7 +383,7 @@ def _variances(u: Signal, y: Signal, model: Model) -> tuple[float, ...]:
 # Tracking
 
 
-def _tracking_figures(recording: Recording) -> tuple[Figure, ...]:
+def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figure, ...]:
     run, tracks = recording.run, recording.tracks
     mean, ours = tracks["mean-between-faults"], tracks["cusum"]
     segments = recording.segments
@@ -394,6 +394,7 @@ def _tracking_figures(recording: Recording) -> tuple[Figure, ...]:
     m_per_code = lsb_mm / 1e3
     ceiling = MEAN_CEILING / UNITS_PER_M / m_per_code
     predicted = displacement - mean.innovation * lsb_mm
+    calm = quantised.tracks["mean-between-faults"]
     return (
         Figure(
             "5.7",
@@ -414,20 +415,32 @@ def _tracking_figures(recording: Recording) -> tuple[Figure, ...]:
             f"Mean between faults with the printed ceiling of 500 units, {ceiling:.2f} LSB, off for the first 50"
             " samples. Orange: the batch estimates of the stretches between the changes, as in the thesis. b1 is"
             f" drawn 1e-6 lower, to make them distinguishable. At 1 LSB of noise the scheme raises {len(mean.alarms)}"
-            " alarms and never settles; Fig. 5.8 A shows our default on the same samples.",
+            " alarms and never settles; Fig. 5.8 B shows our default on the same samples.",
             marks(mean, segments, CHANGE_LABELS),
         ),
         Figure(
             "5.8 A",
-            "The same data, our default trigger.",
+            "The same without noise.",
+            (
+                *_estimate_panels(calm, _batch_estimates(quantised.run), quantised.run),
+                _statistic("Triggering sequence [LSB]", calm.statistic, ceiling),
+            ),
+            "Ideal amplifiers and no noise but that of the 12 bits, the same scheme and ceiling.",
+            marks(calm, segments, CHANGE_LABELS),
+        ),
+        Figure(
+            "5.8 B",
+            "The data of Fig. 5.8, our default trigger.",
             (
                 *_estimate_panels(ours, batch, run),
                 _statistic("Trigger: cumulative sum", ours.statistic, float(np.log(1e5))),
             ),
             "The device as it is shipped: three b's and an offset, of which those of u(k−1) and u(k−2) are drawn;"
-            " whitened equations; the ceiling is ln 100,000.",
+            " whitened equations; the ceiling is ln 100,000. After an alarm the b's, and with them M, B and K, are not"
+            " told apart before the next edge of the force, 50 samples after each change.",
             marks(ours, segments, CHANGE_LABELS),
         ),
+        _ceilings_figure(recording),
         Figure(
             "5.9",
             "Parameter estimates obtained using (a) forgetting factor, (b) Kalman filter.",
@@ -435,7 +448,8 @@ def _tracking_figures(recording: Recording) -> tuple[Figure, ...]:
                 _b_panel("(a) λ = 0.97", tracks["forgetting"], batch, run),
                 _b_panel("(b) R = identity matrix", tracks["random-walk"], batch, run),
             ),
-            "Only the b parameters, as in the thesis; b1 is drawn 1e-6 lower.",
+            "Only the b parameters, as in the thesis; b1 is drawn 1e-6 lower. What R = I means depends on the units of"
+            " u and y; here they are codes, as the device has them.",
             changes,
         ),
         Figure(
@@ -453,7 +467,6 @@ def _tracking_figures(recording: Recording) -> tuple[Figure, ...]:
             "Of the run of Fig. 5.8; predicted one sample ahead.",
             marks(mean, segments, CHANGE_LABELS),
         ),
-        _ceilings_figure(recording),
     )
 
 
@@ -535,7 +548,7 @@ def _ceilings_figure(recording: Recording) -> Figure:
         return Panel(title, label, curves, CEILINGS_LSB, "ceiling [LSB]", log_x=True)
 
     return Figure(
-        "5.8 B",
+        "5.8 C",
         "Every ceiling on the same data.",
         (panel("Changes missed", "of 4", 0), panel("Extra alarms", "in 1000 samples", 1)),
         "61 ceilings from 0.1 to 100 LSB on the samples of Fig. 5.7: low ones limit-cycle, since every reset of P"
@@ -588,7 +601,7 @@ def _tracking_claims(circuit: Circuit) -> tuple[Claim, ...]:
             " alarms in 1000 samples, and M, B, K converge after none of the changes (forgetting:"
             f" {_counts(forgetting)}). With quantisation alone: {quantised['mean-between-faults'].missed} missed,"
             f" {quantised['mean-between-faults'].extra_alarms} extra. No ceiling serves; the best of 61 each: {best}"
-            f" (Fig. 5.8 B). Our default on the same samples: {ours.missed} missed, {ours.extra_alarms} extra,"
+            f" (Fig. 5.8 C). Our default on the same samples: {ours.missed} missed, {ours.extra_alarms} extra,"
             f" converged after {_counts(ours)}.",
             {
                 "mean_between_faults": _plain(mean),
@@ -599,7 +612,7 @@ def _tracking_claims(circuit: Circuit) -> tuple[Claim, ...]:
                     " ".join((name, key, "|e|" if a else "e")): x for (name, key, a), x in sweeps.items()
                 },
             },
-            ("5.8", "5.8 A", "5.8 B"),
+            ("5.8", "5.8 A", "5.8 B", "5.8 C"),
         ),
         Claim(
             "5.9-forgetting",

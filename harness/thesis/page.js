@@ -1,6 +1,6 @@
 "use strict";
 (() => {
-  const HEIGHT_PX = 190;
+  const [HEIGHT_PX, PRINT_HEIGHT_PX] = [190, 136]; // two figures of two plots to a printed page
   const [LEFT_PX, RIGHT_PX] = [78, 16];
   const FONT = "12px system-ui, sans-serif";
   const PRINT_WIDTH_PX = 700; // an A4 page between its margins
@@ -143,11 +143,15 @@
     };
   }
 
+  function isPrinting() {
+    return document.documentElement.classList.contains("printing");
+  }
+
   function options(figure, panel, width, ink) {
     const wide = (u, values) => values.map((v) => (v === null ? "" : String(v)));
     return {
       width,
-      height: HEIGHT_PX,
+      height: isPrinting() ? PRINT_HEIGHT_PX : HEIGHT_PX,
       padding: [20, RIGHT_PX, 0, 0],
       cursor: { y: false, sync: { key: figure.number, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
       scales: { x: { time: false, distr: panel.log ? 3 : 1 }, y: { range: range(panel.shown) } },
@@ -179,12 +183,11 @@
   function draw(columns) {
     const style = getComputedStyle(document.documentElement);
     const ink = (name) => style.getPropertyValue(`--${name}`).trim();
-    const printing = document.documentElement.classList.contains("printing");
     plots.forEach((plot) => plot.destroy());
     plots = data.figures.flatMap((figure, i) => {
       const place = document.querySelector(`[data-figure="${i}"]`);
       place.replaceChildren();
-      const width = printing ? PRINT_WIDTH_PX : place.clientWidth;
+      const width = isPrinting() ? PRINT_WIDTH_PX : place.clientWidth;
       return figure.panels.map((panel) => drawn(figure, panel, columns, place, width, ink));
     });
   }
@@ -202,7 +205,7 @@
     const place = document.querySelector("[data-figure]");
     new ResizeObserver(() => {
       const width = place.clientWidth;
-      if (document.documentElement.classList.contains("printing") || plots[0].width === width) return;
+      if (!width || isPrinting() || plots[0].width === width) return;
       for (const plot of plots) plot.setSize({ width, height: HEIGHT_PX });
     }).observe(place);
   }

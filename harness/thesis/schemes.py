@@ -9,7 +9,8 @@ from typing import Any
 from harness.estimator_config import EstimatorConfig
 
 HOLD_N = 4
-"""Section 4.4.3: "After four samples, calculate the mean as normal"."""
+"""Section 4.4.3: "After four samples, calculate the mean as normal". Of the C they are four innovations: it begins its
+equations anew with the sample after an alarm, so that two samples go by before the first of them."""
 
 FORGETTING = 0.97
 
