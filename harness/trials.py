@@ -7,6 +7,7 @@ Only what the messages around them say is lacking: isolation's diagnoses, and th
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,11 @@ class Trials:
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
         found = [block.first + self._estimator.alarms(*_entered(block)) for block in performance.blocks]
         return np.concatenate(found)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The estimator's, of the last trial."""
+        return self._estimator.counters
 
     def run(self, scenario: Scenario, seed: int) -> Run:
         """One trial, for ``judge``; errors as ``alarms``."""

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from harness.bench import Bench
+from harness.catalogue import Counter
 from harness.cli import main
 from harness.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
 from harness.dut import Dut, connect, open_dut, reopen_dut
@@ -167,6 +168,31 @@ def test_slcan_device_that_dies_is_told_for_what_it_is() -> None:
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(LinkClosed, match="^device bob: the device process ended with status -9"):
             dut.identity()
+
+
+# ---- what a bus can carry
+
+
+def test_real_time_that_does_not_fit_the_bus_is_refused_with_the_arithmetic() -> None:
+    """At most 135 bits a frame (Davis et al. 2007): one there and eight back, 20,000 times a second, at 1 Mbit/s."""
+    with open_rig("emulator") as rig, connect(InprocDevice(name="bob", link="can", bitrate=1_000_000)) as dut:
+        with pytest.raises(ConfigurationError) as caught:
+            Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
+        assert str(caught.value) == (
+            "device bob: real time does not fit its line: 20000 samples/s, each of 135 us to the device and 1080 us"
+            " back (7 estimates every 1 samples), are 24.3 times what 1000000 bit/s carry; 24.3 times slower would fit"
+        )
+        short = Scenario(samples=56, excitation=THESIS.excitation)
+        assert Bench(rig, dut, real_time=24.31).play(short, seed=1).samples == 56
+
+
+def test_time_on_the_bus_is_that_of_all_frames() -> None:
+    with connect(InprocDevice(name="bob", link="can", bitrate=500_000, estimator=ESTIMATOR)) as dut:
+        dut.start()
+        dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+        alarms = dut.status()["alarms"]
+        frames = 9 * N + alarms + 1 + len(Counter)  # the question for the counters, and an answer for each
+        assert dut.line_s == pytest.approx(frames * 270e-6)
 
 
 # ---- on a bus with others
