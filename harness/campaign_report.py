@@ -7,34 +7,12 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 
 from harness.campaign_results import CONFIDENCE, Results, Summary, label
-from harness.report.page import part, policy
+from harness.report.page import FOLDER, assembled
 from harness.storage import replacing
 
-_PAGE = Template("""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="$policy">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-<main>
-<section class="outcome $outcome" aria-labelledby="outcome"><h1 id="outcome">$heading</h1>
-<p>$sentence</p></section>
-$maps
-<section aria-labelledby="cells"><h2 id="cells">Every cell</h2>
-$table
-</section>
-</main>
-</body>
-</html>
-""")
+_TEMPLATE = FOLDER / "campaign.html"
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 74, 34, 110, 26
 _DEEPEST = (0, 114, 178)
@@ -69,11 +47,12 @@ def write_page(results: Results, path: Path) -> None:
 
 def render(results: Results) -> str:
     """The page as text."""
-    style, spec, total = part("page.css"), results.plan.spec, results.total()
+    spec, total = results.plan.spec, results.total()
     scenario = str(results.plan.scenario["name"])
-    return _PAGE.substitute(
-        policy=policy([style], []),
-        style=style,
+    return assembled(
+        _TEMPLATE,
+        (FOLDER / "page.css",),
+        (),
         title=html.escape(f"campaign {spec.name}"),
         outcome=results.outcome(),
         heading=html.escape(f"Campaign {spec.name}: {results.outcome().upper()}"),

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 import can
+from can.interfaces.slcan import slcanBus
 
 from harness.child import Child
 from harness.errors import ConfigurationError, LinkClosed, LinkError
@@ -155,8 +156,14 @@ class PythonCanBus:
             number = _errno(error)
             if number is not None:
                 raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
-            self.damaged += 1
+            self._forget_damage(error)
             return None
+
+    def _forget_damage(self, error: Exception) -> None:
+        """python-can's slcan keeps a line that is no text for ever, and fails with each one after it."""
+        self.damaged += 1
+        if any(isinstance(each, UnicodeDecodeError) for each in _causes(error)) and isinstance(self._bus, slcanBus):
+            self._bus.flush()
 
     def close(self) -> None:
         with contextlib.suppress(Exception):  # of a bus that is gone

@@ -176,6 +176,7 @@ class Twin:
         self.mean, self.mean_n = 0.0, 0
         self.quiet_n = config.warm_up_n
         self.doubt: Doubt | None = None
+        self.slipped: Vector | None = None  # theta as a slip leaves it, from the next sample on
         self.slips = 0
         self.refreshes = 0
 
@@ -197,6 +198,7 @@ class Twin:
         self._enter_input(u)
         if self.pending:
             self.pending -= 1
+            self.theta, self.slipped = self.slipped or self.theta, None
             if not self.pending:
                 self.whitener.restart()
             step = TwinStep(statistic=self.statistic)
@@ -269,6 +271,8 @@ class Twin:
         if doubt is None:
             return None
         b = doubt.theta[config.na : config.na + config.nb]
+        if self.since_n >= config.nb + config.nk:
+            b = [0.0] * config.nb
         late = -sum(b[j] * self._height(config.nk + j, doubt.age_n) for j in range(config.nb))
         early = sum(b[j] * self._height(config.nk + j - 1, doubt.age_n) for j in range(config.nb))
         doubt.early = self._also_whitened(doubt.early, early)
@@ -277,11 +281,8 @@ class Twin:
         return believed - doubt.early[0], believed - doubt.late[0]
 
     def _height(self, lag: int, age_n: int) -> float:
-        """Of the edge ``lag`` samples ago, if it is one of those in doubt."""
-        if not 0 <= lag < age_n:
-            return 0.0
-        step = self.u[lag] - self.u[lag + 1]
-        return step if abs(step) >= self.config.edge_codes else 0.0
+        """Of the step of u ``lag`` samples ago, if it is one of those in doubt: after an edge it is noise."""
+        return self.u[lag] - self.u[lag + 1] if 0 <= lag < age_n else 0.0
 
     def _also_whitened(self, past: Vector, x: float) -> Vector:
         gains = self.whitener.latest
@@ -357,7 +358,7 @@ class Twin:
         first, last = config.na, config.na + config.nb
         b = believed[first:last]
         moved = [0.0, *b[:-1]] if self.rivals[1] < self.rivals[0] else [*b[1:], 0.0]
-        self.theta = [*believed[:first], *moved, *believed[last:]]
+        self.slipped = [*believed[:first], *moved, *believed[last:]]
         self.covariance.inflate(SLIP_DOUBT)
         self.statistic = min(self.rivals)
         self.slips += 1

@@ -4,6 +4,7 @@
 #include "est_trigger.h"
 
 #include <float.h>
+#include <stddef.h>
 
 #ifndef EST_ASSERT
 #ifdef NDEBUG  // a freestanding compiler has no assert.h
@@ -98,7 +99,7 @@ static bool in_this_build(const est_config_t* const config) {
 }
 
 bool est_config_valid(const est_config_t* const config) {
-    EST_ASSERT(config != 0);
+    EST_ASSERT(config != NULL);
     return orders_valid(config) && est_whitener_accepts(config->c, config->na) && variances_valid(config) &&
            codes_valid(config) && in_this_build(config) && est_trigger_config_valid(&config->trigger);
 }
@@ -139,18 +140,43 @@ static void restart(est_t* const self, const uint_fast8_t pending_n) {
     self->pending_n = (uint8_t)larger(self->pending_n, pending_n);
 }
 
-/// One sample less to come before the next equation is complete. What an alarm, or a new C, leaves to do to P is done here, where
-/// there is time: the step that finds it is long enough.
-static void gather(est_t* const self) {
-    self->pending_n--;
+/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
+/// did on u(k), or the other way round.
+static void follow_slip(est_t* const self, const bool late) {
+    const uint_fast8_t nb = self->config->nb;
+    float* const  b  = &self->theta[self->config->na];
+    for (uint_fast8_t i = 0U; i < self->count; i++) {
+        self->theta[i] = self->edges.theta[i];
+    }
+    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    if (late) {
+        shift(b, nb, 0.0F);
+        return;  // MISRA D4
+    }
+    for (uint_fast8_t j = 0U; j < nb; j++) {
+        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
+    }
+}
+
+/// What an alarm, a slip or a new C leaves to do to theta and P.
+static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_DOUBT)) {
         est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
+    } else if (EST_WITH_EDGES && (self->renewal != EST_RENEWAL_NONE)) {
+        follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else {
-        // P is as it should be
+        // they are as they should be
     }
     self->renewal = EST_RENEWAL_NONE;
+}
+
+/// One sample less to come before the next equation is complete. There is time here for what the step that found a change
+/// left to do: that one is long enough.
+static void gather(est_t* const self) {
+    self->pending_n--;
+    renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
         count(&self->counters.restarts);
@@ -176,10 +202,12 @@ static bool inside(const est_config_t* const config, const float code) {
 
 /// Whether the two are the same number, to the bit.
 static bool same(const float a, const float b) {
-    const union {
-        float    number;
+    typedef union {  // MISRA D5
+        float    number;  // cppcheck F4
         uint32_t bits;
-    } first = { .number = a }, second = { .number = b };
+    } est_bits_t;
+    const est_bits_t first  = { .number = a };  // MISRA D5
+    const est_bits_t second = { .number = b };  // MISRA D5
     return first.bits == second.bits;
 }
 
@@ -199,17 +227,17 @@ static bool stuck(est_t* const self, const float y, const bool edge) {
 /// An edge joins the doubt about earlier ones if another reading of those is ahead, and otherwise begins a doubt of its own.
 static void doubt_edge(est_t* const self) {
     if ((self->edges.age_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
-        return;
+        return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
-    est_edges_begin(&self->edges, self->config, self->theta, self->count, step, self->pending_n == 0U);
+    est_edges_begin(&self->edges, self->config, self->theta, step, self->pending_n == 0U);
     est_trigger_begin_doubt(&self->trigger);
 }
 
 static void enter_edge(est_t* const self) {
     self->edges.since_n = 0U;
     if (!EST_WITH_EDGES) {
-        return;
+        return;  // MISRA D4
     }
     if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         doubt_edge(self);
@@ -227,7 +255,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     const bool edge = self->known && est_edges_is_edge(config, self->u);
     if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
         count(&self->counters.stuck);
-        return EST_REFUSED;
+        return EST_REFUSED;  // MISRA D4
     }
     if (EST_WITH_WATCH || EST_WITH_EDGES || EST_WITH_ADAPTATION) {
         count(&self->edges.since_n);
@@ -241,7 +269,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     self->known = true;
     if (self->pending_n > 0U) {
         gather(self);
-        return EST_GATHERING;
+        return EST_GATHERING;  // MISRA D4
     }
     return EST_UPDATED;
 }
@@ -249,10 +277,10 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
 /// Whether the sample is one, and what will become of it.
 static est_status_t examine(est_t* const self, const est_sample_t sample) {
     if (!sample.valid) {
-        return EST_MISSING;
+        return EST_MISSING;  // MISRA D4
     }
     if (inside(self->config, sample.u) && inside(self->config, sample.y)) {
-        return enter_input(self, sample);
+        return enter_input(self, sample);  // MISRA D4
     }
     if (plausible(sample.u) && plausible(sample.y)) {
         count(&self->counters.saturated);
@@ -266,10 +294,11 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 /// they are taken against what was believed before the doubt.
 EST_INLINE void
 read_otherwise(est_t* const self, const est_shape_t shape, const float* const phi, float* const readings) {
-    const float e = est_equation_residual(phi, self->edges.theta, est_shape_count(shape));
+    const float e = (self->edges.age_n > 1U) ? est_equation_residual(phi, self->edges.theta, est_shape_count(shape))
+                                             : readings[0];  // theta has not moved since
     float       early;
     float       late;
-    est_edges_shares(&self->edges, self->config, &self->whitener, self->u, &early, &late);
+    est_edges_shares(&self->edges, shape, &self->whitener, self->u, &early, &late);
     readings[1] = e - early;
     readings[2] = e - late;
 }
@@ -295,31 +324,36 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
-/// Of the magnitudes of the two, the first of which is one.
-static float larger_magnitude(const float a, const float b) {
-    const float magnitude = (b < 0.0F) ? -b : b;
-    return (a < magnitude) ? magnitude : a;
+/// Whether one of the coefficients is further from the C in use than this.
+EST_INLINE bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
+    bool out = false;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        const float step = c[i] - whitener->c[i];
+        out              = out || (step > distance) || (step < -distance);
+    }
+    return out;
 }
 
 /// After convergence the noise of the equations is coloured by A itself (thesis section 3.5: noise on the output).
 static void refresh_prefilter(est_t* const self) {
     const uint_fast8_t na = self->config->na;
-    float         c[EST_NA_MAX];
-    float         factor = 1.0F;
-    float         step   = 0.0F;  // of the coefficient that moves most
-    for (uint_fast8_t i = 0U; i < na; i++) {
+    float c[EST_NA_MAX];
+    float factor = 1.0F;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         factor *= CONTRACTION;
-        c[i]  = self->theta[i] * factor;
-        step = larger_magnitude(step, c[i] - self->whitener.c[i]);
+        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
     }
-    if ((step > REFRESH_STEP) && est_whitener_accepts(c, na)) {
-        est_whitener_set(&self->whitener, c, na);
-        count(&self->counters.refreshes);
-        if (step > REFRESH_STRIDE) {
-            self->renewal = EST_RENEWAL_DOUBT;
-            restart(self, 1U);
-        }
+    if (!further(&self->whitener, c, REFRESH_STEP) || !est_whitener_accepts(c, EST_NA_MAX)) {
+        return;  // MISRA D4
     }
+    if (further(&self->whitener, c, REFRESH_STRIDE)) {
+        self->renewal = EST_RENEWAL_DOUBT;
+        restart(self, 1U);
+    }
+    est_whitener_set(&self->whitener, c, EST_NA_MAX);
+    count(&self->counters.refreshes);
 }
 
 static bool remembers_edge(const est_t* const self) {
@@ -330,7 +364,7 @@ static bool remembers_edge(const est_t* const self) {
 EST_INLINE void approach_refresh(est_t* const self) {
     self->refresh_in--;
     if (self->refresh_in > 0U) {
-        return;
+        return;  // MISRA D4
     }
     if ((self->edges.age_n > 0U) || !remembers_edge(self)) {
         self->refresh_in = 1U;
@@ -341,24 +375,6 @@ EST_INLINE void approach_refresh(est_t* const self) {
 }
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
-
-/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
-/// did on u(k), or the other way round. The statistic goes on as this reading has it, so that a change is not lost in it.
-static void follow_slip(est_t* const self) {
-    const uint_fast8_t nb = self->config->nb;
-    float* const  b  = &self->theta[self->config->na];
-    for (uint_fast8_t i = 0U; i < self->count; i++) {
-        self->theta[i] = self->edges.theta[i];
-    }
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
-    if (est_trigger_settle_late(&self->trigger)) {
-        shift(b, nb, 0.0F);
-        return;
-    }
-    for (uint_fast8_t j = 0U; j < nb; j++) {
-        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
-    }
-}
 
 static void zero(float* const x, const uint_fast8_t n) {
     for (uint_fast8_t i = 0U; i < n; i++) {
@@ -380,14 +396,14 @@ static void estimate_afresh(est_t* const self) {
 
 static void react(est_t* const self, const est_finding_t finding) {
     if (finding == EST_QUIET) {
-        return;
+        return;  // MISRA D4
     }
     if (!EST_WITH_EDGES || (finding == EST_ALARM)) {
         count(&self->counters.alarms);
         estimate_afresh(self);
     } else {
         count(&self->counters.slips);
-        follow_slip(self);
+        self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
     }
     forget_samples(self);  // they belong to the plant, or the clock, as it was
 }
@@ -452,11 +468,11 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
     const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = true };
     if (alike(shape, free_running)) {
         enter_equation(self, free_running, y, step);
-        return;
+        return;  // MISRA D4
     }
     if (alike(shape, locked)) {
         enter_equation(self, locked, y, step);
-        return;
+        return;  // MISRA D4
     }
 #endif
     enter_equation(self, shape, y, step);
@@ -497,9 +513,9 @@ est_config_t est_config_default(void) {
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
-    EST_ASSERT((self != 0) && (config != 0));
+    EST_ASSERT((self != NULL) && (config != NULL));
     if (!est_config_valid(config)) {
-        return false;
+        return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
     self->count          = (uint8_t)est_shape_count(est_shape_of(config));
@@ -514,7 +530,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 }
 
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
     step.statistic  = self->trigger.statistic;
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
@@ -531,42 +547,42 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
 }
 
 uint8_t est_theta_count(const est_t* const self) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     return self->count;
 }
 
 float est_theta(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != 0) && (index < self->count));
+    EST_ASSERT((self != NULL) && (index < self->count));
     return self->theta[index];
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != 0) && (index < self->count));
+    EST_ASSERT((self != NULL) && (index < self->count));
     return est_factors_variance(&self->factors, self->count, index);
 }
 
 float est_noise_variance(const est_t* const self) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     return self->noise_variance;
 }
 
 float est_prefilter(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != 0) && (index < EST_NA_MAX));
+    EST_ASSERT((self != NULL) && (index < EST_NA_MAX));
     return self->whitener.c[index];
 }
 
 est_counters_t est_counters(const est_t* const self) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     return self->counters;
 }
 
 bool est_invariants_hold(const est_t* const self) {
-    if ((self == 0) || (self->config == 0) || !est_config_valid(self->config) || (self->count != est_shape_count(est_shape_of(self->config)))) {
-        return false;
+    if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config) || (self->count != est_shape_count(est_shape_of(self->config)))) {
+        return false;  // MISRA D4
     }
     for (uint_fast8_t i = 0U; i < self->count; i++) {
         if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
-            return false;
+            return false;  // MISRA D4
         }
     }
     return within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);

@@ -37,8 +37,8 @@
 extern "C" {
 #endif
 
-#define EST_VERSION_MAJOR 0
-#define EST_VERSION_MINOR 1
+#define EST_VERSION_MAJOR 0  // MISRA D1
+#define EST_VERSION_MINOR 1  // MISRA D1
 
 /// The largest orders that est_init() accepts, and the most parameters. They fix the size of est_t; override them with -D.
 #ifndef EST_NA_MAX
@@ -197,7 +197,11 @@ typedef struct {
 } est_factors_t;
 
 /// The gains of so many equations are needed to find those of the next.
-#define EST_GAINS_KEPT ((EST_NA_MAX > 1U) ? (EST_NA_MAX - 1U) : 1U)
+#if EST_NA_MAX > 1
+#define EST_GAINS_KEPT (EST_NA_MAX - 1U)
+#else
+#define EST_GAINS_KEPT 1U
+#endif
 
 /// The last values of one whitened signal, newest first. Private.
 typedef struct {
@@ -238,6 +242,8 @@ typedef struct {
 #define EST_RENEWAL_NONE 0U
 #define EST_RENEWAL_RESET 1U  ///< P := P0, after an alarm
 #define EST_RENEWAL_DOUBT 2U  ///< less certain, after C has moved far
+#define EST_RENEWAL_EARLY 3U  ///< theta as before, but the edges of u come one sample earlier, and less certain
+#define EST_RENEWAL_LATE 4U   ///< one sample later
 
 /// The state of an estimator. The fields are private; read them through the functions below. The small ones come first: an
 /// offset below 128 bytes is a shorter instruction.
@@ -279,7 +285,7 @@ bool est_init(est_t* self, const est_config_t* config);
 
 /// Enters one sample: filters, regressor, U-D update (Bierman 1977), trigger.
 /// Cost: for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension; up to 1.3 times that when C is taken
-/// from A, 1.7 times while an edge is in doubt.
+/// from A, or an edge is in doubt.
 /// RAM: none beyond the state and some 300 bytes of stack. May be called from an interrupt.
 /// Bad data never fails and never enters the estimate: see est_status_t.
 est_step_t est_step(est_t* self, est_sample_t sample);
@@ -287,7 +293,8 @@ est_step_t est_step(est_t* self, est_sample_t sample);
 /// The number of parameters: na + nb + nc, and one more with the offset.
 uint8_t est_theta_count(const est_t* self);
 
-/// One element of theta; index in [0, est_theta_count()), asserted.
+/// One element of theta; index in [0, est_theta_count()), asserted. After a slip it is what the innovations that the slip
+/// explains have made of it until the next sample.
 float est_theta(const est_t* self, uint8_t index);
 
 /// One diagonal element of P [noise variances]; index in [0, est_theta_count()), asserted. Cost: O(n).

@@ -12,10 +12,12 @@
 #define EST_DOUBT_N 12U
 
 /// No edge is in doubt.
-void est_edges_forget(est_edges_t* self);
+EST_INLINE void est_edges_forget(est_edges_t* const self) { self->age_n = 0U; }
 
 /// One sample later, with an edge in doubt. A doubt that has lasted its term has been decided by est_trigger_step().
-void est_edges_age(est_edges_t* self);
+EST_INLINE void est_edges_age(est_edges_t* const self) {
+    self->age_n = (self->age_n < EST_DOUBT_N) ? (uint8_t)(self->age_n + 1U) : 0U;
+}
 
 /// True iff u[0] comes after an edge, the values of u newest first.
 static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
@@ -25,15 +27,50 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
 /// sample before had an equation, which an edge one sample early would have entered.
-void est_edges_begin(
-    est_edges_t* self, const est_config_t* config, const float* theta, uint_fast8_t count, float step, bool after_equation);
+EST_INLINE void est_edges_begin(est_edges_t* const        self,
+                     const est_config_t* const config,
+                     const float* const        theta,
+                     const float               step,
+                     const bool                after_equation) {
+    self->age_n = 1U;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        self->early.x[i] = 0.0F;
+        self->late.x[i]  = 0.0F;
+    }
+    if (after_equation && (config->nk == 0U)) {
+        self->early.x[0] = theta[config->na] * step;
+    }
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
+        self->theta[i] = theta[i];
+    }
+}
 
-/// What the edges, had they come early, and late, would have added to the present equation, whitened.
-void est_edges_shares(est_edges_t*          self,
-                      const est_config_t*   config,
-                      const est_whitener_t* whitener,
-                      const float*          u,
-                      float*                early,
-                      float*                late);
+/// What the edges, had they come early, and late, would have added to the present equation, whitened. One that is a sample
+/// early had its new level already in the sample before, and one that came late not yet in its own: u since the doubt began
+/// is moved by one place against y, its noise too.
+EST_INLINE void est_edges_shares(est_edges_t* const          self,
+                                 const est_shape_t           shape,
+                                 const est_whitener_t* const whitener,
+                                 const float* const          u,
+                                 float* const                early,
+                                 float* const                late) {
+    const float* const b         = &self->theta[shape.na];
+    float              early_raw = 0.0F;
+    float              late_raw  = 0.0F;
+    if (self->since_n < ((uint32_t)shape.nb + shape.nk)) {
+        EST_UNROLL
+        for (uint_fast8_t j = 0U; j < shape.nb; j++) {
+            const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);
+            late_raw -= b[j] * ((lag < self->age_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
+            if (lag > 0U) {
+                early_raw += b[j] * ((lag <= self->age_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
+            }
+        }
+    }
+    *early = est_filter(whitener->gain[0], &self->early, early_raw);
+    *late  = est_filter(whitener->gain[0], &self->late, late_raw);
+}
 
 #endif  // EST_EDGES_H_INCLUDED

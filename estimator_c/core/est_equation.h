@@ -27,14 +27,14 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
     float* out = phi;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < shape.na; i++) {
-        *out++ = -self->y[i];
+        *out++ = -self->y[i];  // MISRA D3
     }
     out = append(out, &self->u[shape.nk], shape.nb);
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
     if (shape.offset) {
-        *out++ = 1.0F;
+        *out++ = 1.0F;  // MISRA D3
     }
     *out = y;
 }
@@ -54,8 +54,8 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     const est_shape_t     shape,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
-    const uint_fast8_t count = est_shape_count(shape);
-    float* const  phi   = equation->phi;
+    const uint_fast8_t count = est_shape_count(shape);  // cppcheck F3
+    float* const  phi   = equation->phi;  // cppcheck F2
     float         gain[EST_NA_MAX];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -75,10 +75,10 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint_fast8_t      count       = est_shape_count(shape);
+    const uint_fast8_t      count       = est_shape_count(shape);  // cppcheck F3
     const float        remembering = 1.0F / config->forgetting;
     const float* const phi         = equation->phi;
-    float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled
+    float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled; MISRA D2
     float              alpha   = config->forgetting * equation->variance;
     float              inverse = (equation->variance > 1.0F) ? (remembering / equation->variance) : remembering;
     float*             column  = self->upper;
@@ -98,7 +98,7 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
         EST_UNROLL
         for (uint_fast8_t i = 0U; i < j; i++) {
             const float u = *column;
-            *column++     = u - (p * gain[i]);
+            *column++     = u - (p * gain[i]);  // MISRA D3
             gain[i] += u * v;
         }
         gain[j] = v;

@@ -6,14 +6,14 @@ void est_factors_reset(est_factors_t* const self, const est_config_t* const conf
     for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
         self->d[j] = est_factors_prior(config, shape, j);
         for (uint_fast8_t i = 0U; i < j; i++) {
-            *column++ = 0.0F;
+            *column++ = 0.0F;  // MISRA D3
         }
     }
 }
 
 /// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
 static void walk_row(est_factors_t* const self, const uint_fast8_t row, const float variance) {
-    float a[EST_THETA_MAX] = { 0.0F };
+    float a[EST_THETA_MAX] = { 0.0F };  // MISRA D2
     float c                = variance;
     a[row]                 = 1.0F;
     for (uint_fast8_t j = (uint_fast8_t)(row + 1U); j > 0U; j--) {

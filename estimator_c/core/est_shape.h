@@ -28,7 +28,7 @@
 
 /// A build for size would rather call a short function than have it everywhere.
 #if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
-#define EST_OUTLINE static __attribute__((noinline))
+#define EST_OUTLINE static __attribute__((noinline, unused))
 #else
 #define EST_OUTLINE static inline
 #endif

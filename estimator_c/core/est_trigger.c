@@ -4,6 +4,7 @@
 #include "est_shape.h"
 
 #include <float.h>
+#include <stddef.h>
 
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
@@ -46,21 +47,21 @@ static float other_statistic(est_trigger_t* const              self,
                              const float                       precision) {
     switch (config->kind) {
     case EST_TRIGGER_PREDICTION_ERROR:
-        return magnitude(innovation);
+        return magnitude(innovation);  // MISRA D4
     case EST_TRIGGER_MEAN_BETWEEN_FAULTS:
-        return mean_between_faults(self, config->absolute, innovation);
+        return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
     case EST_TRIGGER_NONE:
-        return no_statistic(innovation);
+        return no_statistic(innovation);  // MISRA D4
     case EST_TRIGGER_CUSTOM:
     case EST_TRIGGER_CUSUM:
     default:
-        return custom(self, config, innovation, 1.0F / precision);
+        return custom(self, config, innovation, 1.0F / precision);  // MISRA D4
     }
 }
 
 /// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
-EST_OUTLINE float cusum(const float before, const float innovation, const float precision) {
-    const float sum = before + (CUSUM_GAIN * innovation * innovation * precision) - CUSUM_DRIFT;
+EST_OUTLINE float cusum(const float before, const float innovation, const float weight) {
+    const float sum = before + ((innovation * innovation * weight) - CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
@@ -71,15 +72,17 @@ EST_OUTLINE float best_rival(const est_trigger_t* const self) {
 
 /// The plant has changed only if no reading of the edges explains the innovations.
 static est_finding_t
-find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const readings, const float precision, const bool expires) {
+find_in_doubt(
+    est_trigger_t* const self, const float ceiling, const float* const readings, const float weight, const bool expires) {
+    EST_UNROLL
     for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = cusum(self->rival[i], readings[i + 1U], precision);
+        self->rival[i] = cusum(self->rival[i], readings[i + 1U], weight);
     }
     if (self->statistic < ceiling) {
-        return EST_QUIET;
+        return EST_QUIET;  // MISRA D4
     }
     if (best_rival(self) < ceiling) {
-        return expires ? EST_SLIP : EST_QUIET;
+        return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
     }
     return EST_ALARM;
 }
@@ -87,7 +90,7 @@ find_in_doubt(est_trigger_t* const self, const float ceiling, const float* const
 bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
                        (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
-                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != 0));
+                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
@@ -99,15 +102,9 @@ void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
     est_trigger_begin_doubt(self);
 }
 
-void est_trigger_begin_doubt(est_trigger_t* const self) {
-    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
-        self->rival[i] = self->statistic;
-    }
-}
-
 est_finding_t est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
-        return EST_SLIP;
+        return EST_SLIP;  // MISRA D4
     }
     if (est_trigger_in_doubt(self)) {
         self->statistic = best_rival(self);
@@ -136,9 +133,10 @@ est_finding_t est_trigger_step(est_trigger_t* const              self,
         self->quiet_n--;
         self->statistic = no_statistic(readings[0]);
     } else if (config->kind == EST_TRIGGER_CUSUM) {
-        self->statistic = cusum(self->statistic, readings[0], precision);
+        const float weight = CUSUM_GAIN * precision;
+        self->statistic = cusum(self->statistic, readings[0], weight);
         if (EST_WITH_EDGES && (doubt_n > 0U)) {
-            return find_in_doubt(self, config->ceiling, readings, precision, doubt_n >= EST_DOUBT_N);
+            return find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);  // MISRA D4
         }
     } else if (EST_WITH_TRIGGERS) {
         self->statistic = other_statistic(self, config, readings[0], precision);

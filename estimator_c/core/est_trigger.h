@@ -5,7 +5,7 @@
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
 
-#include "est.h"
+#include "est_shape.h"
 
 /// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
 bool est_trigger_config_valid(const est_trigger_config_t* config);
@@ -20,7 +20,12 @@ typedef enum {
 void est_trigger_restart(est_trigger_t* self, uint16_t quiet_n);
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
-void est_trigger_begin_doubt(est_trigger_t* self);
+EST_OUTLINE void est_trigger_begin_doubt(est_trigger_t* const self) {
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+        self->rival[i] = self->statistic;
+    }
+}
 
 /// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
 /// had already passed the ceiling, another reading explained them: a slip. Else the statistic goes on from the best reading.

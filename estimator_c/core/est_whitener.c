@@ -3,38 +3,6 @@
 /// The gains have come to C once the variance of the noise is below this; what is left makes no difference worth the name.
 #define SETTLED 1.0001F
 
-/// Reflection coefficients beyond this belong to a C that filters the data into overflow.
-#define REFLECTION_MAX 0.9999F
-
-/// Schur-Cohn (step-down): all zeros are inside iff every reflection coefficient is below 1.
-bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
-    float a[EST_NA_MAX];
-    for (uint_fast8_t i = 0U; i < na; i++) {
-        a[i] = c[i];
-    }
-    for (uint_fast8_t order = na; order > 0U; order--) {
-        const float k = a[order - 1U];
-        if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
-            return false;
-        }
-        const float rest = 1.0F - (k * k);
-        for (uint_fast8_t i = 0U; ((2U * i) + 1U) < order; i++) {
-            float* const mirror = &a[order - 2U - i];
-            const float  lower  = (a[i] - (k * *mirror)) / rest;
-            *mirror             = (*mirror - (k * a[i])) / rest;
-            a[i]                = lower;
-        }
-    }
-    return true;
-}
-
-void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
-    for (uint_fast8_t i = 0U; i < na; i++) {
-        self->c[i]       = c[i];
-        self->gain[0][i] = c[i];
-    }
-}
-
 void est_whitener_restart(est_whitener_t* const self) {
     self->n       = 0U;
     self->settled = false;
@@ -56,7 +24,7 @@ static float autocovariance(const float* const c, const uint_fast8_t lag) {
 }
 
 /// The gains of a new equation.
-static void remember(est_whitener_t* const self, const float* const gain, const float variance) {
+EST_INLINE void remember(est_whitener_t* const self, const float* const gain, const float variance) {
     EST_UNROLL
     for (uint_fast8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
         self->precision[row] = self->precision[row - 1U];
@@ -67,11 +35,10 @@ static void remember(est_whitener_t* const self, const float* const gain, const 
         }
     }
     self->precision[0] = 1.0F / variance;
-    self->settled      = variance < SETTLED;
     self->n            = (uint8_t)(self->n + ((self->n < EST_NA_MAX) ? 1U : 0U));
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->gain[0][i] = self->settled ? self->c[i] : gain[i];
+        self->gain[0][i] = gain[i];
     }
 }
 
@@ -85,16 +52,19 @@ float est_whitener_advance(est_whitener_t* const self) {
         float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
         EST_UNROLL
         for (uint_fast8_t m = EST_NA_MAX; m > i; m--) {
-            sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];
+            sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];  // cppcheck F1
         }
         covariance[i - 1U] = sum;
         gain[i - 1U]       = sum * self->precision[i - 1U];
         variance -= sum * gain[i - 1U];
     }
-    remember(self, gain, variance);
-    return self->settled ? 1.0F : variance;
+    if (variance < SETTLED) {
+        self->settled = true;
+        variance      = 1.0F;
+        est_whitener_set(self, self->c, EST_NA_MAX);
+    } else {
+        remember(self, gain, variance);
+    }
+    return variance;
 }
 
-float est_whitener_filter(const est_whitener_t* const self, est_past_t* const past, const float x) {
-    return est_filter(self->gain[0], past, x);
-}

@@ -8,11 +8,43 @@
 
 #include "est_shape.h"
 
+/// Reflection coefficients beyond this belong to a C that filters the data into overflow.
+#define REFLECTION_MAX 0.9999F
+
 /// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
-bool est_whitener_accepts(const float* c, uint_fast8_t na);
+/// Schur-Cohn (step-down): all zeros are inside iff every reflection coefficient is below 1.
+EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
+    float a[EST_NA_MAX] = { 0.0F };  // MISRA D2
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        a[i] = (i < na) ? c[i] : 0.0F;
+    }
+    EST_UNROLL
+    for (uint_fast8_t order = EST_NA_MAX; order > 0U; order--) {
+        const float k = a[order - 1U];
+        if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
+            return false;  // MISRA D4
+        }
+        const float rest = 1.0F - (k * k);
+        EST_UNROLL
+        for (uint_fast8_t i = 0U; ((2U * i) + 1U) < order; i++) {
+            float* const mirror = &a[order - 2U - i];
+            const float  lower  = (a[i] - (k * *mirror)) / rest;
+            *mirror             = (*mirror - (k * a[i])) / rest;
+            a[i]                = lower;
+        }
+    }
+    return true;
+}
 
 /// From now on C is this; how the next equations hang together with those before is kept.
-void est_whitener_set(est_whitener_t* self, const float* c, uint_fast8_t na);
+EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        self->c[i]       = (i < na) ? c[i] : 0.0F;
+        self->gain[0][i] = self->c[i];
+    }
+}
 
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
@@ -32,8 +64,5 @@ EST_INLINE float est_filter(const float* const gain, est_past_t* const past, con
     past->x[0] = out;
     return out;
 }
-
-/// Whitens another signal along with the equations.
-float est_whitener_filter(const est_whitener_t* self, est_past_t* past, float x);
 
 #endif  // EST_WHITENER_H_INCLUDED

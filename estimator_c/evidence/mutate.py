@@ -2,7 +2,9 @@
 
 `make mutate` makes each mutant, runs the tests on it until one fails, and prints those that none notices. MUTATION.md
 explains them; one that it does not explain, or an explanation whose mutant is noticed or gone, is a failure.
-ARGS="--sample 60" takes so many of them by chance, --seed 2 others.
+ARGS="--sample 60" takes so many of them by chance, --seed 2 others. What became of each is written as soon as it is
+known: ARGS=--resume goes on with a run that ended early, and after a change of core or tests tries again what the
+change may have altered: the mutants of functions that were rewritten, and the survivors that nobody has explained.
 
 The tests are loaded once and forked for each mutant, and what they simulate is kept: two to ten seconds a mutant.
 """
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import dataclasses
 import functools
 import hashlib
 import importlib
@@ -19,14 +22,14 @@ import json
 import multiprocessing
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,7 +39,19 @@ import hypothesis
 import pytest
 from hypothesis import Phase
 
-__all__ = ["EXPLAINED", "Mutant", "Outcome", "explained", "main", "mutants", "sampled", "tried"]
+__all__ = [
+    "EXPLAINED",
+    "Mutant",
+    "Outcome",
+    "explained",
+    "main",
+    "mutants",
+    "recalled",
+    "sampled",
+    "sources",
+    "tried",
+    "write",
+]
 
 ROOT = Path(__file__).parents[2]
 CORE = ROOT / "estimator_c" / "core"
@@ -51,8 +66,8 @@ SEARCHING = (
 """Left out where not even a bit is different in the 129,600 steps of bit_exact.c."""
 
 LONG = "not ten_million and not long_free_running and not rarer_than_promised"
-DEADLINE_S = 60.0
-"""A mutant may not come to an end."""
+DEADLINE_S = 60
+"""A mutant may not come to an end. In seconds of the processor: the machine may be busy."""
 
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
@@ -119,7 +134,7 @@ class Mutant:
     @property
     def key(self) -> tuple[str, str, str, str]:
         """What it is called, wherever the line has moved to."""
-        return self.file, self.function, self.before.strip(), self.after.strip()
+        return self.file, self.function, code_of(self.before).strip(), code_of(self.after).strip()
 
 
 @dataclass(frozen=True)
@@ -131,11 +146,18 @@ class Outcome:
     """killed, survived, equivalent (the same machine code), or invalid (it does not compile)."""
     by: str = ""
     """The test that noticed it."""
+    source: str = ""
+    """A digest of the function that was altered, as it was."""
+
+
+def code_of(line: str) -> str:
+    """Without a remark."""
+    return line.split("//", maxsplit=1)[0]
 
 
 def altered(line: str) -> Iterator[str]:
     """The line with each alteration in turn."""
-    code = line.split("//", maxsplit=1)[0]
+    code = code_of(line)
 
     def put(start: int, end: int, text: str) -> str:
         return line[:start] + text + line[end:]
@@ -162,17 +184,35 @@ def mutants() -> list[Mutant]:
 
 
 def _mutants_of(path: Path) -> Iterator[Mutant]:
+    for number, function, line in _lines_of(path):
+        yield from (Mutant(path.name, number, function, line, after) for after in altered(line))
+
+
+def _lines_of(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Number, function or macro, and text of each line that may be altered."""
     function = ""
     for number, line in enumerate(path.read_text().splitlines(), 1):
         constant, definition = CONSTANT.match(line), DEFINITION.match(line)
         if definition:
             function = definition[1]
         if constant and not SETTING.search(constant[1]):
-            yield from (Mutant(path.name, number, constant[1], line, after) for after in altered(line))
+            yield number, constant[1], line
         elif function and not line.startswith("#") and "EST_ASSERT" not in line:
-            yield from (Mutant(path.name, number, function, line, after) for after in altered(line))
+            yield number, function, line
         if (line.rstrip().endswith("}") and (line.startswith("}") or definition)) or line.endswith(");"):
             function = function if line.startswith(" ") else ""
+
+
+@functools.cache
+def sources() -> dict[tuple[str, str], str]:
+    """A digest of each function and macro of the core, by file and name; remarks do not count."""
+    text: dict[tuple[str, str], list[str]] = {}
+    for path in sorted(CORE.glob("*.[ch]")):
+        for _, function, line in _lines_of(path):
+            text.setdefault((path.name, function), []).append(code_of(line).strip())
+    return {
+        where: hashlib.sha256("\n".join(filter(None, lines)).encode()).hexdigest()[:16] for where, lines in text.items()
+    }
 
 
 def sampled(every: Sequence[Mutant], count: int, seed: int = 1) -> list[Mutant]:
@@ -200,6 +240,51 @@ def explained() -> dict[tuple[str, str, str, str], str]:
         elif line.startswith("+ "):
             found[*where, before, line[2:]] = heading
     return found
+
+
+# ---- what is known of an earlier run
+
+
+def _numbered(every: Iterable[Mutant]) -> Iterator[tuple[Mutant, tuple[object, ...]]]:
+    """Each with a name of its own: its key, and how many of that key came before it."""
+    seen: Counter[tuple[str, str, str, str]] = Counter()
+    for mutant in every:
+        yield mutant, (*mutant.key, seen[mutant.key])
+        seen[mutant.key] += 1
+
+
+def recalled(
+    record: Path, every: Sequence[Mutant], known: Container[tuple[str, str, str, str]]
+) -> dict[Mutant, Outcome]:
+    """The outcomes of an earlier run that still hold: the function is as it was, and a survivor has been explained."""
+    if not record.exists():
+        return {}
+    before = [
+        Outcome(**{**outcome, "mutant": Mutant(**outcome["mutant"])})
+        for outcome in json.loads(record.read_text())["mutants"]
+    ]
+    names = dict(_numbered(outcome.mutant for outcome in before))
+    outcomes = {names[outcome.mutant]: outcome for outcome in before}
+    held = {}
+    for mutant, name in _numbered(every):
+        outcome = outcomes.get(name)
+        if outcome is None or outcome.source != sources()[mutant.file, mutant.function]:
+            continue
+        if outcome.fate != "survived" or mutant.key in known:
+            held[mutant] = dataclasses.replace(outcome, mutant=mutant)
+    return held
+
+
+def write(record: Path, outcomes: Iterable[Outcome]) -> None:
+    """All at once: a run may be ended at any time."""
+    ordered = sorted(outcomes, key=lambda outcome: (outcome.mutant.file, outcome.mutant.line, outcome.mutant.after))
+    fates = Counter(outcome.fate for outcome in ordered)
+    record.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = record.with_suffix(".unfinished")
+    unfinished.write_text(
+        json.dumps({"fates": fates, "mutants": [asdict(outcome) for outcome in ordered]}, indent=1) + "\n"
+    )
+    unfinished.replace(record)
 
 
 # ---- the tests, loaded once
@@ -279,22 +364,19 @@ def _in_a_fork(tests: Sequence[str]) -> str:
     receiver, sender = os.pipe()
     child = os.fork()
     if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (DEADLINE_S, resource.RLIM_INFINITY))
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, 1)
         os.dup2(nothing, 2)
         os.write(sender, _first_failure(tests).encode())
         os._exit(0)
     os.close(sender)
-    deadline = time.monotonic() + DEADLINE_S
-    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            os.close(receiver)
-            return "no end"
-        time.sleep(0.01)
     with os.fdopen(receiver) as pipe:
-        return pipe.read() if ended[1] == 0 else f"crash: {ended[1]}"
+        said = pipe.read()
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if status == -signal.SIGXCPU:
+        return "no end"
+    return said if status == 0 else f"crash: {status}"
 
 
 # ---- the mutants
@@ -389,7 +471,9 @@ def tried(chosen: Sequence[Mutant], jobs: int = 2) -> Iterator[Outcome]:
             raise RuntimeError(f"the tests fail on the core as it is: {failed}")
         with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
             work = functools.partial(_try, plain=plain, expected=expected)
-            yield from pool.map(work, chosen, chunksize=1)
+            for outcome in pool.map(work, chosen, chunksize=1):
+                where = (outcome.mutant.file, outcome.mutant.function)
+                yield dataclasses.replace(outcome, source=sources()[where])
 
 
 def main() -> int:
@@ -400,26 +484,25 @@ def main() -> int:
     parser.add_argument("--only", default="", help="mutants of the files whose name contains this")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "mutation.json")
+    parser.add_argument("--resume", action="store_true", help="keep what still holds of the run that wrote --out")
     arguments = parser.parse_args()
     every = [mutant for mutant in mutants() if arguments.only in mutant.file]
     chosen = every
     if arguments.sample is not None:
         chosen = sampled(every, arguments.sample, arguments.seed)
     known = explained()
-    outcomes = []
-    for outcome in tried(chosen, arguments.jobs):
-        outcomes.append(outcome)
+    outcomes = recalled(arguments.out, chosen, known) if arguments.resume else {}
+    for outcome in tried([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs):
+        outcomes[outcome.mutant] = outcome
+        write(arguments.out, outcomes.values())
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             print(shown(outcome.mutant.key), flush=True)
-    fates = Counter(outcome.fate for outcome in outcomes)
+    fates = Counter(outcome.fate for outcome in outcomes.values())
     print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
-    survivors = {outcome.mutant.key for outcome in outcomes if outcome.fate == "survived"}
+    survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}
     stale = known.keys() - survivors if chosen == every and not arguments.only else set()
     for key in sorted(stale):
         print(f"explained, but noticed or gone:\n{shown(key)}")
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    record = {"fates": fates, "mutants": [asdict(outcome) for outcome in outcomes]}
-    arguments.out.write_text(json.dumps(record, indent=1) + "\n")
     return 1 if stale or survivors - known.keys() else 0
 
 

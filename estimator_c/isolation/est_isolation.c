@@ -1,5 +1,7 @@
 #include "est_isolation.h"
 
+#include <stddef.h>
+
 #ifndef EST_ASSERT
 #ifdef NDEBUG  // a freestanding compiler has no assert.h
 #define EST_ASSERT(x) ((void)0)
@@ -97,16 +99,16 @@ static bool believe(est_believed_t* const self, const est_config_t* const config
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
     if ((a2 < 1.0e-6F) || (a2 >= 1.0F) || (sum < 1.0e-6F)) {
-        return false;
+        return false;  // MISRA D4
     }
     const float cosh_w = -a1 / (2.0F * root(a2));
     const float p      = -logarithm(a2);
     if (cosh_w < -0.9F) {
-        return false;
+        return false;  // MISRA D4
     }
     const float q = (0.25F * p * p) - squared_arcosh(cosh_w);
     if (q <= 0.0F) {
-        return false;
+        return false;  // MISRA D4
     }
     const float first  = a1 + (2.0F * a2);
     const float second = a1 + (4.0F * a2);
@@ -150,7 +152,7 @@ static float pushed(const est_isolation_t* const self, const uint32_t ago, const
     if (age_n == 1U) {
         const float direct = (config->nk == 0U) ? b[0] : 0.0F;
         const float whole  = self->believed.gain * self->believed.hold;
-        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));
+        return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));  // MISRA D4
     }
     float out = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
@@ -281,7 +283,7 @@ static est_change_t verdict(const est_fit_t* const fit, const float unit, const 
             const uint8_t pair   = (uint8_t)(one + other - 1U);
             const float   second = fit->pair[pair] - fit->alone[one];
             if (second > (NOT_BY_CHANCE * unit)) {
-                return EST_CHANGE_SEVERAL;
+                return EST_CHANGE_SEVERAL;  // MISRA D4
             }
             ruled = ruled && (second < (BY_CHANCE * unit)) && (fit->certainty[pair] > (RULED_OUT * noise_variance)) &&
                     ((fit->alone[one] - fit->alone[other]) >= (SURE * unit));
@@ -293,7 +295,7 @@ static est_change_t verdict(const est_fit_t* const fit, const float unit, const 
 /// 1 - old/new of M; new/old - 1 of B and K.
 static float extent_of(const est_change_t change, const float x) {
     if (change == EST_CHANGE_MASS) {
-        return (x < 0.99F) ? (1.0F / (1.0F - x)) : 100.0F;
+        return (x < 0.99F) ? (1.0F / (1.0F - x)) : 100.0F;  // MISRA D4
     }
     return 1.0F + x;
 }
@@ -303,14 +305,14 @@ static void diagnose(est_isolation_t* const self) {
     const float            unit = 2.0F * self->noise_variance;
     const uint16_t         to_alarm_n = self->onsets[0].before_n;
     if (self->worked_n <= to_alarm_n) {
-        return;
+        return;  // MISRA D4
     }
     out->samples_n = (uint16_t)(self->worked_n - to_alarm_n);
     if (out->change == EST_CHANGE_UNDECIDED) {
         out->change = verdict(&self->fit, unit, self->noise_variance);
     }
     if ((out->change == EST_CHANGE_UNDECIDED) || (out->change == EST_CHANGE_SEVERAL)) {
-        return;
+        return;  // MISRA D4
     }
     const uint8_t one   = (uint8_t)((uint8_t)out->change - 1U);
     const float   level = self->fit.alone[one] - (2.0F * unit);
@@ -339,7 +341,7 @@ static void stop(est_isolation_t* const self) {
 /// closer together. What a push makes up for is an onset so far off that the force of the change has not yet moved y.
 static uint32_t spacing(const uint8_t quiet_n) {
     if (quiet_n < 5U) {
-        return 1U;
+        return 1U;  // MISRA D4
     }
     return (quiet_n < 9U) ? 2U : 4U;
 }
@@ -363,7 +365,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     self->since_n   = 0U;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config, self->force_zero)) {
-        return;
+        return;  // MISRA D4
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
         const uint8_t held_n = (quiet_n < EARLIEST_N) ? quiet_n : (uint8_t)EARLIEST_N;
@@ -379,7 +381,7 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
 }
 
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
-    EST_ASSERT((self != 0) && (config != 0));
+    EST_ASSERT((self != NULL) && (config != NULL));
     *self           = (est_isolation_t){ .config = config, .force_zero = force_zero };
     self->quiet_n   = NEVER;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
@@ -410,12 +412,12 @@ static void enter_quiet(est_isolation_t* const self, const est_t* const estimato
 }
 
 void est_isolation_enter(est_isolation_t* const self, const est_t* const estimator, const est_sample_t sample, const est_step_t step) {
-    EST_ASSERT((self != 0) && (estimator != 0));
+    EST_ASSERT((self != NULL) && (estimator != NULL));
     self->since_n = one_more(self->since_n);
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
         self->known_n = 0U;
         stop(self);
-        return;
+        return;  // MISRA D4
     }
     keep(self, sample, step.innovation);
     if (self->active) {
@@ -432,9 +434,9 @@ void est_isolation_enter(est_isolation_t* const self, const est_t* const estimat
 }
 
 bool est_isolation_work(est_isolation_t* const self) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     if (!self->active || (self->waiting_n == 0U)) {
-        return false;
+        return false;  // MISRA D4
     }
     const uint32_t     ago   = self->waiting_n - 1U;
     est_onset_t* const onset = &self->onsets[self->turn];
@@ -458,6 +460,6 @@ bool est_isolation_work(est_isolation_t* const self) {
 }
 
 est_diagnosis_t est_isolation_diagnosis(const est_isolation_t* const self) {
-    EST_ASSERT(self != 0);
+    EST_ASSERT(self != NULL);
     return self->diagnosis;
 }

@@ -34,6 +34,20 @@ def test_operators_constants_conditions_and_statements_are_altered(line: str, ex
     assert bool(altered) == bool(expected)
 
 
+def test_a_resumed_run_keeps_what_neither_core_nor_tests_have_made_doubtful(tmp_path: Path) -> None:
+    kept, rewritten, explained, unexplained = every = mutate.sampled(mutate.mutants(), 4)
+    digests = {mutant: mutate.sources()[mutant.file, mutant.function] for mutant in every}
+    outcomes = [
+        mutate.Outcome(kept, "killed", "a test", digests[kept]),
+        mutate.Outcome(rewritten, "killed", "a test", "another"),
+        mutate.Outcome(explained, "survived", "other bits", digests[explained]),
+        mutate.Outcome(unexplained, "survived", "other bits", digests[unexplained]),
+    ]
+    record = tmp_path / "mutation.json"
+    mutate.write(record, outcomes)
+    assert set(mutate.recalled(record, mutate.mutants(), {explained.key}).values()) == {outcomes[0], outcomes[2]}
+
+
 @pytest.mark.timeout(900)
 def test_mutants_by_chance_are_noticed_or_explained(tmp_path: Path) -> None:
     """In a process of its own: every test there has the library of a mutant."""
