@@ -207,7 +207,7 @@ def until_lines(process: subprocess.Popen[bytes], path: Path, lines: int) -> Non
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     tmp_path: Path, ended_by: signal.Signals, status: int
 ) -> None:
-    spec = SPEC.replace("trials = 6", "trials = 200").replace("chunk = 2", "chunk = 5")
+    spec = SPEC.replace("trials = 6", "trials = 120").replace("chunk = 2", "chunk = 5")
     plan, out = planned(tmp_path, spec), tmp_path / "out.json"
     process = started(tmp_path / "spec.toml", out)
     until_lines(process, journal_of(out), 4)
