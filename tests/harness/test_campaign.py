@@ -154,6 +154,19 @@ def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, refere
         assert not journal_of(out).exists()
 
 
+def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
+    path, digest = tmp_path / "out.json.journal", planned(tmp_path).digest()
+    with Journal(path, digest) as journal:
+        journal.add(Chunk((0, 0)), [])
+        journal.add(Chunk((0, 1)), [])
+    path.write_bytes(path.read_bytes()[:-3])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0)]
+        journal.add(Chunk((1, 0)), [])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0), (1, 0)]
+
+
 def test_damaged_line_of_a_journal_is_played_again(tmp_path: Path, reference: Path) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.json"
     with Journal(journal_of(out), plan.digest()) as journal:
@@ -194,7 +207,7 @@ def until_lines(process: subprocess.Popen[bytes], path: Path, lines: int) -> Non
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     tmp_path: Path, ended_by: signal.Signals, status: int
 ) -> None:
-    spec = SPEC.replace("trials = 6", "trials = 200").replace("chunk = 2", "chunk = 5")
+    spec = SPEC.replace("trials = 6", "trials = 120").replace("chunk = 2", "chunk = 5")
     plan, out = planned(tmp_path, spec), tmp_path / "out.json"
     process = started(tmp_path / "spec.toml", out)
     until_lines(process, journal_of(out), 4)
