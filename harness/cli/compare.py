@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,10 +37,12 @@ def _probability(text: str) -> float:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
     from harness.comparison import compare, load
 
     found = compare(load(arguments.a), load(arguments.b), arguments.alpha)
-    show(json.dumps(dataclasses.asdict(found)) if arguments.json else _text(found))
+    show(json.dumps(asdict(found)) if arguments.json else _text(found))
     if not found.differences:
         return complain("INCONCLUSIVE: the two sides have nothing that can be compared", INCONCLUSIVE)
     return FAILED if found.worse else PASSED
