@@ -6,6 +6,7 @@ when the power went is not there; everything before it is.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import zlib
@@ -33,12 +34,11 @@ class Journal:
         self.rows: dict[Chunk, list[Row]] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("a+b")
-            self._lock()
-            whole = self._read(digest)
-            self._file.truncate(whole)
-            if not whole:
-                self._write({"format": FORMAT, "plan": digest})
+            with contextlib.ExitStack() as opened:
+                self._file = opened.enter_context(path.open("a+b"))
+                self._lock()
+                self._begin(digest)
+                opened.pop_all()
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from error
 
@@ -72,6 +72,12 @@ class Journal:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise ConfigurationError(f"{self.path}: another campaign is writing to it") from error
+
+    def _begin(self, digest: str) -> None:
+        whole = self._read(digest)
+        self._file.truncate(whole)
+        if not whole:
+            self._write({"format": FORMAT, "plan": digest})
 
     def _read(self, digest: str) -> int:
         """Takes in all whole lines; the number of their bytes."""

@@ -7,34 +7,12 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 
 from harness.campaign_results import CONFIDENCE, Results, Summary, label
-from harness.report.page import part, policy
+from harness.report.page import FOLDER, assembled
 from harness.storage import replacing
 
-_PAGE = Template("""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="$policy">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<title>$title</title>
-<style>$style</style>
-</head>
-<body>
-<main>
-<section class="outcome $outcome" aria-labelledby="outcome"><h1 id="outcome">$heading</h1>
-<p>$sentence</p></section>
-$maps
-<section aria-labelledby="cells"><h2 id="cells">Every cell</h2>
-$table
-</section>
-</main>
-</body>
-</html>
-""")
+_TEMPLATE = FOLDER / "campaign.html"
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 74, 34, 110, 26
 _DEEPEST = (0, 114, 178)
@@ -69,11 +47,12 @@ def write_page(results: Results, path: Path) -> None:
 
 def render(results: Results) -> str:
     """The page as text."""
-    style, spec, total = part("page.css"), results.plan.spec, results.total()
+    spec, total = results.plan.spec, results.total()
     scenario = str(results.plan.scenario["name"])
-    return _PAGE.substitute(
-        policy=policy([style], []),
-        style=style,
+    return assembled(
+        _TEMPLATE,
+        (FOLDER / "page.css",),
+        (),
         title=html.escape(f"campaign {spec.name}"),
         outcome=results.outcome(),
         heading=html.escape(f"Campaign {spec.name}: {results.outcome().upper()}"),
@@ -103,7 +82,8 @@ def _maps(results: Results) -> str:
             if other == group
         }
         where = ", ".join(f"{name} {value}" for name, value in group)
-        sections += [_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES]
+        maps = "".join(_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES)
+        sections.append(f'<div class="maps">{maps}</div>')
     return f'<section aria-labelledby="maps"><h2 id="maps">Maps</h2>{"".join(sections)}</section>'
 
 
@@ -130,7 +110,7 @@ def _square(i: int, j: int, value: float | None, most: float, form: str) -> str:
     colour = "#" + "".join(f"{round(255 + share * (deep - 255)):02x}" for deep in _DEEPEST)
     x, y = _LEFT + i * _WIDTH, _TOP + j * _HEIGHT
     text = "–" if value is None else format(value, form)
-    ink = "#ffffff" if share > 0.55 else "#1a1a1a"
+    ink = "#ffffff" if share > 0.85 else "#1a1a1a"
     return (
         f'<rect x="{x}" y="{y}" width="{_WIDTH}" height="{_HEIGHT}" fill="{"#d5d5d5" if value is None else colour}"'
         f' stroke="#8a8a8a"/>{_words(x + 0.5 * _WIDTH, y + 0.62 * _HEIGHT, text, colour=ink)}'

@@ -103,12 +103,13 @@ def _check_row(row: Any) -> None:
     counts = [row[name] for name in ("seed", "samples", "false_alarms")]
     if not all(type(count) is int and count >= 0 for count in counts) or row["false_alarms"] > row["samples"]:
         raise ValueError("a row whose counts cannot be")
-    for change in row["changes"]:
-        latency_n, bound_n, missed, late = change
-        if not all(value is None or type(value) is int for value in (latency_n, bound_n)):
-            raise ValueError("a change whose latency is no number")
-        if not (isinstance(missed, bool) and isinstance(late, bool)):
-            raise ValueError("a change of which it is not known whether it was missed")
+    if not all(_is_change(*change) for change in row["changes"]):
+        raise ValueError("a change that is none")
+
+
+def _is_change(latency_n: object, bound_n: object, missed: object, late: object) -> bool:
+    counts = all(value is None or type(value) is int for value in (latency_n, bound_n))
+    return counts and isinstance(missed, bool) and isinstance(late, bool)
 
 
 @dataclass(frozen=True)

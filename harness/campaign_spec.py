@@ -168,7 +168,7 @@ class Case:
     device: Mapping[str, Any]
     scenario: Scenario
     seed: int
-    drawn: Mapping[str, float]
+    drawn: Mapping[str, float] = field(default_factory=dict)
 
 
 class Chunk(tuple[int, int]):
@@ -203,7 +203,7 @@ class Plan:
         plan = cls(
             spec=spec,
             scenario=scenario.as_table(),
-            rigs=tuple(_rig_table(name) for name in spec.rigs),
+            rigs=tuple(rig_table(name) for name in spec.rigs),
             devices=tuple(describe(name).as_table() for name in spec.devices),
         )
         plan._check()
@@ -258,12 +258,8 @@ class Plan:
         return Case(rig, self.devices[cell.device], scenario, seed, drawn)
 
     def one_worker_only(self) -> str:
-        """The device of which there is only one, so that two workers cannot both have it; "" if there is none."""
-        for table in self.devices:
-            device = from_table(table, "the campaign's device")
-            if device.elsewhere and not isinstance(device, QemuDevice):
-                return device.elsewhere
-        return ""
+        """As the function, of the first of the devices that is alone."""
+        return next(filter(None, map(one_worker_only, self.devices)), "")
 
     def _check(self) -> None:
         spec = self.spec
@@ -302,7 +298,17 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     return from_table(table, f"device {table['name']}")
 
 
-def _rig_table(name: str) -> Mapping[str, Any]:
+def one_worker_only(table: Mapping[str, Any]) -> str:
+    """The name of a device of which there is only one, so that two workers cannot both have it; "" for any other."""
+    device = device_of(table)
+    return device.elsewhere if not isinstance(device, QemuDevice) else ""
+
+
+def rig_table(name: str) -> Mapping[str, Any]:
+    """A rig by its name, as plain values that ``open_table`` takes.
+
+    :raises ConfigurationError: there is none, or it can play but one scenario.
+    """
     with open_rig(name) as rig:
         if isinstance(rig, RecordingRig):
             raise ConfigurationError(

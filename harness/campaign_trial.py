@@ -7,9 +7,10 @@ import functools
 import json
 import threading
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from harness.bench import Bench
+from harness.bench import INTERRUPTED_BY_USER, Bench
 from harness.campaign_spec import Case, Chunk, Plan, device_of, open_table
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
@@ -37,18 +38,18 @@ def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
             run = _players.player(case).play(case)
         except AnalogrigError as error:
             raise type(error)(f"campaign {planned.spec.name}, cell {numbered.cell}, seed {seed}: {error}") from error
-        rows.append(row(case, run, judge(run)))
+        rows.append(row(run, judge(run), case.drawn))
     return rows
 
 
-def row(case: Case, run: Run, verdict: Verdict) -> Row:
+def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
     """What is kept of a trial.
 
     ``changes``: for each [latency or null, bound or null, missed, late], in samples. ``errors``: relative errors of M,
     B, K at the end, or null. ``theta``: the first digits of the hash of all estimates, which tells builds apart.
     """
     out: Row = {
-        "seed": case.seed,
+        "seed": run.conditions.seed,
         "outcome": verdict.outcome,
         "samples": run.samples,
         "false_alarms": len(verdict.false_alarms),
@@ -56,11 +57,27 @@ def row(case: Case, run: Run, verdict: Verdict) -> Row:
         "errors": list(verdict.estimates[-1].error.values()) if verdict.estimates else [],
         "theta": verdict.theta_hash[:16],
     }
-    if case.drawn:
-        out["drawn"] = dict(case.drawn)
+    if drawn:
+        out["drawn"] = dict(drawn)
     if verdict.reasons:
         out["why"] = verdict.reasons[0]
     return out
+
+
+@dataclass(frozen=True)
+class Count:
+    """The alarms of a trial in which nothing changes."""
+
+    alarms: int
+    updated: int
+    """Samples that the estimator took in."""
+    fault: str = ""
+    """Why the trial is not valid."""
+
+
+def count_alarms(case: Case) -> Count:
+    """As fast as it goes; errors as ``play_chunk``."""
+    return _players.player(case).count(case)
 
 
 class _InProcess:
@@ -71,6 +88,10 @@ class _InProcess:
 
     def play(self, case: Case) -> Run:
         return self._trials.run(case.scenario, case.seed)
+
+    def count(self, case: Case) -> Count:
+        alarms = self._trials.alarms(case.scenario, case.seed)
+        return Count(len(alarms), self._trials.counters["updated"])
 
     def close(self) -> None:
         """Nothing is held."""
@@ -94,7 +115,15 @@ class _OnBench:
             raise
         if run.conditions.faults:
             self.close()
+        if INTERRUPTED_BY_USER in run.conditions.faults:
+            raise KeyboardInterrupt
         return run
+
+    def count(self, case: Case) -> Count:
+        run = self.play(case)
+        verdict = judge(run)
+        fault = "" if verdict.valid else f"seed {case.seed}: {verdict.reasons[0]}"
+        return Count(len(run.alarm_index), run.conditions.counters.get("updated", 0), fault)
 
     def close(self) -> None:
         dut, self._dut = self._dut, None

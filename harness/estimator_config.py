@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
+from harness import config
 from harness.catalogue import Key, Trigger
+from harness.errors import ConfigurationError
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
 ResetName = Literal["covariance", "all"]
@@ -142,7 +144,42 @@ class EstimatorConfig:
         yield Key.EDGE_INSTANTS, float(_EDGE_INSTANTS.index(self.edge_instants))
         yield Key.RESET, float(_RESETS.index(self.reset))
 
+    @classmethod
+    def from_settings(cls, settings: Mapping[int, float], where: str) -> Self:
+        """What a device says that it has, by its keys; what it has not said is as by default.
+
+        :raises ConfigurationError: no device can have that; ``where`` leads.
+        """
+        said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
+        for key, value in said.items():
+            if not math.isfinite(value):
+                raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
+        table: dict[str, Any] = {}
+        kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
+        for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
+            if Key[name.upper()] in said:
+                kind = kinds[name] if kinds[name] in (int, bool) else float
+                table[name] = kind(said[Key[name.upper()]])
+        words: Mapping[Key, Sequence[str]] = {
+            Key.TRIGGER: [trigger.name.lower().replace("_", "-") for trigger in Trigger],
+            Key.EDGE_INSTANTS: _EDGE_INSTANTS,
+            Key.RESET: _RESETS,
+        }
+        for key, names in words.items():
+            if key in said and 0 <= said[key] < len(names):
+                table[key.name.lower()] = names[int(said[key])]
+        if table.get("trigger") == "none":
+            table.pop("ceiling", None)
+        if Key.C1 in said:
+            table["c"] = [said.get(Key[f"C{i + 1}"], 0.0) for i in range(int(table.get("na", cls.na)))]
+        return config.build(cls, table, where)
+
     def as_table(self) -> dict[str, Any]:
         """In plain values, from which the same can be made; the ceiling instead of arl0."""
         table = dataclasses.asdict(self) | {"c": list(self.c), "ceiling": self.statistic_ceiling, "arl0": None}
         return {key: value for key, value in table.items() if value is not None}
+
+
+def _shortest(value: float) -> float:
+    """Of all numbers that are this one in single precision, the one with the fewest digits."""
+    return float(str(np.float32(value)))

@@ -2,8 +2,7 @@
 
 A pseudo-terminal takes any number of bytes at once, a virtual bus any number of frames. Here each takes its bits, the
 device answers when the last bit of a message is there, and takes no time itself. Nothing is delayed, so that the figure
-is the same every time; for lock-step, where nothing is sent before the answers have come, it is exact, but that CAN
-frames count with as many stuff bits as they can have.
+is the same every time; it is exact for lock-step, where nothing is sent before the answers have come.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from harness import frame
-from harness.bus_load import CLASSIC_BYTES, longest_bits
+from harness.bus_load import CLASSIC_BYTES, frame_s, message_s
 from harness.catalogue import LAYOUTS, Message
 
 if TYPE_CHECKING:
@@ -71,15 +70,12 @@ class CanLine:
         return f"{self.bitrate} bit/s{faster}"
 
     def frame_s(self, frame: can.Message) -> float:
-        """How long a frame takes, with the space after it, when it has as many stuff bits as it can have [s]."""
-        bits = longest_bits(len(frame.data), is_fd=frame.is_fd, switches=frame.bitrate_switch)
-        return bits.seconds(self.bitrate, self.data_bitrate)
+        """How long this very frame takes, with the space after it [s]."""
+        return message_s(frame, self.bitrate, self.data_bitrate)
 
     def message_s(self, kind: type[Message]) -> float:
         length = LAYOUTS[kind.__name__].length
-        is_fd = length > CLASSIC_BYTES
-        bits = longest_bits(length, is_fd=is_fd, switches=is_fd and self.data_bitrate is not None)
-        return bits.seconds(self.bitrate, self.data_bitrate)
+        return frame_s(length, fd=length > CLASSIC_BYTES, bitrate=self.bitrate, data_bitrate=self.data_bitrate)
 
     def together_s(self, to_s: float, from_s: float) -> float:
         return to_s + from_s

@@ -343,7 +343,11 @@ class RecordingRig:
     @classmethod
     def open(cls, path: Path) -> RecordingRig:
         """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
-        run = Run.load(path)
+        return cls.of(Run.load(path), path)
+
+    @classmethod
+    def of(cls, run: Run, path: Path) -> RecordingRig:
+        """As ``open``, of what was read from ``path``."""
         if run.samples == 0:
             raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
         return cls(run, path)

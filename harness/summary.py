@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from harness.advice import advice
+from harness.bus_load import BusLoad, load_of
 from harness.plant import UNITS
 from harness.run import Run
 from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
@@ -37,6 +38,9 @@ def summary(run: Run, verdict: Verdict) -> str:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
     if seen := line_text(conditions.link_counters):
         lines += [f"  on the line: {seen}"]
+    load = load_of(run)
+    if load is not None:
+        lines += [f"  bus: {load_text(load)}"]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
@@ -52,6 +56,15 @@ def lamps_text(overloads: Mapping[str, int]) -> str:
     """The lamps that lit, in order of time: ``U1 from sample 51``."""
     in_order = sorted(overloads.items(), key=lambda lamp: (lamp[1], lamp[0]))
     return ", ".join(f"{amplifier} from sample {sample}" for amplifier, sample in in_order) or "none"
+
+
+def load_text(load: BusLoad) -> str:
+    """What the exchange asks of its CAN bus."""
+    faster = "" if load.data_bitrate is None else f", data {load.data_bitrate} bit/s"
+    late = "" if load.latency_s is None else f", answers within {load.latency_s * 1e3:.3g} ms"
+    fits = load.utilisation <= 1.0
+    used = f"{load.utilisation:.1%} of it" if fits else f"{load.utilisation:.3g} times what it carries,"
+    return f"{load.bitrate} bit/s{faster}: {used} in real time{late}; at most {load.most_samples_per_s:.5g} samples/s"
 
 
 def _false_alarms(verdict: Verdict) -> str:

@@ -7,6 +7,7 @@ Only what the messages around them say is lacking: isolation's diagnoses, and th
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ def are_possible(rig: Rig, device: DeviceDescription) -> bool:
     return (
         isinstance(rig, EmulatorRig)
         and isinstance(device, InprocDevice)
+        and device.link == "serial"
         and not device.wire_faults
         and device.report_interval_n == 1
     )
@@ -61,6 +63,11 @@ class Trials:
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
         found = [block.first + self._estimator.alarms(*_entered(block)) for block in performance.blocks]
         return np.concatenate(found)
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The estimator's, of the last trial."""
+        return self._estimator.counters
 
     def run(self, scenario: Scenario, seed: int) -> Run:
         """One trial, for ``judge``; errors as ``alarms``."""

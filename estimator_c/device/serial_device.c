@@ -11,18 +11,26 @@
 
 void serial_device_init(serial_device_t* const self, const device_identity_t* const identity) {
     SERIAL_DEVICE_ASSERT(self != 0);
+    self->dropped = 0U;
     device_init(&self->device, identity);
     frame_decoder_init(&self->decoder, identity->catalogue_hash);
 }
 
-/// Takes a byte, and the message that it completes.
-static void enter(serial_device_t* const self, const uint8_t byte) {
-    const uint32_t dropped = frame_dropped(&self->decoder);
-    if (frame_decoder_enter(&self->decoder, byte)) {
-        device_enter(&self->device, frame_id(&self->decoder), frame_payload(&self->decoder));
-    } else if (frame_dropped(&self->decoder) != dropped) {
-        device_dropped(&self->device, 1U);
+/// Takes bytes up to the end of a message, and enters it; false if they end before. What was dropped is counted before the
+/// message, which may ask for it.
+static bool take_message(serial_device_t* const self, const uint8_t* const in, const size_t in_n, size_t* const taken) {
+    bool is_whole = false;
+    while (!is_whole && (*taken < in_n)) {
+        is_whole = frame_decoder_enter(&self->decoder, in[*taken]);
+        (*taken)++;
     }
+    if (is_whole) {
+        const uint32_t dropped = frame_dropped(&self->decoder);
+        device_dropped(&self->device, dropped - self->dropped);
+        self->dropped = dropped;
+        device_enter(&self->device, frame_id(&self->decoder), frame_payload(&self->decoder));
+    }
+    return is_whole;
 }
 
 device_progress_t serial_device_run(serial_device_t* const self,
@@ -37,10 +45,10 @@ device_progress_t serial_device_run(serial_device_t* const self,
         device_message_t answer;
         if (device_answer(&self->device, &answer)) {
             progress.given += frame_encode(hash, answer.id, answer.payload, &out[progress.given]);
-        } else if (progress.taken < in_n) {
-            enter(self, in[progress.taken++]);
-        } else {
+        } else if (!take_message(self, in, in_n, &progress.taken)) {
             break;
+        } else {
+            // it may have answers
         }
     }
     return progress;

@@ -24,6 +24,7 @@ extern "C" {
 typedef struct {
     device_t        device;  ///< first
     frame_decoder_t decoder;
+    uint32_t        dropped;  ///< frames of which the device has been told
 } serial_device_t;
 
 /// Makes the device ready: default configuration, stopped, at the beginning of a frame.

@@ -40,7 +40,7 @@ static uint8_t digit(const uint8_t character) {
 
 static uint8_t character(const uint32_t value) {
     const uint8_t low = (uint8_t)(value & 0xFU);
-    return (uint8_t)(low + ((low < 10U) ? (uint8_t)'0' : (uint8_t)('A' - 10)));
+    return (uint8_t)(low + ((low < 10U) ? (uint8_t)'0' : ((uint8_t)'A' - 10U)));
 }
 
 /// A number of n digits; false if one of them is none.

@@ -14,12 +14,15 @@ from pathlib import Path
 ESTIMATOR = Path(__file__).parents[1]
 GENERATED = ESTIMATOR.parent / "build" / "generated"
 PARTS = (ESTIMATOR / "core", ESTIMATOR / "isolation", ESTIMATOR / "device", GENERATED)
+LOOP = ESTIMATOR / "ports" / "loop"
+HERE = ESTIMATOR / "fuzz"
 
-LONGEST_INPUT = {"fuzz_est": 512, "fuzz_device": 2048}
+LONGEST_INPUT = {"fuzz_est": 512, "fuzz_serial": 2048, "fuzz_can": 2048, "fuzz_slcan": 2048}
 """By target, in bytes: some hundred samples."""
 
 _SANITIZED = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined")
-_FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *(f"-I{part}" for part in PARTS))
+_INCLUDE = tuple(f"-I{part}" for part in (*PARTS, LOOP, HERE))
+_FLAGS = ("-std=c99", *_SANITIZED, "-ffp-contract=off", "-DEST_NC_MAX=2U", *_INCLUDE)
 
 
 def build(target: str, folder: Path) -> Path:
@@ -28,7 +31,8 @@ def build(target: str, folder: Path) -> Path:
     :raises subprocess.CalledProcessError: it does not compile.
     """
     program = folder / target
-    sources = [ESTIMATOR / "fuzz" / f"{target}.c", *(path for part in PARTS for path in sorted(part.glob("*.c")))]
+    parts = [path for part in PARTS for path in sorted(part.glob("*.c"))]
+    sources = [HERE / f"{target}.c", HERE / "fuzz_line.c", *sorted(LOOP.glob("*_line.c")), *parts]
     subprocess.run(["clang", *_FLAGS, *map(str, sources), "-o", str(program)], check=True)
     return program
 

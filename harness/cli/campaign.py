@@ -55,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
-        with workers(arguments, plan) as crew:
+        with workers(arguments, plan.one_worker_only(), len(list(plan.chunks()))) as crew:
             results = conduct(plan, crew, out, progress(plan))
     except KeyboardInterrupt:
         return complain(f"interrupted: {kept}", INTERRUPTED)
@@ -71,22 +71,23 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def workers(arguments: argparse.Namespace, plan: Plan) -> Iterator[Workers]:
-    """Those that the command line asks for.
+def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
+    """Those that the command line asks for, by default at most as many as are useful.
 
-    :raises ConfigurationError: they cannot share a device.
+    ``alone``: a device that cannot be shared, or "".
+
+    :raises ConfigurationError: they would have to share it.
     """
     from harness.campaign_workers import Dask, Processes, ThisProcess
     from harness.errors import ConfigurationError
 
-    alone = plan.one_worker_only()
     if alone and (arguments.cluster or (arguments.workers or 1) > 1):
         raise ConfigurationError(f"{alone} is one device: it cannot be shared by several workers; say --workers 1")
     if arguments.cluster:
         with contextlib.closing(Dask(arguments.cluster)) as cluster:
             yield cluster
         return
-    count = arguments.workers if arguments.workers is not None else len(os.sched_getaffinity(0))
+    count = arguments.workers if arguments.workers is not None else min(len(os.sched_getaffinity(0)), useful)
     yield ThisProcess() if alone or count == 1 else Processes(count)
 
 

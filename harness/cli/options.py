@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from harness.rig import Rig
+    from harness.run import Run
     from harness.scenario import Scenario
 
 DEFAULT_SCENARIO = "thesis"
@@ -93,6 +94,15 @@ def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
     )
 
 
+def add_can_log(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--can-log",
+        choices=("log", "blf", "asc", "mf4", "none"),
+        default="log",
+        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz",
+    )
+
+
 def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
     command.add_argument(
         "--out",
@@ -133,3 +143,57 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
         recorded = None if recording is None else recording.run.conditions.seed
         seeds = (arguments.seed, scenario.seed, recorded, DEFAULT_SEED)
         yield rig, scenario, next(seed for seed in seeds if seed is not None)
+
+
+def add_capture(command: argparse.ArgumentParser) -> None:
+    """What a CAN log does not say itself."""
+    command.add_argument(
+        "--scenario", metavar="NAME", help="what was played: shipped name or .toml file; a run.npz says it itself"
+    )
+    command.add_argument(
+        "--rig",
+        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
+        metavar="NAME",
+        help="on which a CAN log was captured: shipped name or .toml file (default: $ANALOGRIG_RIG or emulator)",
+    )
+    command.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
+    )
+    command.add_argument("--run", type=int, metavar="N", help="which of several runs in a CAN log, from 1")
+    command.add_argument(
+        "--most-lost", type=int, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
+    )
+
+
+def is_capture(path: Path) -> bool:
+    """Whether it is, by its name, no recording of ours."""
+    return path.suffix != ".npz"
+
+
+def recorded(arguments: argparse.Namespace) -> Run:
+    """The run in the file that is named.
+
+    :raises RecordingError: it cannot be read.
+    :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.
+    """
+    from harness.can_log import captured_run, retold
+    from harness.errors import ConfigurationError
+    from harness.rig import open_rig
+    from harness.run import Run
+    from harness.scenario import Scenario
+
+    scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    if not is_capture(arguments.file):
+        run = Run.load(arguments.file)
+        return run if scenario is None else retold(run, scenario)
+    if scenario is None:
+        raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
+    with open_rig(arguments.rig) as rig:
+        return captured_run(
+            arguments.file,
+            scenario,
+            rig,
+            dbc=arguments.dbc,
+            number=arguments.run,
+            most_lost_n=arguments.most_lost,
+        )

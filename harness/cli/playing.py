@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show
 
 if TYPE_CHECKING:
+    from harness.can_log import CanLog
     from harness.dut import Dut
     from harness.rig import Rig
     from harness.run import Run
     from harness.scenario import Scenario
     from harness.verdict import Verdict
 
-RUN_FILE, REPORT_FILE = "run.npz", "report.html"
+RUN_FILE, REPORT_FILE, CAN_LOG = "run.npz", "report.html", "can"
 
 
 def prepare(out: Path, rig: Rig) -> None:
@@ -38,14 +39,44 @@ def prepare(out: Path, rig: Rig) -> None:
         raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
 
 
-def play(rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace) -> int:
-    from harness.bench import INTERRUPTED_BY_USER, Bench
+def can_log(arguments: argparse.Namespace) -> CanLog | None:
+    """What listens to the CAN frames of the run, if they shall be kept; a run on another link has none.
+
+    :raises RecordingError: the log of an earlier run is in the way.
+    """
+    from harness.can_log import WRITTEN, CanLog
+
+    kept = None
+    for suffix in WRITTEN:
+        log = CanLog(arguments.out / f"{CAN_LOG}.{suffix}")
+        kept = log if suffix == arguments.can_log else kept
+    return kept
+
+
+def play(
+    rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace, log: CanLog | None = None
+) -> int:
+    from harness.bench import Bench
+    from harness.errors import RecordingError
+
+    run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
+    status = conclude(run, arguments)
+    try:
+        if log is not None:
+            log.close()
+    except RecordingError as error:
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+    return status
+
+
+def conclude(run: Run, arguments: argparse.Namespace) -> int:
+    """Judge a run, show the verdict, keep both, and return the exit status."""
+    from harness.bench import INTERRUPTED_BY_USER
     from harness.errors import RecordingError
     from harness.report import write_report
     from harness.summary import summary
     from harness.verdict import judge
 
-    run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
     verdict = judge(run)
     if arguments.json:
         show(json.dumps(_as_json(run, verdict, arguments.out)))

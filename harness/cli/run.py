@@ -6,8 +6,8 @@ import argparse
 import os
 from typing import Any
 
-from harness.cli.options import add_dut, add_output, add_what_to_play, changes_of_dut, opened
-from harness.cli.playing import play, prepare
+from harness.cli.options import add_can_log, add_dut, add_output, add_what_to_play, changes_of_dut, opened
+from harness.cli.playing import can_log, play, prepare
 
 
 def add(commands: Any) -> None:
@@ -15,6 +15,7 @@ def add(commands: Any) -> None:
     add_what_to_play(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
     add_output(command)
+    add_can_log(command)
     command.set_defaults(command=_run)
 
 
@@ -23,5 +24,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
     with opened(arguments) as (rig, scenario, seed):
         prepare(arguments.out, rig)
-        with open_dut(arguments.dut, **changes_of_dut(arguments)) as dut:
-            return play(rig, dut, scenario, seed, arguments)
+        log = can_log(arguments)
+        with open_dut(arguments.dut, listener=log, **changes_of_dut(arguments)) as dut:
+            return play(rig, dut, scenario, seed, arguments, log)

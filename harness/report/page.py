@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 
@@ -14,9 +15,10 @@ from harness.run import Run
 from harness.storage import replacing
 from harness.verdict import Verdict
 
-_FOLDER = Path(__file__).parent
-_STYLES = ("uPlot.min.css", "page.css")
-_SCRIPTS = ("uPlot.iife.min.js", "page.js")
+FOLDER = Path(__file__).parent
+STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
+"""Of every page with plots."""
+PLOTTER = FOLDER / "uPlot.iife.min.js"
 
 
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
@@ -34,12 +36,10 @@ def render(run: Run, verdict: Verdict) -> str:
 
     :raises RecordingError: the build has not put uPlot in its place.
     """
-    styles = [part(name) for name in _STYLES]
-    scripts = [part(name) for name in _SCRIPTS]
-    return Template(part("page.html")).substitute(
-        policy=policy(styles, scripts),
-        styles="\n".join(f"<style>{style}</style>" for style in styles),
-        scripts="\n".join(f"<script>{script}</script>" for script in scripts),
+    return assembled(
+        FOLDER / "page.html",
+        STYLES,
+        (PLOTTER, FOLDER / "page.js"),
         data=as_script(payload(run, verdict)),
         title=tables.title(run, verdict),
         outcome=tables.outcome(run, verdict),
@@ -53,7 +53,22 @@ def render(run: Run, verdict: Verdict) -> str:
     )
 
 
-def policy(styles: list[str], scripts: list[str]) -> str:
+def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], **texts: str) -> str:
+    """A page that needs nothing but itself: ``template`` with its styles, scripts and texts.
+
+    :raises RecordingError: the build has not put uPlot in its place.
+    """
+    style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
+    return Template(_part(template)).substitute(
+        texts,
+        policy=_policy(style, script),
+        licence=_part(FOLDER / "licence.html").rstrip("\n"),
+        styles="\n".join(f"<style>{each}</style>" for each in style),
+        scripts="\n".join(f"<script>{each}</script>" for each in script),
+    )
+
+
+def _policy(styles: list[str], scripts: list[str]) -> str:
     """A content security policy under which nothing is loaded and only these very styles and scripts work."""
     return f"default-src 'none'; style-src {_hashes(styles)}; script-src {_hashes(scripts)}"
 
@@ -63,12 +78,7 @@ def _hashes(sources: list[str]) -> str:
     return " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
 
 
-def part(name: str) -> str:
-    """A file beside this one.
-
-    :raises RecordingError: it is not there.
-    """
-    path = _FOLDER / name
+def _part(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from harness.advice import advice
+from harness.bus_load import load_of
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
-from harness.summary import lamps_text
+from harness.summary import lamps_text, load_text
 from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
 
 _MAX_FALSE_ALARMS = 20
@@ -50,12 +51,14 @@ def conditions(run: Run, verdict: Verdict) -> str:
     """What ran, and where."""
     ran = run.conditions
     description = ran.scenario.get("description")
+    load = load_of(run)
     rows = [
         ("Scenario", f"{ran.scenario['name']}{f': {description}' if description else ''}"),
         ("Rig", ran.rig["name"]),
         ("Device", ran.dut["name"]),
         ("Firmware", _pairs(ran.dut.get("identity", {})) or "unknown"),
         ("Link", ran.link),
+        ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
         ("Seed", ran.seed),
         ("Samples", _samples(run, verdict)),
         ("Overload lamps", lamps_text(verdict.overloads)),

@@ -1,4 +1,4 @@
-"""What static checkers say of core and isolation: the deviations from MISRA C:2012 in MISRA.md, and no others."""
+"""What static checkers say of core and isolation: what MISRA.md explains, and no more; of the device: nothing."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from estimator_c.evidence import eva
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 CORE = ESTIMATOR / "core"
+GENERATED = ESTIMATOR.parent / "build" / "generated"
 SOURCES = sorted(path for part in ("core", "isolation") for path in (ESTIMATOR / part).glob("*.c"))
 INCLUDE = f"-I{CORE}"
 
@@ -41,14 +42,43 @@ def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_pa
 def test_clang_tidy_finds_nothing(part: str) -> None:
     """The checks are those of estimator_c/.clang-tidy."""
     require("clang-tidy", "clang-tidy")
-    generated = ESTIMATOR.parent / "build" / "generated"
     folders = [ESTIMATOR / name for name in ("core", "isolation", "device")]
-    options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, generated))]
+    options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, GENERATED))]
     sources = map(str, sorted((ESTIMATOR / part).glob("*.c")))
     done = subprocess.run(
         ["clang-tidy", "--quiet", *sources, "--", *options], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
+
+
+DEVICE_FOLDERS = [*(ESTIMATOR / name for name in ("core", "isolation", "device", "ports/loop")), GENERATED]
+DEVICE_SOURCES = sorted(
+    path for part in ("device", "ports/loop", "ports/host") for path in (ESTIMATOR / part).glob("*.c")
+)
+
+
+def test_gcc_analyzer_finds_nothing_in_the_device_and_its_port_to_this_computer(tmp_path: Path) -> None:
+    require("gcc", "gcc")
+    command = ["gcc", "-std=c99", "-D_XOPEN_SOURCE=700", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", "-c"]
+    command += [*(f"-I{folder}" for folder in DEVICE_FOLDERS), *map(str, DEVICE_SOURCES)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_cppcheck_finds_nothing_in_the_device() -> None:
+    """Of its own; the rules of MISRA are for core and isolation."""
+    require("cppcheck", "cppcheck")
+    command = [
+        "cppcheck",
+        "--quiet",
+        "--enable=warning,style,performance,portability",
+        "--std=c99",
+        "--error-exitcode=1",
+    ]
+    command += ["-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in DEVICE_FOLDERS)]
+    sources = map(str, sorted((ESTIMATOR / "device").glob("*.c")))
+    done = subprocess.run([*command, *sources], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.timeout(600)

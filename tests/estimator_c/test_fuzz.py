@@ -10,7 +10,7 @@ import pytest
 
 from estimator_c.fuzz.fuzz import LONGEST_INPUT, build, fuzz
 
-SECONDS = 60 if os.environ.get("ANALOGRIG_CI") else 5
+SECONDS = 60 if os.environ.get("ANALOGRIG_CI") else 3
 
 
 @pytest.mark.timeout(SECONDS + 120)

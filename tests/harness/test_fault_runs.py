@@ -73,17 +73,23 @@ def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind
 PLACES: tuple[tuple[Direction, str, int], ...] = (("to", "handshake", 0), ("to", "samples", 5), ("from", "samples", 40))
 """Direction, step, and which of the frames of that step."""
 SOME = ("flip", "drop", "duplicate", "disconnect", "hang", "wrong-baud", "reset")
+SOME_OF_CAN = ("drop", "duplicate", "error", "collide", "fd", "bus-off", "babble", "disconnect", "hang", "reset")
 REAL = [
-    *(("host", kind) for kind in FaultyWire.HAPPENS if kind != "delay"),
-    *(pytest.param("qemu-m4", kind, marks=needs_firmware) for kind in SOME),
+    *(("serial", "host", kind) for kind in FaultyWire.HAPPENS if kind != "delay"),
+    *(pytest.param("serial", "qemu-m4", kind, marks=needs_firmware) for kind in SOME),
+    *(("can", "can:virtual", kind) for kind in SOME_OF_CAN),
+    *(("can", "host?link=slcan", kind) for kind in ("drop", "collide", "reset")),
 ]
 
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: f"{place[0]}-{place[1]}")
-@pytest.mark.parametrize(("device", "kind"), REAL)
-def test_fault_leads_to_the_same_over_a_real_line(device: str, kind: str, place: tuple[Direction, str, int]) -> None:
+@pytest.mark.parametrize(("link", "device", "kind"), REAL)
+def test_fault_leads_to_the_same_over_a_real_line(
+    link: LinkKind, device: str, kind: str, place: tuple[Direction, str, int]
+) -> None:
     direction, step, nth = place
-    number = steps("sample")[direction].index(step) + nth
+    number = steps("sample", link)[direction].index(step) + nth
     opened: Any = describe(device)
-    played = play(Case(WireFaults((WireFault(kind, direction, number),))), opened.wire, timeout_s=1.0)
-    assert played.outcome in documented("serial")[kind, direction][step], played.why
+    case = Case(WireFaults((WireFault(kind, direction, number),)), link=link)
+    played = play(case, opened.wire if link == "serial" else opened.bus, timeout_s=1.0)
+    assert played.outcome in documented(link)[kind, direction][step], played.why

@@ -264,7 +264,7 @@ def test_page_of_the_thesis_is_small(source: str) -> None:
 def test_plot_library_that_was_not_built_is_one_clear_line(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page, "_FOLDER", tmp_path)
+    monkeypatch.setattr(page, "STYLES", (tmp_path / "uPlot.min.css",))
     with pytest.raises(RecordingError, match=r"uPlot.min.css.*make setup") as caught:
         write_report(run, reported_verdict(run), tmp_path / "report.html")
     assert "\n" not in str(caught.value)

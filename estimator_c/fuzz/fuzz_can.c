@@ -1,0 +1,80 @@
+/// libFuzzer target over the device on a CAN bus, with CAN FD and without, as fuzz_line.h has it: frames of any identifier, kind
+/// and length among the harness's. `make fuzz` builds and runs it.
+
+#include "analogrig_catalogue.h"
+#include "can_device.h"
+#include "fuzz_line.h"
+
+#include <string.h>
+
+static void begin(stream_t* const stream) { (void)stream; }
+
+static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
+    (void)memcpy(&stream->bytes[stream->n], frame, sizeof(*frame));
+    stream->n += sizeof(*frame);
+}
+
+/// Now and then in the wrong kind of frame, or with another identifier of the same last byte.
+static void
+add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+    can_frame_t   frame  = { .id = id, .length = analogrig_length(id) };
+    const uint8_t choice = take_byte(input);
+    frame.flags          = (frame.length > CAN_FRAME_CLASSIC_MAX) ? CAN_FRAME_FD : 0U;
+    frame.flags ^= ((choice & 0xF0U) == 0xF0U) ? (choice & 0xFU) : 0U;
+    frame.id |= ((choice & 0xF0U) == 0xE0U) ? ((choice & 7U) << 8U) : 0U;
+    (void)memcpy(frame.data, payload, frame.length);
+    add_frame(stream, &frame);
+}
+
+static void add_noise(stream_t* const stream, input_t* const input) {
+    can_frame_t frame = { .flags = take_byte(input), .length = take_byte(input) };
+    for (uint8_t i = 0U; i < 4U; i++) {
+        frame.id = (frame.id << 8U) | take_byte(input);
+    }
+    for (uint8_t i = 0U; (i < frame.length) && (i < CAN_FRAME_MAX); i++) {
+        frame.data[i] = take_byte(input);
+    }
+    add_frame(stream, &frame);
+}
+
+/// Of the harness, each in a data frame of its length.
+static size_t messages(const stream_t* const stream) {
+    size_t n = 0U;
+    for (size_t i = 0U; i < stream->n; i += sizeof(can_frame_t)) {
+        can_frame_t frame;
+        (void)memcpy(&frame, &stream->bytes[i], sizeof(frame));
+        const bool is_data = (frame.flags | CAN_FRAME_FD) == CAN_FRAME_FD;
+        const bool is_ours = (frame.id <= UINT8_MAX) && analogrig_is_from_harness((uint8_t)frame.id);
+        n += (is_data && is_ours && (frame.length == analogrig_length((uint8_t)frame.id))) ? 1U : 0U;
+    }
+    return n;
+}
+
+/// Nothing but classic frames of the device.
+static size_t checked(const answers_t* const answers) {
+    const size_t frames = answers->n / sizeof(can_frame_t);
+    expect((answers->n % sizeof(can_frame_t)) == 0U);
+    for (size_t i = 0U; i < frames; i++) {
+        can_frame_t frame;
+        (void)memcpy(&frame, &answers->bytes[i * sizeof(frame)], sizeof(frame));
+        expect((frame.flags == 0U) && (frame.length <= CAN_FRAME_CLASSIC_MAX) && (frame.id <= UINT8_MAX));
+        expect_answer((uint8_t)frame.id, frame.data, frame.length, i);
+    }
+    return frames;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
+    static can_device_t device;
+    static can_device_t device_at_once;
+    const bool          is_fd = (size > 0U) && ((data[size - 1U] & 1U) != 0U);
+    const fuzz_line_t   kind  = { .line        = is_fd ? &can_fd_line : &can_line,
+                                  .item_size   = sizeof(can_frame_t),
+                                  .answer_size = sizeof(can_frame_t),
+                                  .begin       = begin,
+                                  .add_message = add_message,
+                                  .add_noise   = add_noise,
+                                  .messages    = messages,
+                                  .checked     = checked };
+    fuzz_line(&kind, &device, &device_at_once, data, size);
+    return 0;
+}

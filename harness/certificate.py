@@ -1,0 +1,187 @@
+"""Whether a device raises false alarms rarely enough: the one question that every owner asks, with its error stated.
+
+A plant that does not change is played in runs of one length, with seeds in order. What counts as a trial is a sample
+that the estimator took in once it was warm; every alarm is a false one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from harness import config
+from harness.campaign_spec import Case, device_of, open_table
+from harness.campaign_trial import Count, close_devices, count_alarms
+from harness.campaign_workers import Workers
+from harness.errors import ConfigurationError
+from harness.scenario import Scenario
+from harness.statistics import ConfidenceSequence, Decision, Design, SequentialTest, lower_rate, upper_rate
+from harness.trials import are_possible
+
+IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
+"""About so many samples in a run: in this process, or over a line."""
+
+WORTH_A_WORKER_N = 3_000_000
+"""Samples that a process plays in about the time that another takes to start."""
+
+APART = 10.0
+"""The sequential test certifies quickest where the true rate is so many times below the limit."""
+
+MOST_LONGER = 3.0
+"""A sequential test gives up after so many times the length of a fixed one."""
+
+Outcome = Literal["certified", "refuted", "inconclusive"]
+
+
+@dataclass(frozen=True)
+class Question:
+    """Whether the rate of false alarms is below ``far`` per sample."""
+
+    far: float
+    confidence: float
+    rig: Any
+    """In plain values, as ``campaign_spec.open_table`` takes it."""
+    device: Any
+    scenario: Any
+    first_seed: int = 0
+    allowed: int = 5
+    """For a fixed length: with more alarms it is not certified."""
+    sequential: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.far * APART < 1.0:
+            raise ValueError(f"far must be more than 0 and less than {1.0 / APART:g} per sample, not {self.far:g}")
+        if not 0.5 < self.confidence < 1.0:
+            raise ValueError(f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}")
+        if not 0 <= self.allowed <= 1000:
+            raise ValueError(f"allowed must be 0 to 1000, not {self.allowed}")
+        if self.scenario.get("tweaks"):
+            raise ValueError("the scenario changes the plant, and this is about alarms while nothing changes")
+
+    @property
+    def useful_workers(self) -> int:
+        """More would take longer to start than to play."""
+        device = device_of(self.device)
+        return (
+            max(1, self.design_n // WORTH_A_WORKER_N) if are_possible(open_table(self.rig), device) else self.design_n
+        )
+
+    @functools.cached_property
+    def design_n(self) -> int:
+        """Samples of the test of fixed length."""
+        return Design(self.far, self.confidence, self.allowed).trials
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The answer."""
+
+    outcome: Outcome
+    reason: str
+    alarms: int
+    samples: int
+    """That counted."""
+    rate: tuple[float, float]
+    """One-sided exact bounds, for a fixed length; (0, 1) for a sequential test, whose outcome is all it says."""
+
+
+def certify(
+    question: Question, workers: Workers, progress: Callable[[int, int, int], None] | None = None
+) -> Certificate:
+    """Play until the answer is there. It does not depend on the number of workers.
+
+    ``progress`` is called with the samples that have counted, those that may be needed, and the alarms among them.
+
+    :raises ConfigurationError: the scenario cannot be played, or the device refuses its configuration.
+    :raises WorkerError, LinkError, DeviceError, RigError: they cannot be had or kept.
+    """
+    most = math.ceil(question.design_n * (MOST_LONGER if question.sequential else 1.0))
+    run_n = _run_n(question, most)
+    text = json.dumps(dataclasses.asdict(question), sort_keys=True)
+    work = functools.partial(count_run, text, run_n)
+    alarms = samples = 0
+    warm_up_n = device_of(question.device).estimator.warm_up_n
+    try:
+        for count in _in_order(workers, work, question.first_seed):
+            counted = max(count.updated - warm_up_n, 0)
+            alarms, samples = alarms + count.alarms, samples + counted
+            if progress is not None:
+                progress(samples, most, alarms)
+            if count.fault or not counted:
+                fault = count.fault or "the device took in no sample that counts"
+                return Certificate("inconclusive", fault, alarms, samples, (0.0, 1.0))
+            answer = _sequential(question, alarms, samples) if question.sequential else None
+            if samples >= most:
+                answer = answer or _at_the_end(question, alarms, samples)
+            if answer is not None:
+                return answer
+    finally:
+        close_devices()
+    raise AssertionError("seeds do not end")
+
+
+def count_run(question: str, run_n: int, seed: int) -> Count:
+    """The alarms of one run."""
+    asked = config.build(Question, json.loads(question), "the question")
+    scenario = dataclasses.replace(Scenario.from_table(asked.scenario, "the scenario"), samples=run_n)
+    return count_alarms(Case(asked.rig, asked.device, scenario, seed))
+
+
+def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
+    """The counts by seed, whichever is there first."""
+    early: dict[int, Count] = {}
+    expected = first_seed
+    for seed, count in workers.play(work, itertools.count(first_seed)):
+        early[seed] = count
+        while expected in early:
+            yield early.pop(expected)
+            expected += 1
+
+
+def _run_n(question: Question, most: int) -> int:
+    """Such a length that a whole number of runs makes up a test of fixed length."""
+    device, rig = device_of(question.device), open_table(question.rig)
+    about = IN_PROCESS_RUN_N if are_possible(rig, device) else BENCH_RUN_N
+    runs = math.ceil(most / about)
+    return math.ceil(most / runs) + device.estimator.warm_up_n + _LEAD_IN_N
+
+
+_LEAD_IN_N = 16
+"""Samples that fill the regressors before the first equation, for any model that a device can have."""
+
+
+def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
+    if question.sequential:
+        said = f"{alarms} alarms in {samples} samples, and still undecided"
+        return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
+    low = lower_rate(alarms, samples, question.confidence)
+    high = upper_rate(alarms, samples, question.confidence)
+    said = f"{alarms} alarms in {samples} samples: the rate is {low:.3g} to {high:.3g}"
+    outcome: Outcome = "certified" if high <= question.far else "refuted" if low > question.far else "inconclusive"
+    return Certificate(outcome, said, alarms, samples, (low, high))
+
+
+def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:
+    """Wald's test certifies; a confidence sequence refutes, which it does in the end for any rate above the limit."""
+    error, far = 1.0 - question.confidence, question.far
+    said = f"{alarms} alarms in {samples} samples, and no more were needed"
+    better = SequentialTest(far / APART, far, error, error, trials=samples, events=alarms)
+    if better.decision is Decision.BELOW:
+        return Certificate("certified", said, alarms, samples, (0.0, 1.0))
+    known = ConfidenceSequence(question.confidence, far, trials=samples, events=alarms)
+    is_worse = known.decision(far) is Decision.ABOVE
+    return Certificate("refuted", said, alarms, samples, (0.0, 1.0)) if is_worse else None
+
+
+def question_of(rig: Any, device: Any, scenario: Scenario, **settings: Any) -> Question:
+    """:raises ConfigurationError: a setting is out of range."""
+    try:
+        return Question(rig=rig, device=device, scenario=scenario.as_table(), **settings)
+    except ValueError as error:
+        raise ConfigurationError(f"certify: {error}") from error

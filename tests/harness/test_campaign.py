@@ -1,0 +1,441 @@
+"""Campaigns: the same file whatever happens on the way, and what it says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from harness.bench import Bench
+from harness.campaign import Tally, conduct, journal_of
+from harness.campaign_journal import Journal
+from harness.campaign_results import Results, Summary, text
+from harness.campaign_spec import CampaignSpec, Chunk, Plan
+from harness.campaign_trial import close_devices, play_chunk, row
+from harness.campaign_workers import MOST_DEATHS, Processes, ThisProcess
+from harness.cli import main
+from harness.dut import open_dut
+from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
+from harness.rig import open_rig
+from harness.scenario import Scenario, Tweak
+from harness.verdict import judge
+
+SPEC = """
+trials = 6
+chunk = 2
+samples = 1300
+change_at = 1200
+[grid]
+stiffness_factor = [0.8, 0.9]
+[draw]
+damping_n_s_per_m = [2500.0, 3021.0]
+"""
+
+
+def planned(tmp_path: Path, spec: str = SPEC) -> Plan:
+    path = tmp_path / "spec.toml"
+    path.write_text(spec)
+    return Plan.of(CampaignSpec.load(str(path)))
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of SPEC, played here, without interruption."""
+    folder = tmp_path_factory.mktemp("reference")
+    conduct(planned(folder), ThisProcess(), folder / "reference.json")
+    return folder / "reference.json"
+
+
+# ------------------------------------------------------------------------------------------------------- what is played
+
+
+def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
+    spec = SPEC.replace("[draw]", "noise_lsb = [0.5]\n[draw]")
+    plan = planned(tmp_path, spec)
+    case = plan.case(plan.cells()[1], 4)
+    damping = case.drawn["damping_n_s_per_m"]
+    assert 2500.0 < damping < 3021.0
+    base = dataclasses.replace(Scenario.load("healthy"), samples=1300)
+    plant = dataclasses.replace(base.plant, damping_n_s_per_m=damping)
+    scenario = dataclasses.replace(base, plant=plant, tweaks=(Tweak(1200, stiffness_n_per_m=0.9 * 24500.0),))
+    rig_file = tmp_path / "emulator.toml"
+    rig_file.write_text((Path("fixtures/rigs/emulator.toml")).read_text().replace("noise_lsb = 1.0", "noise_lsb = 0.5"))
+    with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:
+        run = Bench(rig, dut).play(scenario, 4)
+    played = play_chunk(plan.as_json(), (2, 1))
+    assert [each["seed"] for each in played] == [4, 5]
+    assert played[0] == row(run, judge(run), case.drawn)
+
+
+def test_plan_reads_the_same_after_a_journey_as_text(tmp_path: Path) -> None:
+    plan = planned(tmp_path)
+    assert Plan.from_json(plan.as_json()) == plan
+    assert Plan.from_json(plan.as_json()).digest() == plan.digest()
+
+
+def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
+    spec = "trials = 1\nsamples = 400\ndevices = {}\n"
+    rows = [play_chunk(planned(tmp_path, spec.format(names)).as_json(), (0, 0)) for names in ('["inproc"]', '["host"]')]
+    close_devices()
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize(
+    ("spec", "complaint"),
+    [
+        ("trails = 3", "unknown key 'trails'"),
+        ("[grid]\nmass = [1.0]", "grid: unknown key 'mass'"),
+        ("[grid]\nmass_kg = [100.0, 100.0]", "grid: mass_kg has a value twice"),
+        ("[draw]\nmass_kg = [100.0, 90.0]", r"draw: mass_kg must be \(low, high\)"),
+        ("[grid]\nmass_kg = [90.0]\n[draw]\nmass_kg = [80.0, 90.0]", "mass_kg: in the grid and drawn as well"),
+        ("trials = 0", "trials must be 1 to"),
+        ("devices = []", "devices must name at least one"),
+        ("[grid]\nmass_kg = [10.0]", "pot M: .*M_kg = 10"),
+        ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has tweaks of its own"),
+        ("[grid]\nmass_factor = [0.5]\n", None),
+        ("[stop]\nquantity = 'late'\nrate = 0.1", "quantity: must be one of"),
+        ("samples = 1100\n[grid]\nmass_factor = [0.5]\nchange_at = 3", "unknown key 'change_at'"),
+        (
+            "samples = 500\n[grid]\nmass_factor = [0.5]",
+            "mass_factor = 0.5: the tweak at sample 1000 is beyond the last",
+        ),
+        ("rigs = ['recording:x.npz']", "x.npz"),
+    ],
+)
+def test_wrong_campaign_is_one_line_that_names_the_key(tmp_path: Path, spec: str, complaint: str | None) -> None:
+    if complaint is None:
+        planned(tmp_path, spec)
+        return
+    with pytest.raises(AnalogrigError, match=complaint) as error:
+        planned(tmp_path, spec)
+    assert "\n" not in str(error.value)
+
+
+# ------------------------------------------------------------------------------------------------ the same file always
+
+
+def test_two_processes_give_the_file_of_one(tmp_path: Path, reference: Path) -> None:
+    conduct(planned(tmp_path), Processes(2), tmp_path / "two.json")
+    assert (tmp_path / "two.json").read_bytes() == reference.read_bytes()
+
+
+def test_order_in_which_chunks_come_changes_nothing(tmp_path: Path, reference: Path) -> None:
+    plan = planned(tmp_path)
+
+    class Backwards:
+        def play(self, work: Callable[[Chunk], object], tasks: Iterator[Chunk]) -> Iterator[tuple[Chunk, object]]:
+            return iter([(task, work(task)) for task in tasks][::-1])
+
+    conduct(plan, Backwards(), tmp_path / "back.json")  # type: ignore[arg-type]  # narrower than the protocol
+    assert (tmp_path / "back.json").read_bytes() == reference.read_bytes()
+
+
+def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, reference: Path) -> None:
+    """As if the power had gone after any byte: every length of the last line, and all numbers of lines."""
+    plan, out = planned(tmp_path), tmp_path / "out.json"
+    with Journal(journal_of(out), plan.digest()) as journal:
+        for chunk in plan.chunks():
+            journal.add(chunk, play_chunk(plan.as_json(), chunk))
+    whole = journal_of(out).read_bytes()
+    ends = [i + 1 for i, byte in enumerate(whole) if byte == ord("\n")]
+    for end in sorted({0, 5, *ends, *(end - 1 for end in ends), *(end + 20 for end in ends[:-1])}):
+        journal_of(out).write_bytes(whole[:end])
+        out.unlink(missing_ok=True)
+        conduct(plan, ThisProcess(), out)
+        assert out.read_bytes() == reference.read_bytes()
+        assert not journal_of(out).exists()
+
+
+def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
+    path, digest = tmp_path / "out.json.journal", planned(tmp_path).digest()
+    with Journal(path, digest) as journal:
+        journal.add(Chunk((0, 0)), [])
+        journal.add(Chunk((0, 1)), [])
+    path.write_bytes(path.read_bytes()[:-3])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0)]
+        journal.add(Chunk((1, 0)), [])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0), (1, 0)]
+
+
+def test_damaged_line_of_a_journal_is_played_again(tmp_path: Path, reference: Path) -> None:
+    plan, out = planned(tmp_path), tmp_path / "out.json"
+    with Journal(journal_of(out), plan.digest()) as journal:
+        for chunk in plan.chunks():
+            journal.add(chunk, play_chunk(plan.as_json(), chunk))
+    damaged = bytearray(journal_of(out).read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    journal_of(out).write_bytes(damaged)
+    conduct(plan, ThisProcess(), out)
+    assert out.read_bytes() == reference.read_bytes()
+
+
+def started(spec: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
+    command: list[str | Path] = [
+        sys.executable,
+        "-m",
+        "harness.cli",
+        "campaign",
+        spec,
+        "--out",
+        out,
+        "--workers",
+        "2",
+        *more,
+    ]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def until_lines(process: subprocess.Popen[bytes], path: Path, lines: int) -> None:
+    """Until the journal has so many lines; fails if the campaign ends before."""
+    deadline_s = time.monotonic() + 60.0
+    while not path.exists() or path.read_bytes().count(b"\n") < lines:
+        assert process.poll() is None and time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(("ended_by", "status"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
+    tmp_path: Path, ended_by: signal.Signals, status: int
+) -> None:
+    spec = SPEC.replace("trials = 6", "trials = 120").replace("chunk = 2", "chunk = 5")
+    plan, out = planned(tmp_path, spec), tmp_path / "out.json"
+    process = started(tmp_path / "spec.toml", out)
+    until_lines(process, journal_of(out), 4)
+    process.send_signal(ended_by)
+    _, complaint = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert not out.exists()
+    done = journal_of(out).read_bytes().count(b"\n") - 1
+    assert 3 <= done < len(list(plan.chunks()))
+    if ended_by == signal.SIGINT:
+        assert complaint.decode().startswith("analogrig: interrupted: what is done is kept in ")
+        assert complaint.count(b"\n") == 1
+    conduct(plan, ThisProcess(), out)
+    conduct(plan, ThisProcess(), tmp_path / "whole.json")
+    assert out.read_bytes() == (tmp_path / "whole.json").read_bytes()
+
+
+def _die_once(marks: str, task: int) -> int:
+    """Ends its process the first time that it is given 3; each call leaves a mark."""
+    mark = Path(marks) / f"{task}.{os.getpid()}"
+    mark.touch()
+    if task == 3 and len(list(Path(marks).glob("3.*"))) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return task * task
+
+
+def _die(_: int) -> int:
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError
+
+
+class DyingOnce:
+    """``_die_once`` with its folder, as it crosses the border between processes."""
+
+    def __init__(self, marks: Path) -> None:
+        self.marks = str(marks)
+
+    def __call__(self, task: int) -> int:
+        return _die_once(self.marks, task)
+
+
+def test_only_the_task_of_a_killed_worker_is_played_again(tmp_path: Path) -> None:
+    results = dict(Processes(2).play(DyingOnce(tmp_path), iter(range(8))))
+    assert results == {task: task * task for task in range(8)}
+    times = {task: len(list(tmp_path.glob(f"{task}.*"))) for task in range(8)}
+    assert times == {task: 2 if task == 3 else 1 for task in range(8)}
+
+
+def test_task_that_kills_every_worker_ends_the_campaign() -> None:
+    with pytest.raises(WorkerError, match=f"7: {MOST_DEATHS} workers died over it"):
+        list(Processes(1).play(_die, iter([7])))
+
+
+def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:
+    planned(tmp_path, SPEC.replace("trials = 6", "trials = 2000"))
+    out = tmp_path / "out.json"
+    process = started(tmp_path / "spec.toml", out)
+    until_lines(process, journal_of(out), 2)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    assert len(children) >= 2
+    process.kill()
+    process.communicate(timeout=60)
+    deadline_s = time.monotonic() + 30.0
+    while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def test_campaign_on_dask_with_a_worker_killed_gives_the_file_of_one_process(tmp_path: Path, reference: Path) -> None:
+    script = Path(__file__).with_name("campaign_on_dask.py")
+    planned(tmp_path)
+    command: list[str | Path] = [sys.executable, script, tmp_path / "spec.toml", tmp_path / "dask.json"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "killed a worker" in ran.stdout
+    assert (tmp_path / "dask.json").read_bytes() == reference.read_bytes()
+
+
+# --------------------------------------------------------------------------------------------------------- early end
+
+
+def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None:
+    """A change of 0.5 % is missed nearly always, and one of 20 % never; each is certain long before 40 trials."""
+    spec = SPEC.replace("trials = 6", "trials = 40").replace("[0.8, 0.9]", "[0.8, 0.999]").split("[draw]")[0]
+    stop = '[stop]\nquantity = "missed"\nrate = 0.5\nconfidence = 0.95\n'
+    plan = planned(tmp_path, spec.replace("samples = 1300", "samples = 1290") + stop)
+    results = conduct(plan, ThisProcess(), tmp_path / "a.json")
+    quick = results.cells()[0][1]
+    assert quick.missed == 0
+    assert quick.miss_rate[1] < 0.5
+    assert quick.trials < 20
+    tally = Tally(plan, 2)
+    for chunk in reversed(list(plan.chunks())):
+        tally.add(chunk, play_chunk(plan.as_json(), chunk))
+    assert tuple(map(tuple, tally.counted)) == results.rows
+
+
+# ------------------------------------------------------------------------------------------------------------ results
+
+
+def test_results_survive_the_file_and_are_not_played_again(tmp_path: Path, reference: Path) -> None:
+    class Nobody(ThisProcess):
+        play = None  # type: ignore[assignment]  # never asked
+
+    again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]
+    again.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == reference.read_bytes()
+
+
+def test_results_of_another_campaign_are_not_overwritten(tmp_path: Path, reference: Path) -> None:
+    before = reference.read_bytes()
+    with pytest.raises(ConfigurationError, match="holds the results of another campaign"):
+        conduct(planned(tmp_path, SPEC.replace("chunk = 2", "chunk = 3")), ThisProcess(), reference)
+    assert reference.read_bytes() == before
+
+
+def test_journal_of_another_campaign_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    with Journal(journal_of(out), planned(tmp_path).digest()):
+        pass
+    with pytest.raises(ConfigurationError, match="what was kept there is of another campaign"):
+        conduct(planned(tmp_path, SPEC.replace("chunk = 2", "chunk = 3")), ThisProcess(), out)
+
+
+def test_two_campaigns_do_not_share_a_journal(tmp_path: Path) -> None:
+    plan, out = planned(tmp_path), tmp_path / "out.json"
+    with (
+        Journal(journal_of(out), plan.digest()),
+        pytest.raises(ConfigurationError, match="another campaign is writing to it"),
+    ):
+        conduct(plan, ThisProcess(), out)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: whole.replace(b'"outcome":"passed"', b'"outcome":"superb"', 1),
+        lambda whole: whole.replace(b'"false_alarms":0', b'"false_alarms":-1', 1),
+        lambda whole: whole.replace(b'"version": 1', b'"version": 2', 1),
+        lambda _: b"[]",
+        lambda _: b"[" * 100_000,
+    ],
+)
+def test_damaged_results_are_one_line(tmp_path: Path, reference: Path, damage: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "damaged.json"
+    path.write_bytes(damage(reference.read_bytes()))
+    with pytest.raises(RecordingError, match=r"damaged\.json: ") as error:
+        Results.load(path)
+    assert "\n" not in str(error.value)
+
+
+def trial(
+    outcome: str = "passed", false_alarms: int = 0, changes: tuple[object, ...] = (), seed: int = 0
+) -> dict[str, object]:
+    return {
+        "seed": seed,
+        "outcome": outcome,
+        "samples": 1000,
+        "false_alarms": false_alarms,
+        "changes": list(changes),
+        "errors": [0.03, -0.04, 0.0],
+        "theta": "00",
+    }
+
+
+def test_summary_counts_what_is_valid_and_nothing_else() -> None:
+    rows = [
+        trial(changes=([4, 3, False, False],)),
+        trial("failed", 2, ([None, 5, True, False], [8, 5, False, True])),
+        trial(changes=([None, None, False, False],)),
+        trial("inconclusive", 9, ([None, 1, True, False],)),
+    ]
+    found = Summary.of(rows)
+    assert (found.trials, found.passed, found.failed, found.inconclusive) == (4, 2, 1, 1)
+    assert (found.samples, found.false_alarms, found.visible, found.missed, found.late) == (3000, 2, 3, 1, 1)
+    assert (found.latency_n, found.latency_p95_n, found.bound_n) == (6.0, 8.0, 4.0)
+    assert found.error["M"] == pytest.approx(0.03)
+    assert found.miss_rate[0] < 1 / 3 < found.miss_rate[1]
+
+
+def test_table_has_a_line_for_each_cell_and_one_for_all(reference: Path) -> None:
+    lines = text(Results.load(reference)).splitlines()
+    assert lines[0] == "campaign spec: 2 cells, 12 trials, 15600 samples: PASSED"
+    assert [line.split()[0] for line in lines[3:6]] == ["0.8", "0.9", "all"]
+
+
+def test_command_says_what_came_out_and_writes_the_page(
+    tmp_path: Path, reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path)
+    out = tmp_path / "out.json"
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["total"]["trials"] == 12
+    assert [cell["stiffness_factor"] for cell in said["cells"]] == ["0.8", "0.9"]
+    assert out.read_bytes() == reference.read_bytes()
+    assert Path(said["page"]).read_text().startswith("<!doctype html>")
+
+
+def test_device_that_cannot_be_had_is_inconclusive_and_what_is_done_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent']\n")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json")]) == 3
+    complaint = capsys.readouterr().err
+    assert "cell 0, seed 0: cannot open /dev/absent" in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path, "trials = 1\nsamples = 600\ndevices = ['host']\n")
+    out = tmp_path / "out.json"
+
+    def interrupted(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("harness.dut.Dut.play", interrupted)
+        assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
+    assert "interrupted: what is done is kept in" in capsys.readouterr().err
+    assert journal_of(out).read_bytes().count(b"\n") == 1
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 0
+
+
+def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    planned(tmp_path, "devices = ['serial:/dev/absent']\n")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "out.json")]) == 2
+    assert "serial:/dev/absent is one device" in capsys.readouterr().err

@@ -1,0 +1,181 @@
+"""Buses that python-can opens: what its interfaces and the system say when something is wrong, as one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+import pty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from harness.can_bus import PythonCanBus
+from harness.errors import ConfigurationError, LinkClosed, LinkError
+
+FRAME = can.Message(arbitration_id=0x18, is_extended_id=False, data=bytes(8))
+
+
+@pytest.fixture
+def channel(request: pytest.FixtureRequest) -> str:
+    """Of a virtual bus that nobody else has."""
+    return str(request.node.name)
+
+
+@pytest.fixture
+def bus(channel: str) -> Iterator[PythonCanBus]:
+    bus = PythonCanBus({"interface": "virtual", "channel": channel})
+    yield bus
+    bus.close()
+
+
+@pytest.fixture(autouse=True)
+def _no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of whoever runs the tests."""
+    for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("can.util.CONFIG_FILES", [])
+
+
+def test_frames_pass_in_both_directions(bus: PythonCanBus, channel: str) -> None:
+    with can.Bus(interface="virtual", channel=channel) as other:
+        bus.send(FRAME)
+        heard = other.recv(1.0)
+        assert heard is not None and heard.equals(
+            FRAME, timestamp_delta=None, check_channel=False, check_direction=False
+        )
+        other.send(FRAME)
+        assert bus.receive(1.0) is not None
+        assert bus.receive(0.0) is None
+
+
+def test_bus_may_be_closed_twice(bus: PythonCanBus) -> None:
+    bus.close()
+    bus.close()
+
+
+# ---- python-can's own configuration
+
+
+def test_environment_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, channel: str) -> None:
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    monkeypatch.setenv("CAN_CHANNEL", channel)
+    monkeypatch.setenv("CAN_CONFIG", '{"fd": true, "bitrate": 500000, "data_bitrate": 2000000}')
+    bus = PythonCanBus({})
+    assert (bus.name, bus.is_fd) == (f"virtual/{channel}", True)
+    assert bus.line is not None and bus.line.speed == "500000 bit/s, data 2000000 bit/s"
+    bus.close()
+
+
+def test_file_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, channel: str) -> None:
+    (tmp_path / "can.conf").write_text(f"[default]\ninterface = virtual\nchannel = {channel}\nbitrate = 250000\n")
+    monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
+    bus = PythonCanBus({"bitrate": 125_000})
+    assert bus.name == f"virtual/{channel}"
+    assert bus.line is not None and bus.line.bitrate == 125_000
+    bus.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "kind", "said"),
+    [
+        ({}, ConfigurationError, "can: say which interface, can:virtual or can:socketcan/can0, or name it in"),
+        ({"interface": "foo"}, ConfigurationError, "can:foo: python-can knows canalystii, .*, and no 'foo'"),
+        ({"interface": "slcan"}, ConfigurationError, "can:slcan: say which channel: can:slcan/CHANNEL"),
+        (
+            {"interface": "slcan", "channel": "/dev/absent", "sleep_after_open": 0},
+            LinkError,
+            "cannot open can:slcan//dev/absent: No such file or directory",
+        ),
+        ({"interface": "virtual", "foo": 1, "state": "odd"}, ConfigurationError, "can: .*State config not valid!"),
+    ],
+)
+def test_what_cannot_be_opened_is_named(asked: dict[str, Any], kind: type[Exception], said: str) -> None:
+    with pytest.raises(kind, match=f"^{said}") as caught:
+        PythonCanBus(asked)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.EAFNOSUPPORT, "this kernel has no CAN"),
+        (errno.ENODEV, "there is no such interface"),
+        (errno.EPERM, "Operation not permitted"),
+    ],
+)
+def test_what_the_system_refuses_is_named(number: int, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("can.interfaces.socketcan.socketcan.create_socket", refuse)
+    with pytest.raises(LinkError, match=f"^cannot open can:socketcan/can0: {said}"):
+        PythonCanBus({"interface": "socketcan", "channel": "can0"})
+
+
+# ---- while it is open
+
+
+def failing(error: Exception, times: int) -> Callable[..., None]:
+    """So often, and then well."""
+    left = times
+
+    def send(*_: object) -> None:
+        nonlocal left
+        left -= 1
+        if left >= 0:
+            raise error
+
+    return send
+
+
+NO_ROOM = can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+DOWN = can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN)
+
+
+def test_full_queue_is_waited_for(bus: PythonCanBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus._bus, "send", failing(NO_ROOM, times=3))
+    bus.send(FRAME)
+
+
+@pytest.mark.parametrize("error", [NO_ROOM, can.CanTimeoutError(), can.CanOperationError("Transmit buffer full")])
+def test_queue_that_stays_full_is_named_with_what_may_be_the_cause(
+    bus: PythonCanBus, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("harness.can_bus.WRITE_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(bus._bus, "send", failing(error, times=1000))
+    with pytest.raises(LinkError, match=r"queue has been full for 0\.02 s: nobody acknowledges") as caught:
+        bus.send(FRAME)
+    assert not isinstance(caught.value, LinkClosed)
+
+
+@pytest.mark.parametrize("way", ["send", "recv"])
+def test_interface_that_goes_down_is_gone(bus: PythonCanBus, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus._bus, way, failing(DOWN, times=1))
+    with pytest.raises(LinkClosed, match=r"^virtual/\S+: Network is down$"):
+        bus.send(FRAME) if way == "send" else bus.receive(1.0)
+
+
+def test_what_the_interface_cannot_read_is_counted(bus: PythonCanBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus._bus, "recv", failing(ValueError("invalid literal for int()"), times=2))
+    assert [bus.receive(1.0), bus.receive(1.0), bus.receive(1.0)] == [None, None, None]
+    assert bus.damaged == 2
+
+
+def test_garbage_of_an_adapter_is_counted_and_its_end_told() -> None:
+    ours, theirs = pty.openpty()
+    path = os.ttyname(theirs)
+    bus = PythonCanBus({"interface": "slcan", "channel": path, "sleep_after_open": 0})
+    os.write(ours, b"tXYZ\rt0208\xff\xff\r")
+    assert [bus.receive(1.0), bus.receive(1.0)] == [None, None]
+    assert bus.damaged == 2
+    os.write(ours, b"t02020102\r")
+    heard = bus.receive(1.0)
+    assert heard is not None and (heard.arbitration_id, heard.data.hex()) == (0x20, "0102")
+    os.close(theirs)
+    os.close(ours)
+    with pytest.raises(LinkClosed, match=f"^slcan/{path}: "):
+        bus.receive(1.0)
+    bus.close()

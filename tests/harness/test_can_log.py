@@ -1,0 +1,432 @@
+"""CAN logs: in the tools that their users have, judged and replayed, damaged and strange."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from harness.bench import Bench
+from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
+from harness.catalogue import LAYOUTS, Hello, Key, pack
+from harness.cli import main
+from harness.dut import open_dut
+from harness.errors import ConfigurationError, RecordingError
+from harness.estimator_config import EstimatorConfig
+from harness.rig import RecordingRig, open_rig
+from harness.run import LOST, Run
+from harness.scenario import Scenario
+from harness.summary import summary
+from harness.verdict import judge
+
+DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
+
+SCENARIO = dataclasses.replace(
+    Scenario.load("thesis"),
+    samples=600,
+    tweaks=tuple(dataclasses.replace(tweak, sample=400) for tweak in Scenario.load("thesis").tweaks[:1]),
+)
+SEED = 7
+
+DEVICE = "inproc?link=can&bitrate=1000000"
+
+
+def played(*listeners: Callable[[can.Message], object], device: str = DEVICE, **changes: Any) -> Run:
+    def listen(frame: can.Message) -> None:
+        for listener in listeners:
+            listener(frame)
+
+    with open_rig("emulator") as rig, open_dut(device, listener=listen, **changes) as dut:
+        return Bench(rig, dut).play(SCENARIO, SEED)
+
+
+@pytest.fixture(scope="module")
+def traffic() -> tuple[Run, list[can.Message]]:
+    """A run, and its frames."""
+    frames: list[can.Message] = []
+    return played(frames.append), frames
+
+
+def written(path: Path, frames: Iterable[can.Message]) -> Path:
+    log = CanLog(path)
+    for frame in frames:
+        log(frame)
+    log.close()
+    return path
+
+
+def captured(path: Path, **how: Any) -> Run:
+    with open_rig("emulator") as rig:
+        return captured_run(path, SCENARIO, rig, **how)
+
+
+def identifier(name: str) -> int:
+    return LAYOUTS[name].id
+
+
+def nth(frames: Sequence[can.Message], name: str, n: int) -> int:
+    """Where the n-th frame of that name is."""
+    return [i for i, frame in enumerate(frames) if frame.arbitration_id == identifier(name)][n]
+
+
+def without(frames: list[can.Message], *places: int) -> list[can.Message]:
+    return [frame for i, frame in enumerate(frames) if i not in places]
+
+
+def ran(*words: str, given: bytes = b"") -> str:
+    return subprocess.run(
+        [sys.executable, *words], input=given, capture_output=True, check=True, timeout=60
+    ).stdout.decode()
+
+
+# ------------------------------------------------------------------------------------------------- the users' tools
+
+
+def test_cantools_decodes_a_candump_log_with_our_dbc(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    first = nth(frames, "Sample", 0)
+    log = written(tmp_path / "can.log", frames[first : first + 9])
+    out = ran("-m", "cantools", "decode", "--single-line", str(DBC), given=log.read_bytes())
+    lines = out.splitlines()
+    assert len(lines) == 9
+    assert f"Force: {run.codes[0, 0]} code" in lines[0]
+    assert f"Displacement: {run.codes[0, 1]} code" in lines[0]
+    assert "Element: THETA_0" in lines[1]
+    assert "Element: INNOVATION" in lines[7]
+    assert "Stepped(" in lines[8]
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_readers_of_python_can_get_back_what_was_on_the_bus(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], suffix: str
+) -> None:
+    frames = traffic[1][:300]
+    with can.LogReader(written(tmp_path / f"can.{suffix}", frames)) as reader:
+        read = list(reader)
+    assert [frame.arbitration_id for frame in read] == [frame.arbitration_id for frame in frames]
+    assert [bytes(frame.data) for frame in read] == [bytes(frame.data) for frame in frames]
+    assert [frame.is_rx for frame in read] == [frame.is_rx for frame in frames]
+
+
+def test_asammdf_decodes_a_measurement_with_our_dbc(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    asammdf = pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
+    run, frames = traffic
+    log = written(tmp_path / "can.mf4", frames)
+    with asammdf.MDF(log) as raw, raw.extract_bus_logging({"CAN": [(str(DBC), 0)]}) as decoded:
+        force = decoded.get("Force").samples
+    np.testing.assert_array_equal(force, run.codes[:, 0])
+
+
+# ------------------------------------------------------------------------------------------------------- what it was
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_log_holds_the_same_run(tmp_path: Path, traffic: tuple[Run, list[can.Message]], suffix: str) -> None:
+    run, frames = traffic
+    again = captured(written(tmp_path / f"can.{suffix}", frames))
+    assert again.theta_hash() == run.theta_hash()
+    np.testing.assert_array_equal(again.codes[:, :2], run.codes[:, :2])
+    np.testing.assert_array_equal(again.flags, run.flags)
+    np.testing.assert_array_equal(again.alarm_index, run.alarm_index)
+    np.testing.assert_array_equal(again.diagnosis_onset, run.diagnosis_onset)
+    assert again.conditions.counters == run.conditions.counters
+    verdict = judge(run)  # whose ceiling travels in single precision
+    assert dataclasses.replace(judge(again), ceiling=verdict.ceiling, arl0=verdict.arl0) == verdict
+    assert judge(again).outcome == "passed"
+
+
+@pytest.mark.parametrize(
+    ("device", "changes"),
+    [("inproc?link=can&fd=true", {"exchange": "block"}), (DEVICE, {"report_interval_n": 10})],
+    ids=["blocks of CAN FD", "every tenth estimate"],
+)
+def test_log_of_another_exchange_holds_the_same_run(tmp_path: Path, device: str, changes: dict[str, Any]) -> None:
+    log = CanLog(tmp_path / "can.log")
+    run = played(log, device=device, **changes)
+    log.close()
+    again = captured(tmp_path / "can.log")
+    assert again.theta_hash() == run.theta_hash()
+    np.testing.assert_array_equal(again.flags, run.flags)
+
+
+def test_estimator_is_as_the_device_said_it_was(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    said = captured(written(tmp_path / "can.log", frames)).conditions.dut["estimator"]
+    assert singled(said) == singled(run.conditions.dut["estimator"])
+
+
+def singled(table: Mapping[str, Any]) -> dict[str, Any]:
+    """In single precision, as it travels."""
+    return {key: float(np.float32(value)) if isinstance(value, float) else value for key, value in table.items()}
+
+
+def test_settings_give_the_estimator_back() -> None:
+    for estimator in (
+        EstimatorConfig(na=1, nb=1, c=(0.5,), trigger="none", offset=False),
+        EstimatorConfig(
+            trigger="mean-between-faults", ceiling=30.0, reset="all", edge_instants="locked", absolute=True
+        ),
+    ):
+        assert EstimatorConfig.from_settings(dict(estimator.settings()), "here") == estimator
+
+
+def test_setting_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="here: na = nan is no setting of an estimator"):
+        EstimatorConfig.from_settings({Key.NA: float("nan")}, "here")
+
+
+def test_foreign_frames_and_times_of_others_change_nothing(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    """Other names of the channel, seconds since 1970, and a bus on which others talk."""
+    run, frames = traffic
+    rng = random.Random(3)  # noqa: S311
+    lines = []
+    for i, frame in enumerate(frames):
+        lines.append(f"({1.7e9 + i * 1e-3:.6f}) can1 {frame.arbitration_id:03X}#{frame.data.hex()}")
+        if i % 5 == 0:
+            lines.append(f"({1.7e9 + i * 1e-3:.6f}) can1 {rng.randrange(0x100, 0x800):03X}#{rng.randbytes(4).hex()}")
+    lines += ["(1700000001.0) can1 20000080#0000000000000000", "(1700000001.0) can1 00000018#00", "(1.0) can1 018#R"]
+    log = tmp_path / "bench.log"
+    log.write_text("\n".join(lines))
+    again = captured(log)
+    assert again.theta_hash() == run.theta_hash()
+    assert judge(again).outcome == "passed"
+    assert again.conditions.link_counters["frames_foreign"] == -(-len(frames) // 5) + 1
+    assert again.conditions.link_counters["error_frames"] == 1
+    assert again.conditions.link_counters["frames_dropped"] == 1
+
+
+def test_log_with_identifiers_of_another_dbc_is_understood(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    """A bench that has the messages elsewhere, with 29 bits: by name they are the same."""
+    run, frames = traffic
+    text = DBC.read_text()
+    for layout in LAYOUTS.values():
+        there = str(0x80000000 + 0x18FF0000 + layout.id)
+        for word in (
+            "BO_",
+            "CM_ BO_",
+            "CM_ SG_",
+            "VAL_",
+            "SIG_VALTYPE_",
+            'BA_ "VFrameFormat" BO_',
+            'BA_ "FrameSeed" BO_',
+        ):
+            text = text.replace(f"{word} {layout.id} ", f"{word} {there} ")
+    dbc = tmp_path / "bench.dbc"
+    dbc.write_text(text)
+    moved = [
+        can.Message(arbitration_id=0x18FF0000 + frame.arbitration_id, data=frame.data, is_rx=frame.is_rx)
+        for frame in frames
+    ]
+    log = written(tmp_path / "can.log", moved)
+    assert captured(log, dbc=dbc).theta_hash() == run.theta_hash()
+    with pytest.raises(RecordingError, match=r"can\.log: holds no run of a device: \d+ frames have other identifiers"):
+        captured(log)
+
+
+# -------------------------------------------------------------------------------------------------------- what lacks
+
+
+@pytest.mark.parametrize("name", ["Sample", "Estimate", "Stepped", "Alarm"])
+def test_frame_that_was_not_captured_makes_the_run_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    run, frames = traffic
+    again = captured(written(tmp_path / "can.log", without(frames, nth(frames, name, 0))))
+    assert again.samples == run.samples
+    assert int(again.lost.sum()) == (1 if name != "Stepped" else int(again.lost.sum()))
+    assert 1 <= int(again.lost.sum()) <= 2
+    assert judge(again).outcome == "inconclusive"
+
+
+def test_gaps_up_to_the_limit_are_allowed(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    gaps = [nth(frames, "Sample", n) for n in (10, 200, 210)]
+    log = written(tmp_path / "can.log", without(frames, *gaps))
+    assert judge(captured(log, most_lost_n=3)).outcome == "passed"
+    verdict = judge(captured(log, most_lost_n=2))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0] == "3 samples were lost on the way to the device, more than 2"
+    lost = captured(log)
+    assert np.flatnonzero(lost.flags & LOST).tolist() == [10, 200, 210]
+    assert lost.missing[[10, 200, 210]].all()
+    assert lost.theta_hash() == run.theta_hash()  # the device had them
+
+
+def test_capture_that_ended_early_is_inconclusive(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    frames = traffic[1]
+    verdict = judge(captured(written(tmp_path / "can.log", frames[: nth(frames, "Stepped", 299) + 1])))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons == ("the run ended after 300 of 600 samples",)
+
+
+def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    log = written(tmp_path / "can.log", frames)
+    lines = log.read_text().splitlines()
+    lines[5:5] = [
+        "",
+        "hello",
+        "(1.0) can0",
+        "(1.0) can0 018#0",
+        "(x) can0 018#00 R",
+        "\x00\xff\x7f",
+        "(1.0) can0 GGG#00 T",
+    ]
+    log.write_text("\n".join(lines), encoding="latin-1")
+    reader = CapturedFrames(log)
+    assert len(list(reader)) >= len(frames)
+    assert reader.damaged[:2] == [7, 8]
+    again = captured(log)
+    assert again.theta_hash() == run.theta_hash()
+    assert again.conditions.link_counters["lines_damaged"] == len(reader.damaged)
+
+
+@pytest.mark.filterwarnings("ignore:.*MDF4.__del__")  # asammdf, of a file that it could not open
+@pytest.mark.parametrize("suffix", ["blf", "mf4", "asc"])
+def test_file_cut_anywhere_is_refused_or_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], suffix: str
+) -> None:
+    whole = written(tmp_path / f"whole.{suffix}", traffic[1]).read_bytes()
+    cut = tmp_path / f"cut.{suffix}"
+    for part in (0.0, 0.3, 0.9):
+        cut.write_bytes(whole[: int(part * len(whole))])
+        said = outcome_or_error(cut)
+        assert said == "inconclusive" or said.startswith(f"{cut}: holds no run of a device"), part
+        assert "\n" not in said
+
+
+def outcome_or_error(path: Path) -> str:
+    try:
+        return judge(captured(path)).outcome
+    except RecordingError as error:
+        return str(error)
+
+
+def test_several_runs_in_a_log_are_told_apart(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    twice = written(tmp_path / "can.log", [*frames, *frames])
+    with pytest.raises(RecordingError, match=r"can\.log: holds 2 runs: say --run 1 to 2"):
+        captured(twice)
+    for number in (1, 2):
+        assert captured(twice, number=number).theta_hash() == run.theta_hash()
+    with pytest.raises(RecordingError, match=r"can\.log: has no run 3: there are 2"):
+        captured(twice, number=3)
+
+
+def test_device_of_another_catalogue_is_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, "Hello", 0)
+    hello = pack(Hello(0, 18, 0, 0x12345678))
+    frames[at] = can.Message(arbitration_id=hello[0], data=hello[1:], is_extended_id=False)
+    with pytest.raises(RecordingError, match=r"can\.log: the device speaks catalogue 0x12345678, .* say --dbc"):
+        captured(written(tmp_path / "can.log", frames))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("can.log", "", "holds no run of a device"),
+        ("can.log", "  can0  018   [8]  00 11 22 33 44 55 66 77\n", "1 lines are no frames (at 1); candump -L writes"),
+        ("can.csv", "a,b", "not a CAN log: the suffix must be one of .log, .blf, .asc, .mf4, .trc"),
+        ("none.log", None, "No such file or directory"),
+    ],
+)
+def test_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, text: str | None, said: str) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(RecordingError) as error:
+        captured(tmp_path / name)
+    assert str(error.value).startswith(str(tmp_path / name))
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "No such file or directory"),
+        ("BO_ nonsense", "not a DBC"),
+        ('VERSION ""\nBU_: A\nBO_ 1 Engine: 8 A\n SG_ Speed : 0|8@1+ (1,0) [0|0] "" A\n', "none of the messages"),
+        (
+            'VERSION ""\nBU_: A\nBO_ 24 Sample: 8 A\n SG_ Seq : 0|8@1+ (1,0) [0|0] "" A\n',
+            "Sample lacks Displacement, F",
+        ),
+    ],
+)
+def test_dbc_that_does_not_serve_is_refused_in_one_line(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], text: str | None, said: str
+) -> None:
+    if text is not None:
+        (tmp_path / "own.dbc").write_text(text)
+    with pytest.raises(ConfigurationError) as error:
+        captured(written(tmp_path / "can.log", traffic[1][:5]), dbc=tmp_path / "own.dbc")
+    assert str(error.value).startswith(f"--dbc {tmp_path / 'own.dbc'}: ")
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_scenario_with_fewer_samples_is_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    shorter = dataclasses.replace(SCENARIO, samples=599)
+    with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match="has 600 samples, scenario thesis 599"):
+        captured_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
+    with pytest.raises(ConfigurationError, match="the recording has 600 samples"):
+        retold(traffic[0], shorter)
+
+
+def test_disk_that_is_full_is_told_when_the_log_is_closed(
+    traffic: tuple[Run, list[can.Message]], tmp_path: Path
+) -> None:
+    log = CanLog(tmp_path / "gone" / "can.log")  # a folder that is not there
+    for frame in traffic[1][:10]:
+        log(frame)
+    with pytest.raises(RecordingError, match=r"can\.log: cannot be written: No such file"):
+        log.close()
+
+
+# -------------------------------------------------------------------------------------------------- the command line
+
+
+def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    (out / "x").parent.mkdir()
+    (out / "can.blf").write_text("of an earlier run")
+    assert main(["run", "--dut", DEVICE, "--out", str(out)]) == 0
+    first = capsys.readouterr().out
+    (digest,) = [line for line in first.splitlines() if "theta hash" in line]
+    assert "bus: 1000000 bit/s: 24.3 times what it carries, in real time; at most 823.05 samples/s" in first
+    assert {path.name for path in out.iterdir()} == {"can.log", "run.npz", "report.html"}
+    log = str(out / "can.log")
+    for words in (["judge", log], ["judge", str(out / "run.npz")], ["replay", log, "--dut", "inproc"]):
+        assert main([*words, "--scenario", "thesis", "--out", str(tmp_path / "again")]) == 0
+        assert digest in capsys.readouterr().out
+    assert main(["judge", log]) == 2
+    assert "say --scenario" in capsys.readouterr().err
+    assert main(["replay", log, "--scenario", "thesis"]) == 2
+    assert "say --dut" in capsys.readouterr().err
+
+
+def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
+    assert main(["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
+
+
+def test_replay_of_a_log_plays_the_samples_that_it_has(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    run, frames = traffic
+    rig = RecordingRig.of(captured(written(tmp_path / "can.log", frames)), tmp_path / "can.log")
+    with rig, open_dut("inproc") as dut:
+        again = Bench(rig, dut).play(rig.scenario(), rig.run.conditions.seed)
+    assert again.theta_hash() == run.theta_hash()
+    assert "bus:" not in summary(again, judge(again))

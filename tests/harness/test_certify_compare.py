@@ -1,0 +1,263 @@
+"""Certificates and comparisons: that they say what is true, and not more often wrong than they promise."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from harness.bench import Bench
+from harness.campaign_spec import rig_table
+from harness.campaign_trial import Count, Row
+from harness.campaign_workers import Processes, ThisProcess
+from harness.certificate import Certificate, Question, certify, question_of
+from harness.cli import main
+from harness.comparison import Difference, _worded, compare, load, permutation_p, sign_flip_p
+from harness.devices import describe
+from harness.dut import open_dut
+from harness.errors import ConfigurationError, RecordingError
+from harness.rig import open_rig
+from harness.scenario import Scenario
+
+# -------------------------------------------------------------------------------------------------------- certificates
+
+
+def asked(dut: str = "inproc", **settings: Any) -> Question:
+    return question_of(rig_table("emulator"), describe(dut).as_table(), Scenario.load("healthy"), **settings)
+
+
+def noisy_device(tmp_path: Path, arl0: float) -> str:
+    """One whose trigger is far too sensitive: with a noise variance so small, everything is a surprise."""
+    path = tmp_path / "noisy.toml"
+    path.write_text(f'kind = "inproc"\n[estimator]\nnoise_variance = 0.8\narl0 = {arl0}\n')
+    return str(path)
+
+
+def test_quiet_device_is_certified_by_the_number_of_samples_that_this_takes() -> None:
+    """The length is Clopper and Pearson's for no alarm: ln(1 / 0.01) / 1e-4 but for the last samples."""
+    answer = certify(asked(far=1e-4, confidence=0.99, allowed=0), ThisProcess())
+    assert answer.outcome == "certified"
+    assert answer.alarms == 0
+    assert answer.samples == pytest.approx(46_050, abs=40)
+    assert answer.rate[1] <= 1e-4
+
+
+@pytest.mark.parametrize("sequential", [False, True])
+def test_noisy_device_is_refuted(tmp_path: Path, sequential: bool) -> None:  # noqa: FBT001 - a parameter
+    answer = certify(
+        asked(noisy_device(tmp_path, 20.0), far=1e-4, confidence=0.999, allowed=0, sequential=sequential), ThisProcess()
+    )
+    assert answer.outcome == "refuted"
+    assert answer.alarms / answer.samples > 1e-4
+
+
+class Coin:
+    """Instead of a device: alarms by chance at a known rate, in runs of 100 samples that count."""
+
+    def __init__(self, rate: float, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._rate = rate
+
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        for task in tasks:
+            yield task, Count(int(self._rng.binomial(100, self._rate)), 100 + 150)
+
+
+def outcomes(rate: float, n: int, **settings: Any) -> list[Certificate]:
+    question = asked(far=0.01, confidence=0.9, **settings)
+    return [certify(question, Coin(rate, seed)) for seed in range(n)]
+
+
+@pytest.mark.parametrize("sequential", [False, True])
+def test_device_at_the_limit_is_certified_or_refuted_as_seldom_as_promised(sequential: bool) -> None:  # noqa: FBT001
+    """300 of either, at most a tenth of them wrong each way: binomial, false failure 1e-6 each."""
+    found = [answer.outcome for answer in outcomes(0.01, 300, sequential=sequential, allowed=3)]
+    most = stats.binom.isf(1e-6, 300, 0.1)
+    assert 0 < found.count("certified") <= most
+    assert found.count("refuted") <= most
+
+
+def test_sequential_test_needs_fewer_samples_for_a_good_device_than_the_fixed_one() -> None:
+    fixed, early = (outcomes(0.0005, 20, sequential=sequential) for sequential in (False, True))
+    assert {answer.outcome for answer in fixed + early} == {"certified"}
+    assert np.mean([answer.samples for answer in early]) < 0.5 * fixed[0].samples
+
+
+def test_sequential_test_certifies_a_device_without_alarms_in_the_run_in_which_that_is_certain() -> None:
+    """Wald: ln(1 / 0.1) over the gain of a sample without an alarm, ln(0.999 / 0.99)."""
+    fewest = math.log(10.0) / math.log(0.999 / 0.99)
+    (answer,) = outcomes(0.0, 1, sequential=True)
+    assert (answer.outcome, answer.samples) == ("certified", math.ceil(fewest / 100) * 100)
+
+
+class LastFirst:
+    """Counts that depend on the seed alone, and come five at a time, the last one first."""
+
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        while True:
+            for task in reversed(list(itertools.islice(tasks, 5))):
+                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)
+
+
+class InTurn:
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)) for task in tasks)
+
+
+def test_answer_does_not_depend_on_the_workers() -> None:
+    question = asked(far=1e-3, confidence=0.99, sequential=True)
+    assert certify(question, Processes(2)) == certify(question, ThisProcess())
+    question = asked(far=0.01, confidence=0.99, sequential=True)
+    assert certify(question, LastFirst()) == certify(question, InTurn())
+    assert certify(question, InTurn()).samples % 500 != 0
+
+
+def test_device_over_a_line_gives_the_same_counts() -> None:
+    settings: dict[str, Any] = {"far": 5e-3, "confidence": 0.9, "allowed": 0}
+    assert certify(asked("host", **settings), ThisProcess()) == certify(asked(**settings), ThisProcess())
+
+
+def test_run_that_is_not_valid_leaves_the_answer_open(tmp_path: Path) -> None:
+    path = tmp_path / "resetting.toml"
+    path.write_text('kind = "inproc"\nwire_faults = "reset@to:300"\n')
+    answer = certify(asked(str(path), far=5e-3, confidence=0.9, allowed=0), ThisProcess())
+    assert answer.outcome == "inconclusive"
+    assert "seed 0: " in answer.reason
+
+
+def test_scenario_with_changes_cannot_be_certified() -> None:
+    with pytest.raises(ConfigurationError, match="certify: the scenario changes the plant"):
+        question_of(
+            rig_table("emulator"), describe("inproc").as_table(), Scenario.load("thesis"), far=1e-5, confidence=0.9
+        )
+
+
+def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--far", "1e-3", "--confidence", "0.99", "--json"]
+    assert main(["certify", "--dut", "inproc", "--allowed", "0", *options]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["outcome"], said["far"], said["alarms"]) == ("certified", 1e-3, 0)
+    assert main(["certify", "--dut", noisy_device(tmp_path, 20.0), "--sequential", *options]) == 1
+    assert main(["certify", "--dut", "serial:/dev/absent", *options]) == 3
+    assert main(["certify", "--dut", "inproc", "--far", "2"]) == 2
+
+
+# --------------------------------------------------------------------------------------------------------- comparisons
+
+
+def test_sign_flips_are_counted_exactly() -> None:
+    """Five differences of one sign: 2 of the 32 ways are as extreme. By brute force for others."""
+    assert sign_flip_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])) == 2 / 32
+    values = np.array([0.5, -1.0, 2.5, 3.0, 0.25, 1.0])
+    sums = [abs(np.dot(signs, values)) for signs in itertools.product((-1, 1), repeat=6)]
+    assert sign_flip_p(values) == sum(each >= abs(values.sum()) for each in sums) / 64
+    assert sign_flip_p(np.zeros(9)) == 1.0
+
+
+def test_many_sign_flips_agree_with_the_normal_limit() -> None:
+    values = np.random.default_rng(1).standard_normal(200) + 0.1
+    z = values.sum() / np.sqrt((values**2).sum())
+    assert sign_flip_p(values) == pytest.approx(2 * stats.norm.sf(abs(z)), rel=0.05)
+
+
+def test_permutations_agree_with_scipy() -> None:
+    rng = np.random.default_rng(2)
+    x, y = rng.standard_normal(6), rng.standard_normal(7) + 1.0
+    exact = stats.permutation_test((x, y), lambda a, b, axis: a.mean(axis) - b.mean(axis), n_resamples=np.inf)
+    assert permutation_p(x, y) == pytest.approx(exact.pvalue, rel=0.1)
+
+
+def observed(
+    seed: int, latency_n: int | None, *, false_alarms: int = 0, cell: str = "a", theta: str = "0"
+) -> tuple[tuple[object, ...], Row]:
+    change = [latency_n, 3, latency_n is None, False]
+    row = {"seed": seed, "outcome": "passed", "samples": 1000, "false_alarms": false_alarms, "changes": [change]}
+    return (cell, seed), {**row, "errors": [0.01, 0.02, 0.03], "theta": theta}
+
+
+def test_slower_build_is_worse_and_the_other_way_round_better() -> None:
+    quick = [observed(seed, 4 + seed % 3) for seed in range(12)]
+    slow = [observed(seed, 6 + seed % 3, theta="1") for seed in range(12)]
+    found = compare(quick, slow)
+    assert {each.quantity: each.word for each in found.differences if each.word != "no difference shown"} == {
+        "latency": "worse"
+    }
+    assert found.worse
+    assert found.identical == (0, 12)
+    assert {each.word for each in compare(slow, quick).differences} == {"better", "no difference shown"}
+
+
+def test_latency_is_compared_where_both_noticed_and_misses_by_themselves() -> None:
+    a = [observed(seed, 5) for seed in range(28)]
+    b = [observed(seed, None if seed % 2 else 5) for seed in range(28)]
+    words = {each.quantity: (each.word, each.seeds) for each in compare(a, b).differences}
+    assert words["latency"] == ("no difference shown", 14)
+    assert words["missed"] == ("worse", 28)
+
+
+def test_change_that_one_side_missed_counts_for_the_latency_of_neither() -> None:
+    """Two changes a trial, the second of which B misses: 4 against 4 samples, and not 7 against 4."""
+    a, b = ([observed(seed, 4) for seed in range(3)] for _ in "ab")
+    for (_, mine), (_, other) in zip(a, b, strict=True):
+        mine["changes"].append([10, 3, False, False])
+        other["changes"].append([None, 3, True, False])
+    latency = compare(a, b).differences[0]
+    assert (latency.a, latency.b, latency.p) == (4.0, 4.0, 1.0)
+
+
+def test_probabilities_are_adjusted_as_holm_says() -> None:
+    """The smallest times 4, the next times 3, ... and never less than the one before."""
+    found = [Difference("x", "", 1.0, 2.0, 9, "", p, p, "worse") for p in (0.01, 0.04, 0.03, 0.005)]
+    adjusted = [each.adjusted_p for each in _worded(found, 0.025)]
+    assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert [each.word for each in _worded(found, 0.025)] == [*["no difference shown"] * 3, "worse"]
+
+
+def test_cells_of_one_seed_are_one_observation() -> None:
+    """Forty cells with the same three seeds prove no more than three seeds can: 2 of 8 ways."""
+    a, b = ([observed(s, n, cell=str(c)) for c in range(40) for s in range(3)] for n in (4, 9))
+    latency = compare(a, b).differences[0]
+    assert (latency.seeds, latency.p, latency.word) == (3, 0.25, "no difference shown")
+
+
+def test_one_in_many_quantities_is_not_called_different_by_chance() -> None:
+    """Two equal sides, 200 times: a wrong word at most as often as alpha says, with all six quantities asked at once.
+
+    Binomial(200, 0.1): false failure below 1e-6.
+    """
+    rng, wrong = np.random.default_rng(3), 0
+    for _ in range(200):
+        a, b = (
+            [observed(s, int(rng.geometric(0.2)), false_alarms=int(rng.integers(3))) for s in range(10)] for _ in "ab"
+        )
+        wrong += any(each.word != "no difference shown" for each in compare(a, b, alpha=0.1).differences)
+    assert wrong <= stats.binom.isf(1e-6, 200, 0.1)
+
+
+def test_sides_without_a_seed_in_common_are_compared_as_groups() -> None:
+    found = compare([observed(s, 4 + s % 3) for s in range(12)], [observed(100 + s, 8 + s % 3) for s in range(9)])
+    assert found.worse
+    assert found.differences[0].test == "permutation of seeds"
+    assert found.identical == (0, 0)
+
+
+def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = Scenario.load("thesis")
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        for seed in range(2):
+            Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
+    assert [key for key, _ in load(tmp_path / "a")] == [("thesis", "emulator", 0), ("thesis", "emulator", 1)]
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["identical"] == [1, 1]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(RecordingError, match="empty: holds no valid trial"):
+        load(tmp_path / "empty")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "absent.json")]) == 2

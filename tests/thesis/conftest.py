@@ -1,0 +1,26 @@
+"""One reproduction of the thesis for all tests of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.cli import main
+from harness.thesis.reproduction import CLAIMS
+
+
+@pytest.fixture(scope="session")
+def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that ``analogrig thesis`` has written."""
+    folder = tmp_path_factory.mktemp("thesis")
+    assert main(["thesis", "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def claims(reproduced: Path) -> dict[str, Any]:
+    table: dict[str, Any] = json.loads((reproduced / CLAIMS).read_text(encoding="utf-8"))
+    return table
