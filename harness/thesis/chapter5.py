@@ -206,7 +206,7 @@ def _circuit_figures(circuit: Circuit, model: Model) -> tuple[Figure, ...]:
                 Panel(
                     "Difference", "difference [mm]", (Curve("analogue − simulation", analogue - simulated, "second"),)
                 ),
-                Panel("Force", "F [N]", (Curve("force", force, "muted", "step"),)),
+                Panel("Force", "F [N]", (Curve("force", force, "third", "step"),)),
             ),
             "The shock absorber of section 4.2, 200 Hz, 0 to 10 V; analogue: the emulated circuit through its card.",
         ),
@@ -218,11 +218,11 @@ def _circuit_figures(circuit: Circuit, model: Model) -> tuple[Figure, ...]:
                     "(a) Circuit data",
                     "volts",
                     (
-                        Curve("input", volts["force"], "muted", "step"),
+                        Curve("input", volts["force"], "third", "step"),
                         Curve("output", volts["displacement"], "first"),
                     ),
                 ),
-                Panel("(b) Force", "F [N]", (Curve("force", data.channel("force"), "muted", "step"),)),
+                Panel("(b) Force", "F [N]", (Curve("force", data.channel("force"), "third", "step"),)),
                 Panel(
                     "(b) Displacement", "x [mm]", (Curve("displacement", data.channel("displacement") * 1e3, "second"),)
                 ),
@@ -402,7 +402,7 @@ def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figur
             "5.7",
             "Input/Output data from the time-varying electrical analogy.",
             (
-                Panel("Input", "F [N]", (Curve("force", run.channel("force"), "muted", "step"),)),
+                Panel("Input", "F [N]", (Curve("force", run.channel("force"), "third", "step"),)),
                 Panel("Output", "x [mm]", (Curve("displacement", displacement, "first"),)),
             ),
             "100 Hz, 0 to 10 V. Which pots were turned when, the text does not say: assumed are the four changes of"
