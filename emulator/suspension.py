@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .circuit import Circuit, Pot, Resistor
 from .components import NOMINAL, Components
 from .errors import CircuitError, EngineError, PotError
-from .excitation import Excitation
+from .excitation import Edges, Excitation
 from .machine import AnalogComputer, Mode
 from .opamp import OpAmpModel, preset
 from .pot import PotModel, checked_dial, checked_ramp
@@ -165,9 +165,10 @@ class SuspensionComputer:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)
             parts = []
+            edges = excitation.edges(*self.machine.window(stop - start), self.sample_rate_hz)
             while play == self._plays and self.machine.recorded < stop:
                 until = min(stop, turns[0].sample + 1) if turns else stop
-                parts.append(self._advance(excitation, until - self.machine.recorded))
+                parts.append(self._advance(edges, until - self.machine.recorded))
                 while turns and turns[0].sample + 1 == self.machine.recorded:
                     turn = turns.pop(0)
                     self.machine.turn(turn.dials, turn.ramp_n)
@@ -175,9 +176,10 @@ class SuspensionComputer:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _advance(self, excitation: Excitation, samples: int) -> NDArray[np.float64]:
-        edges = excitation.edges(*self.machine.window(samples), self.sample_rate_hz)
-        volts = self.machine.run(samples, {SOURCE: edges})
+    def _advance(self, edges: Edges, samples: int) -> NDArray[np.float64]:
+        """The next samples, with those of the edges that fall among them."""
+        now = slice(*np.searchsorted(edges.ticks, self.machine.window(samples)))
+        volts = self.machine.run(samples, {SOURCE: Edges(edges.ticks[now], edges.levels_v[now])})
         volts *= self._signs
         return volts
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from harness.bench import Bench
+from harness.bench import INTERRUPTED_BY_USER, Bench
 from harness.campaign_spec import Case, Chunk, Plan, device_of, open_table
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
@@ -115,6 +115,8 @@ class _OnBench:
             raise
         if run.conditions.faults:
             self.close()
+        if INTERRUPTED_BY_USER in run.conditions.faults:
+            raise KeyboardInterrupt
         return run
 
     def count(self, case: Case) -> Count:

@@ -97,7 +97,9 @@ class PythonCanBus:
         interface, self.channel = str(config["interface"]), config["channel"]
         where = interface if self.channel is None else f"{interface}/{self.channel}"
         self.name = where if name is None else name
-        self._meaning = _SOCKETCAN if interface == "socketcan" else {}
+        is_socket = interface == "socketcan"
+        self._meaning = _SOCKETCAN if is_socket else {}
+        self._never_echoes = is_socket and not config.get("receive_own_messages")
         self.clock: Clock = time.monotonic
         self.is_fd = bool(config.get("fd"))
         bitrate, data_bitrate = config.get("bitrate"), config.get("data_bitrate")
@@ -151,13 +153,16 @@ class PythonCanBus:
 
     def receive(self, timeout_s: float) -> can.Message | None:
         try:
-            return self._bus.recv(timeout_s)
+            frame = self._bus.recv(timeout_s)
         except Exception as error:  # as above; what is no system's error is a frame that makes no sense
             number = _errno(error)
             if number is not None:
                 raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
             self._forget_damage(error)
             return None
+        if frame is not None and self._never_echoes:
+            frame.is_rx = True  # for SocketCAN nothing is that comes from another program of this computer
+        return frame
 
     def _forget_damage(self, error: Exception) -> None:
         """python-can's slcan keeps a line that is no text for ever, and fails with each one after it."""

@@ -2,8 +2,7 @@
 
 A pseudo-terminal takes any number of bytes at once, a virtual bus any number of frames. Here each takes its bits, the
 device answers when the last bit of a message is there, and takes no time itself. Nothing is delayed, so that the figure
-is the same every time; for lock-step, where nothing is sent before the answers have come, it is exact, but that CAN
-frames count with as many stuff bits as they can have.
+is the same every time; it is exact for lock-step, where nothing is sent before the answers have come.
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ def are_possible(rig: Rig, device: DeviceDescription) -> bool:
     return (
         isinstance(rig, EmulatorRig)
         and isinstance(device, InprocDevice)
+        and device.link == "serial"
         and not device.wire_faults
         and device.report_interval_n == 1
     )

@@ -18,6 +18,7 @@ from harness.dut import connect
 from harness.pace import Pace
 from harness.rig import open_rig
 from harness.scenario import Scenario
+from tests.can_guest.__main__ import throughput_in_guest
 
 from .figure import Figure
 
@@ -61,9 +62,8 @@ SLOW = ("QEMU", "CAN")
 """Names of those that play fewer samples."""
 
 
-def samples_per_s(description: DeviceDescription) -> float:
+def samples_per_s(description: DeviceDescription, samples: int) -> float:
     """Of one run with ARX(2, 3), offset and the default trigger."""
-    samples = SAMPLES_SLOW if any(word in description.name for word in SLOW) else SAMPLES
     index = np.arange(samples)
     force = np.where((index // 50) % 2, 3900, 150).astype(np.uint16)
     displacement = (2000 + 3 * (index % 100)).astype(np.uint16)
@@ -92,8 +92,11 @@ def overruns(duration_s: float) -> Pace:
 def figures() -> Iterator[Figure]:
     """One for each way of exchange; the bounds are the slowest and the fastest run."""
     for description in CASES:
-        rates = [samples_per_s(description) for _ in range(REPEATS)]
+        samples = SAMPLES_SLOW if any(word in description.name for word in SLOW) else SAMPLES
+        rates = [samples_per_s(description, samples) for _ in range(REPEATS)]
         yield Figure(f"link, {description.name}", max(rates), "samples/s", bounds=(min(rates), max(rates)))
+    for name, rate in throughput_in_guest().items():
+        yield Figure(f"link, {name}", rate, "samples/s")
     pace = overruns(REAL_TIME_S)
     name = f"link, pty, {REAL_TIME_S:g} s of real time at 20 kHz, overruns of {pace.messages} messages"
     yield Figure(name, pace.overruns, "messages")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
@@ -20,18 +23,19 @@ TIME_LIMIT_S = 600.0
 WITHIN = "ANALOGRIG_CAN_GUEST"
 """Set in the guest, where alone the tests are safe: they take interfaces down and disturb the bus."""
 
+_NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
 _ENVIRONMENT = {
     WITHIN: "1",
     "ANALOGRIG_CI": "1",  # all that the tests may need is there
     "HOME": "/run",
     "TMPDIR": "/run",
-    "PYTHONDONTWRITEBYTECODE": "1",
     "PYTHONPATH": str(HERE / "without"),
     "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # each takes seconds to import
 }
 _PYTEST = (
-    *(sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider"),
-    *("--color=no", "--verbose", "--durations=10", f"--junitxml={guest.RESULTS / REPORT}", HERE / "suite"),
+    *(sys.executable, "-m", "pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--color=no"),
+    *("-W", "ignore:unclosed <socket:ResourceWarning"),  # python-can's, when there is no such interface
+    HERE / "suite",
 )
 
 
@@ -40,16 +44,43 @@ def run_suite(results: Path, arguments: Sequence[str] = (), console: IO[bytes] |
 
     :raises GuestError: it did not come to an end.
     """
+    _compile()
     results.mkdir(parents=True, exist_ok=True)
     (results / REPORT).unlink(missing_ok=True)
     return guest.run(
-        [*_PYTEST, *arguments],
+        [*_PYTEST, "--verbose", "--durations=10", f"--junitxml={guest.RESULTS / REPORT}", *arguments],
         results,
         folder=ROOT,
-        environment=_ENVIRONMENT,
+        environment=_ENVIRONMENT | _NO_BYTECODE,
         time_limit_s=TIME_LIMIT_S,
         console=console,
     )
+
+
+def _compile() -> None:
+    """Let Python compile here what it would compile in the guest, ten times as slowly and at every run."""
+    command = [*map(str, _PYTEST), "--collect-only", "-q"]
+    environment = {**_ENVIRONMENT, "PATH": os.environ.get("PATH", "")}
+    subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, check=False)  # what fails will fail there
+
+
+def throughput_in_guest() -> dict[str, float]:
+    """Samples per second over SocketCAN; emulated, so slower than any real machine; none where there is no guest."""
+    if guest.lacking() is not None:
+        return {}
+    report = "throughput.json"
+    with tempfile.TemporaryDirectory() as results, (Path(results) / "console").open("w+b") as console:
+        status = guest.run(
+            [sys.executable, "-m", "tests.can_guest.throughput", guest.RESULTS / report],
+            Path(results),
+            folder=ROOT,
+            environment=_ENVIRONMENT | _NO_BYTECODE,
+            time_limit_s=TIME_LIMIT_S,
+            console=console,
+        )
+        if status != 0:
+            raise guest.GuestError(Path(console.name).read_text(errors="replace"))
+        return dict(json.loads((Path(results) / report).read_text()))
 
 
 def main(arguments: Sequence[str]) -> int:

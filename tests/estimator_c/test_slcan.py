@@ -130,6 +130,10 @@ def test_length_between_those_of_can_fd_is_filled_with_zeros() -> None:
     assert text == b"d1239" + b"FF" * 9 + b"00" * 3 + b"\r"
 
 
+def test_remote_frame_has_a_length_and_no_data() -> None:
+    assert Adapter("O").encode(Frame(0x123, bytes(5), REMOTE)) == b"r1235\r"
+
+
 @pytest.mark.parametrize(
     ("opening", "line", "reply"),
     [

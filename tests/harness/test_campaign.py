@@ -154,6 +154,19 @@ def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, refere
         assert not journal_of(out).exists()
 
 
+def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
+    path, digest = tmp_path / "out.json.journal", planned(tmp_path).digest()
+    with Journal(path, digest) as journal:
+        journal.add(Chunk((0, 0)), [])
+        journal.add(Chunk((0, 1)), [])
+    path.write_bytes(path.read_bytes()[:-3])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0)]
+        journal.add(Chunk((1, 0)), [])
+    with Journal(path, digest) as journal:
+        assert list(journal.rows) == [(0, 0), (1, 0)]
+
+
 def test_damaged_line_of_a_journal_is_played_again(tmp_path: Path, reference: Path) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.json"
     with Journal(journal_of(out), plan.digest()) as journal:
@@ -194,7 +207,7 @@ def until_lines(process: subprocess.Popen[bytes], path: Path, lines: int) -> Non
 def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     tmp_path: Path, ended_by: signal.Signals, status: int
 ) -> None:
-    spec = SPEC.replace("trials = 6", "trials = 200").replace("chunk = 2", "chunk = 5")
+    spec = SPEC.replace("trials = 6", "trials = 120").replace("chunk = 2", "chunk = 5")
     plan, out = planned(tmp_path, spec), tmp_path / "out.json"
     process = started(tmp_path / "spec.toml", out)
     until_lines(process, journal_of(out), 4)
@@ -403,6 +416,23 @@ def test_device_that_cannot_be_had_is_inconclusive_and_what_is_done_is_kept(
     complaint = capsys.readouterr().err
     assert "cell 0, seed 0: cannot open /dev/absent" in complaint
     assert complaint.count("\n") == 1
+
+
+def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path, "trials = 1\nsamples = 600\ndevices = ['host']\n")
+    out = tmp_path / "out.json"
+
+    def interrupted(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("harness.dut.Dut.play", interrupted)
+        assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
+    assert "interrupted: what is done is kept in" in capsys.readouterr().err
+    assert journal_of(out).read_bytes().count(b"\n") == 1
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 0
 
 
 def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

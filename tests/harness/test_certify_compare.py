@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from harness.campaign_trial import Count, Row
 from harness.campaign_workers import Processes, ThisProcess
 from harness.certificate import Certificate, Question, certify, question_of
 from harness.cli import main
-from harness.comparison import compare, load, permutation_p, sign_flip_p
+from harness.comparison import Difference, _worded, compare, load, permutation_p, sign_flip_p
 from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
@@ -89,9 +90,33 @@ def test_sequential_test_needs_fewer_samples_for_a_good_device_than_the_fixed_on
     assert np.mean([answer.samples for answer in early]) < 0.5 * fixed[0].samples
 
 
+def test_sequential_test_certifies_a_device_without_alarms_in_the_run_in_which_that_is_certain() -> None:
+    """Wald: ln(1 / 0.1) over the gain of a sample without an alarm, ln(0.999 / 0.99)."""
+    fewest = math.log(10.0) / math.log(0.999 / 0.99)
+    (answer,) = outcomes(0.0, 1, sequential=True)
+    assert (answer.outcome, answer.samples) == ("certified", math.ceil(fewest / 100) * 100)
+
+
+class LastFirst:
+    """Counts that depend on the seed alone, and come five at a time, the last one first."""
+
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        while True:
+            for task in reversed(list(itertools.islice(tasks, 5))):
+                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)
+
+
+class InTurn:
+    def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)) for task in tasks)
+
+
 def test_answer_does_not_depend_on_the_workers() -> None:
     question = asked(far=1e-3, confidence=0.99, sequential=True)
     assert certify(question, Processes(2)) == certify(question, ThisProcess())
+    question = asked(far=0.01, confidence=0.99, sequential=True)
+    assert certify(question, LastFirst()) == certify(question, InTurn())
+    assert certify(question, InTurn()).samples % 500 != 0
 
 
 def test_device_over_a_line_gives_the_same_counts() -> None:
@@ -175,6 +200,24 @@ def test_latency_is_compared_where_both_noticed_and_misses_by_themselves() -> No
     words = {each.quantity: (each.word, each.seeds) for each in compare(a, b).differences}
     assert words["latency"] == ("no difference shown", 14)
     assert words["missed"] == ("worse", 28)
+
+
+def test_change_that_one_side_missed_counts_for_the_latency_of_neither() -> None:
+    """Two changes a trial, the second of which B misses: 4 against 4 samples, and not 7 against 4."""
+    a, b = ([observed(seed, 4) for seed in range(3)] for _ in "ab")
+    for (_, mine), (_, other) in zip(a, b, strict=True):
+        mine["changes"].append([10, 3, False, False])
+        other["changes"].append([None, 3, True, False])
+    latency = compare(a, b).differences[0]
+    assert (latency.a, latency.b, latency.p) == (4.0, 4.0, 1.0)
+
+
+def test_probabilities_are_adjusted_as_holm_says() -> None:
+    """The smallest times 4, the next times 3, ... and never less than the one before."""
+    found = [Difference("x", "", 1.0, 2.0, 9, "", p, p, "worse") for p in (0.01, 0.04, 0.03, 0.005)]
+    adjusted = [each.adjusted_p for each in _worded(found, 0.025)]
+    assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert [each.word for each in _worded(found, 0.025)] == [*["no difference shown"] * 3, "worse"]
 
 
 def test_cells_of_one_seed_are_one_observation() -> None:

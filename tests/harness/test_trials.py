@@ -68,4 +68,5 @@ def test_device_whose_line_is_spoiled_needs_the_bench() -> None:
     assert are_possible(rig, device)
     assert not are_possible(rig, dataclasses.replace(device, wire_faults="flip@0.001"))
     assert not are_possible(rig, dataclasses.replace(device, report_interval_n=10))
+    assert not are_possible(rig, describe("inproc?link=can"))
     assert not are_possible(rig, describe("host"))

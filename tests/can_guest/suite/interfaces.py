@@ -1,4 +1,4 @@
-"""What the tests do to the CAN interfaces of the guest, in the words of ip and tc."""
+"""The CAN interfaces of the guest: what the tests do to them, in the words of ip and tc, and the device on them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from typing import Any
 
 import can
 
+from harness.child import Child
+from harness.devices import HOST_PROGRAM
+
 VIRTUAL = "vcan0"
-CONTROLLERS = ("can0", "can1")
+CONTROLLERS = ("can0", "can1", "can2")
 """On one bus. Classic: an SJA1000 knows no CAN FD."""
 
 
@@ -51,3 +54,14 @@ def queue(interface: str, *, limit_n: int, bitrate: int) -> Iterator[None]:
 
 def socketcan(channel: str, **settings: Any) -> can.BusABC:
     return can.Bus(interface="socketcan", channel=channel, ignore_config=True, **settings)
+
+
+@contextlib.contextmanager
+def device(*arguments: str) -> Iterator[Child]:
+    """The device as a process, on the interface and with the options that are its arguments."""
+    child = Child([HOST_PROGRAM, "--can", *arguments], "the device")
+    try:
+        assert child.first_line() == arguments[0]
+        yield child
+    finally:
+        child.end()

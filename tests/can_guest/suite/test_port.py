@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import can
 import pytest
@@ -33,19 +32,9 @@ from harness.child import Child
 from harness.devices import HOST_PROGRAM
 from tests.harness.processes import LONG_S, children
 
-from .interfaces import CONTROLLERS, VIRTUAL, down, queue, socketcan
+from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
 
 FOREIGN = can.Message(arbitration_id=0x7F0, is_extended_id=False, data=b"anything")
-
-
-@contextlib.contextmanager
-def device(*arguments: str) -> Iterator[Child]:
-    child = Child([HOST_PROGRAM, "--can", *arguments], "the device")
-    try:
-        assert child.first_line() == arguments[0]
-        yield child
-    finally:
-        child.end()
 
 
 def frame(message: Message) -> can.Message:

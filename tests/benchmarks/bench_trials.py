@@ -1,0 +1,89 @@
+"""How fast closed-loop trials go: circuit, card and estimator in one process; and what a second process is worth.
+
+python -m tests.benchmarks trials
+
+Rates are by CPU time, which neighbours on the machine spoil less than time on the wall; of the certificate both are
+given, its start included.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+from harness.devices import describe
+from harness.rig import EmulatorRig, open_rig
+from harness.scenario import Scenario
+from harness.trials import Trials
+
+from .figure import Figure
+
+REPEATS = 5
+"""The best of so many is reported: the machine is shared."""
+
+LONG_N, THESIS_LATER_N = 100_000, 20_000
+
+CERTIFICATE = ("certify", "--dut", "inproc", "--far", "1e-5", "--confidence", "0.999")
+
+
+def figures() -> Iterator[Figure]:
+    """Rates in samples per second; seconds of the strictest certificate."""
+    rig = open_rig("emulator")
+    assert isinstance(rig, EmulatorRig)
+    trials = Trials(rig, describe("inproc"))
+    for name, scenario, count in _cases():
+        for what, play in (("alarms alone", trials.alarms), ("whole run", trials.run)):
+            yield Figure(f"trials, {name}: {what}", _rate(play, scenario, count), "samples/s of CPU time")
+    alone, together = _processes(1), _processes(2)
+    yield Figure("trials: two processes", together, "samples/s of CPU time", "one process", ratio=together / alone)
+    wall_s, cpu_s = (min(each) for each in zip(*(_certificate() for _ in range(REPEATS)), strict=True))
+    yield Figure("certificate of 1.65 million samples", wall_s, "s on the wall")
+    yield Figure("certificate of 1.65 million samples, CPU", cpu_s, "s of CPU time")
+
+
+def _cases() -> Iterator[tuple[str, Scenario, int]]:
+    healthy, thesis = Scenario.load("healthy"), Scenario.load("thesis")
+    yield f"healthy, {LONG_N} samples", dataclasses.replace(healthy, samples=LONG_N), 4
+    later = tuple(dataclasses.replace(tweak, sample=tweak.sample + THESIS_LATER_N) for tweak in thesis.tweaks)
+    longer = dataclasses.replace(thesis, samples=thesis.samples + THESIS_LATER_N, tweaks=later)
+    yield f"the thesis's changes in {longer.samples} samples", longer, 20
+    yield f"the thesis's changes in {thesis.samples} samples", thesis, 100
+
+
+def _rate(play: Callable[[Scenario, int], object], scenario: Scenario, count: int) -> float:
+    """The best of REPEATS."""
+    play(scenario, 0)
+    best_s = float("inf")
+    for _ in range(REPEATS):
+        start_s = time.process_time()
+        for seed in range(count):
+            play(scenario, seed)
+        best_s = min(best_s, time.process_time() - start_s)
+    return count * scenario.samples / best_s
+
+
+def rate_of_this_process() -> float:
+    """Of long healthy trials, by CPU time."""
+    rig = open_rig("emulator")
+    assert isinstance(rig, EmulatorRig)
+    _, scenario, count = next(_cases())
+    return _rate(Trials(rig, describe("inproc")).alarms, scenario, count)
+
+
+def _processes(count: int) -> float:
+    """The sum of the rates of so many at the same time."""
+    program = f"from {__name__} import rate_of_this_process; print(rate_of_this_process())"
+    running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(count)]
+    return sum(float(process.communicate()[0]) for process in running)
+
+
+def _certificate() -> tuple[float, float]:
+    """On the wall and of CPU time, start and end of the command included."""
+    before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run([sys.executable, "-m", "harness.cli", *CERTIFICATE], check=True, stdout=subprocess.DEVNULL)
+    wall_s, after = time.perf_counter() - start_s, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall_s, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

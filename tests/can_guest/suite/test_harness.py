@@ -1,0 +1,165 @@
+"""Runs over SocketCAN: the same bits as over a serial line, and what happens to the interface is told by name."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable
+
+import can
+import pytest
+
+from harness.bench import Bench
+from harness.catalogue import LAYOUTS, Sample, unpack
+from harness.dut import open_dut
+from harness.errors import LinkError, LinkTimeout
+from harness.rig import open_rig
+from harness.run import Run
+from harness.scenario import Scenario
+
+from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
+from .test_port import FOREIGN
+
+SAMPLES = 120
+AT = 60
+"""The sample in whose course something happens."""
+
+HERE, THERE, ELSEWHERE = CONTROLLERS
+ON_VIRTUAL = f"can:socketcan/{VIRTUAL}?device=host"
+BUS_OFF = can.Message(arbitration_id=0x40, is_extended_id=False, is_error_frame=True, data=bytes(8))
+RESTARTED = can.Message(arbitration_id=0x100, is_extended_id=False, is_error_frame=True, data=bytes(8))
+"""CAN_ERR_BUSOFF, CAN_ERR_RESTARTED of include/uapi/linux/can/error.h."""
+
+Listener = Callable[[can.Message], object]
+
+
+def play(dut: str, listener: Listener | None = None, **changes: object) -> Run:
+    """A short scenario."""
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES)
+    with open_rig("emulator") as rig, open_dut(dut, listener=listener, **changes) as opened:
+        return Bench(rig, opened).play(scenario, seed=5)
+
+
+def at_sample(act: Callable[[], object]) -> Listener:
+    """Acts when the harness sends the sample AT."""
+
+    def listener(frame: can.Message) -> None:
+        message = None if frame.is_rx else unpack(bytes((frame.arbitration_id,)) + frame.data)
+        if isinstance(message, Sample) and message.sample_index == AT:
+            act()
+
+    return listener
+
+
+@pytest.fixture(scope="module")
+def expected() -> str:
+    """The hash of theta over a serial line."""
+    run = play("host")
+    assert run.conditions.faults == ()
+    return run.theta_hash()
+
+
+@pytest.mark.parametrize("exchange", ["sample", "stream"])
+@pytest.mark.parametrize("settings", ["device=host", "device=inproc", "device=host&fd=1"])
+def test_run_on_a_virtual_interface_gives_the_bits_of_a_serial_line(
+    settings: str, exchange: str, expected: str
+) -> None:
+    run = play(f"can:socketcan/{VIRTUAL}?{settings}", exchange=exchange)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected
+
+
+@pytest.mark.parametrize("exchange", ["sample", "stream"])
+def test_run_from_controller_to_controller_gives_the_bits_of_a_serial_line(exchange: str, expected: str) -> None:
+    with device(THERE):
+        run = play(f"can:socketcan/{HERE}", exchange=exchange)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected
+
+
+def test_frames_of_both_sides_are_told_to_who_listens() -> None:
+    heard: list[can.Message] = []
+    with open_dut(ON_VIRTUAL, listener=heard.append):
+        pass
+    assert {frame.is_rx for frame in heard} == {True, False}
+
+
+def test_full_queue_is_waited_for(expected: str) -> None:
+    with queue(VIRTUAL, limit_n=2, bitrate=250_000):
+        run = play(ON_VIRTUAL, exchange="stream")
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected
+
+
+def test_queue_that_never_empties_is_told() -> None:
+    """As that of a controller whose frames nobody acknowledges."""
+    with (
+        queue(VIRTUAL, limit_n=1, bitrate=8),
+        pytest.raises(LinkError, match=r"socketcan/vcan0: nothing can be sent, the controller's queue has been full"),
+    ):
+        open_dut(f"can:socketcan/{VIRTUAL}", timeout_s=60.0)
+
+
+def test_frames_of_others_are_counted_and_change_nothing(expected: str) -> None:
+    """Ten of a third controller for each of ours; they are between those of the device too."""
+    sent_n = 0
+
+    def babble(frame: can.Message) -> None:
+        nonlocal sent_n
+        if not frame.is_rx:
+            for _ in range(10):
+                other.send(FOREIGN)
+            sent_n += 10
+
+    with device(THERE), socketcan(ELSEWHERE) as other:
+        run = play(f"can:socketcan/{HERE}", babble)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected
+    assert sent_n > 10 * SAMPLES
+    assert run.conditions.link_counters["frames_foreign"] > sent_n - 20  # but of those after the last answer
+
+
+@pytest.mark.parametrize("channel", [VIRTUAL, HERE])
+def test_interface_that_goes_down_ends_the_run_with_its_name(channel: str) -> None:
+    """Pulled out, or taken down by somebody."""
+    with contextlib.ExitStack() as undone, device(VIRTUAL if channel == VIRTUAL else THERE):
+        run = play(f"can:socketcan/{channel}", at_sample(lambda: undone.enter_context(down(channel))))
+    (fault,) = run.conditions.faults
+    assert f"socketcan/{channel}: the interface is down" in fault
+
+
+def test_bus_that_was_off_and_came_back_is_counted(expected: str) -> None:
+    """As a driver tells it; here another socket does. Nothing was lost meanwhile."""
+    with socketcan(VIRTUAL) as driver:
+        run = play(ON_VIRTUAL, at_sample(lambda: [driver.send(told) for told in (BUS_OFF, RESTARTED)]))
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == expected
+    assert run.conditions.link_counters["error_frames"] == 2
+    assert run.conditions.link_counters["bus_off"] == 1
+
+
+def test_bus_that_stays_off_is_told_when_nobody_answers() -> None:
+    def tell(frame: can.Message) -> None:
+        if not frame.is_rx:
+            driver.send(BUS_OFF)
+
+    with socketcan(VIRTUAL) as driver, pytest.raises(LinkTimeout, match="the bus is bus-off"):
+        open_dut(f"can:socketcan/{VIRTUAL}", listener=tell, timeout_s=0.5)
+
+
+def test_another_harness_on_the_bus_is_noticed() -> None:
+    with socketcan(VIRTUAL) as other:
+        intruder = can.Message(arbitration_id=LAYOUTS["Sample"].id, is_extended_id=False, data=bytes(range(8)))
+        run = play(ON_VIRTUAL, at_sample(lambda: other.send(intruder)))
+    (fault,) = run.conditions.faults
+    assert "somebody else speaks with the harness's identifiers" in fault
+
+
+def test_interface_that_is_absent_is_told() -> None:
+    with pytest.raises(LinkError, match="^cannot open can:socketcan/can7: there is no such interface"):
+        open_dut("can:socketcan/can7")
+
+
+def test_bus_without_a_device_is_told_with_how_it_was_opened() -> None:
+    with pytest.raises(LinkTimeout, match=f"the bus was opened as can:socketcan/{HERE}"):
+        open_dut(f"can:socketcan/{HERE}", timeout_s=0.5)

@@ -1,0 +1,36 @@
+"""How fast samples go over SocketCAN in the guest. Runs inside; writes /run/results/throughput.json."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from harness.devices import CanDevice
+from tests.benchmarks.bench_link import WAYS, samples_per_s
+
+from .suite.interfaces import CONTROLLERS, VIRTUAL, device
+
+SAMPLES = 600
+
+
+def rates() -> Iterator[tuple[str, float]]:
+    """From a process to another, by way of the kernel alone, and by way of two emulated controllers."""
+    for way, fields in WAYS:
+        bus = CanDevice(name="CAN", interface="socketcan", channel=VIRTUAL, device="host", **fields)
+        yield f"CAN vcan in the guest (emulated), {way}", samples_per_s(bus, SAMPLES)
+    here, there, *_ = CONTROLLERS
+    for way, fields in WAYS:
+        if "fd" not in fields:
+            with device(there):
+                bus = CanDevice(name="CAN", interface="socketcan", channel=here, **fields)
+                yield f"CAN kvaser_pci in the guest (emulated), {way}", samples_per_s(bus, SAMPLES)
+
+
+def main(out: Path) -> None:
+    out.write_text(json.dumps(dict(rates())))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,75 @@
+"""The page of a campaign: what a browser makes of it, and that its numbers are those of the results."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser
+
+from harness.campaign_report import render, write_page
+from harness.campaign_results import Results
+from harness.campaign_spec import CampaignSpec, Grid, Plan
+from harness.campaign_trial import Row
+from tests.harness.test_report_browser import Watched, browser
+
+__all__ = ["browser"]
+
+
+def results(name: str = "made") -> Results:
+    """Three stiffnesses by two factors: latencies 1 to 6, and every second change of the last cell missed."""
+    grid = Grid(stiffness_n_per_m=(20000.0, 22000.0, 24500.0), stiffness_factor=(0.8, 0.9))
+    plan = Plan.of(CampaignSpec(trials=2, samples=1100, grid=grid, name=name))
+    return Results(plan, tuple(tuple(row(seed, cell) for seed in range(2)) for cell in range(6)))
+
+
+def row(seed: int, cell: int) -> Row:
+    missed = cell == 5 and seed == 1
+    change = [None if missed else cell + 1, 2, missed, False]
+    outcome = "failed" if missed else "passed"
+    counts = {"seed": seed, "outcome": outcome, "samples": 1100, "false_alarms": 0}
+    return {**counts, "changes": [change], "errors": [0.0, 0.0, 0.0], "theta": "0"}
+
+
+def test_browser_draws_the_maps_and_asks_for_nothing(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "campaign.html"
+    write_page(results(), path)
+    watched = Watched(browser, path)
+    assert watched.complaints == []
+    assert watched.requests == [path.as_uri()]
+    maps = watched.page.locator("svg")
+    assert maps.count() == 2
+    shown = [each.locator("text").all_text_contents() for each in maps.all()]
+    across, down = ["20000", "22000", "24500"], ["0.8", "0.9"]
+    assert shown[0] == [*across, *down, "1.0", "2.0", "3.0", "4.0", "5.0", "6.0"]
+    assert shown[1] == [*across, *down, *["0.0%"] * 5, "50.0%"]
+    fills = watched.page.locator("rect").evaluate_all("all => all.map(each => getComputedStyle(each).fill)")
+    assert fills[5] == fills[11] == "rgb(0, 114, 178)"
+    assert fills[6] == "rgb(255, 255, 255)"
+    assert len(set(fills[:6])) == 6
+    watched.page.close()
+
+
+def test_table_holds_every_cell_and_the_banner_the_outcome() -> None:
+    page = render(results())
+    body = page[page.index("<tbody>") :]
+    assert body.count("<tr>") == 6
+    assert "Campaign made: FAILED" in page
+    assert "1 of 12 visible changes missed" in page
+
+
+def test_same_results_give_the_same_page_and_names_are_escaped() -> None:
+    assert render(results()) == render(results())
+    page = render(results("<script>alert(1)</script>"))
+    assert "<script" not in page
+    assert "&lt;script&gt;" in page
+
+
+@pytest.mark.parametrize("grid", [Grid(), Grid(noise_lsb=(1.0,))])
+def test_campaign_without_a_plane_has_no_map(grid: Grid) -> None:
+    made = results()
+    spec = dataclasses.replace(made.plan.spec, grid=grid)
+    page = render(Results(dataclasses.replace(made.plan, spec=spec), made.rows[:1]))
+    assert not re.search("<svg|<rect", page)
