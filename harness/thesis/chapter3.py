@@ -124,7 +124,7 @@ def _figures(
     data = Panel(
         "(a) Identification data",
         "u, y",
-        (Curve("input u", u[shown], "muted", "step"), Curve("output y", example(u, steady)[shown], "first")),
+        (Curve("input u", u[shown], "third", "step"), Curve("output y", example(u, steady)[shown], "first")),
     )
     alarms = tuple(Mark(float(k), "alarm") for k in clean["prediction-error"].alarms)
     return (

@@ -135,6 +135,29 @@ def track_codes(config: EstimatorConfig, samples: tuple[Signal, Signal, float, f
     return dataclasses.replace(each, parameters=parameters)
 
 
+CUTOFFS_HZ = (5.0, 10.0, 20.0)
+"""Of the filter that section 4.3 asks for and does not describe, in problem time."""
+
+
+def conditioned(run: Run, cutoff_hz: float = CUTOFFS_HZ[0]) -> tuple[Signal, Signal]:
+    """Force [N] and displacement [0.1 um] (n,), off line as in section 4.3: a low-order low-pass Butterworth filter on
+    both, their means removed, scaled."""
+    from scipy.signal import butter, lfilter
+
+    b, a = butter(2, 2.0 * cutoff_hz * run.conditions.sample_period_problem_s)
+    force, displacement = run.channel("force"), run.channel("displacement") * UNITS_PER_M
+    u, y = (lfilter(b, a, each - each.mean()) for each in (force, displacement))
+    return np.asarray(u), np.asarray(y)
+
+
+def conditioned_tracks(run: Run, cutoff_hz: float = CUTOFFS_HZ[0]) -> dict[str, Track]:
+    """The thesis's five with its ceilings, in this process, and its mean with magnitudes."""
+    u, y = conditioned(run, cutoff_hz)
+    configs = {each.key: each.config for each in schemes(PLAIN, ERROR_CEILING, MEAN_CEILING, WARM_UP_N)}
+    configs["mean-of-magnitudes"] = dataclasses.replace(configs["mean-between-faults"], absolute=True)
+    return {key: track(config, u, y, UNITS_PER_M) for key, config in configs.items()}
+
+
 def run_codes(run: Run) -> tuple[Signal, Signal, float, float]:
     """As ``codes``, of a recording."""
     channels = run.conditions.channels

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Signal = NDArray[np.float64]
 """(n,)"""
 
-Ink = Literal["first", "second", "third", "fourth", "truth", "muted"]
+Ink = Literal["first", "second", "third", "truth"]
 
 Verdict = Literal["holds", "holds with a reading", "does not hold"]
 

@@ -177,14 +177,14 @@ def _comparison(comparison: Comparison) -> str:
     return (
         '<section aria-labelledby="comparison"><h2 id="comparison">All schemes on the same data</h2>'
         "<p>Latency and convergence in samples after each of the four changes (K falls; B rises; B falls while K"
-        " rises; M falls). Converged: M, B and K within 5 % for good. Scatter: standard deviation of M, B, K over the"
-        " truth in the second halves of the stretches; – where an estimate there describes no suspension. Spikes:"
-        " excursions beyond 50 %. Instructions: of the same C on x86-64 a sample, n = 5 for the thesis's schemes and"
-        " 6 for ours (<code>python -m tests.thesis.cost</code>); on a Cortex-M4F n = 6 takes 566 typically, 605 the"
-        " shape n = 5 (estimator_c/README.md, <code>make cost</code>). The bound is the latency that no detector with"
-        " a false alarm in 100,000 samples can beat on average. Ceilings: 1500 units for the prediction error, 300"
-        " (simulation) and 500 (circuit) for the mean. Read missed and extra together: a scheme that raises an alarm"
-        " every few samples misses nothing, and its samples without an equation are"
+        " rises; M falls). Converged: M, B and K within 5 % for good (–: never). Scatter: standard deviation of M, B,"
+        " K over the truth in the second halves of the stretches; – where an estimate there describes no suspension."
+        " Spikes: excursions beyond 50 %. Instructions, on the noisy circuit: of the same C on x86-64 a sample, n = 5"
+        " for the thesis's schemes and 6 for ours (<code>python -m tests.thesis.cost</code>); on a Cortex-M4F n = 6"
+        " takes 566 typically, 605 the shape n = 5 (estimator_c/README.md, <code>make cost</code>). The bound is the"
+        " latency that no detector with a false alarm in 100,000 samples can beat on average. Ceilings: 1500 units"
+        " for the prediction error, 300 (simulation) and 500 (circuit) for the mean. Read missed and extra together:"
+        " a scheme that raises an alarm every few samples misses nothing, and its samples without an equation are"
         f" cheap.</p>{tables}{_seeds(comparison)}</section>"
     )
 
