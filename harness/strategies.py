@@ -43,6 +43,9 @@ WIDE_RANGES_V = {
 WARM_UP_N, SETTLING_N = 400, 300
 """Samples before the first change, and between two: enough edges for the device to have learned the plant."""
 
+QUIET_N = 1000
+"""Samples of a scenario in which nothing changes."""
+
 MOST_DISPLACEMENT_V = 8.0
 """That a scenario may come to, at the most: a clipped sample is missing to the device."""
 
@@ -299,7 +302,7 @@ def scenarios(
         sample += tweak.ramp_n + SETTLING_N
     plants = [each.plant() for each in passed]
     return Scenario(
-        samples=sample,
+        samples=sample if tweaks else QUIET_N,
         excitation=_within_range(excitation, plants),
         plant=plant,
         tweaks=tuple(tweaks),
