@@ -25,7 +25,7 @@ from harness.estimator_config import EstimatorConfig
 from harness.faulty_wire import FaultyWire
 from harness.line import CanLine, SerialLine
 from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, DescriptorWire, MemoryWire, PortWire, Wire
+from harness.wire import DEFAULT_BAUD, LIBRARY, DescriptorWire, MemoryWire, PortWire, Wire
 from harness.wire_faults import WireFaults
 
 if TYPE_CHECKING:  # python-can takes longer to import than all the rest
@@ -300,9 +300,29 @@ class InprocDevice(EitherDevice):
 
     CAN: ClassVar[str] = "can"
     kind: ClassVar[str] = "inproc"
+    library: str = ""
+    """A device of your own as a shared library, built from estimator_c and your core; empty: the project's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.library and not self._is_serial:
+            raise ValueError("a library of your own has no CAN bus: say link = 'serial'")
+
+    @classmethod
+    def _located(cls, name: str, where: str) -> dict[str, Any]:  # noqa: ARG003
+        return {"library": where} if where else {}
+
+    @property
+    def library_path(self) -> Path:
+        """That is loaded."""
+        return Path(self.library) if self.library else LIBRARY
+
+    @property
+    def elsewhere(self) -> str:
+        return f"{self.kind}:{self.library}" if self.library else ""
 
     def wire(self) -> Wire:
-        return MemoryWire(boot_nonce=secrets.randbits(32))
+        return MemoryWire(boot_nonce=secrets.randbits(32), library=self.library_path)
 
     def bus(self) -> CanBus:
         from harness.can_device import MemoryBus

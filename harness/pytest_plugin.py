@@ -144,10 +144,11 @@ def _check_owner(name: str) -> None:
 
     :raises pytest.UsageError: this is another one.
     """
-    from harness.devices import describe
+    from harness.devices import InprocDevice, QemuDevice, describe
 
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    if worker != "gw0" and describe(name).elsewhere:
+    described = describe(name)
+    if worker != "gw0" and described.elsewhere and not isinstance(described, InprocDevice | QemuDevice):
         raise pytest.UsageError(f"device {name}: one worker owns it; run pytest with -n 1, or without -n")
 
 

@@ -18,6 +18,7 @@ from harness.estimator import Estimator, Steps, StepStatus
 from harness.rig import Block, EmulatorRig, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
+from harness.wire import LIBRARY
 
 BLOCK_SAMPLES = 16_384
 """Samples that pass from the circuit to the card and on to the estimator at a time: they stay within the cache."""
@@ -51,7 +52,8 @@ class Trials:
         self._rig = rig
         zero = rig.force_zero
         self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
-        self._estimator = Estimator(self._device.estimator)
+        library = device.library_path if isinstance(device, InprocDevice) else LIBRARY
+        self._estimator = Estimator(self._device.estimator, library=library)
 
     def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
         """The samples with an alarm, (a,), and nothing else: the fastest way.
