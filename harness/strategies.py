@@ -16,6 +16,7 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from hypothesis import HealthCheck, assume, settings
 from hypothesis import strategies as st
 
@@ -86,6 +87,18 @@ def suspensions() -> st.SearchStrategy[PlantChoice]:
     front = PLANTS["front"].parameters()
     mass, stiffness = (_usually(front[name], _number(*REACH[name])) for name in ("M", "K"))
     return st.builds(_suspension, mass, stiffness, _usually(None, _number(*DAMPING_RATIO, 2)))
+
+
+def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
+    """So many of the same, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
+    rng = np.random.default_rng(seed)
+    mass, stiffness, ratio = (
+        rng.uniform(*ends, count) for ends in (*(REACH[name] for name in ("M", "K")), DAMPING_RATIO)
+    )
+    return [
+        _suspension(_rounded(float(m)), _rounded(float(k)), float(zeta))
+        for m, k, zeta in zip(mass, stiffness, ratio, strict=True)
+    ]
 
 
 def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> PlantChoice:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 from hypothesis import given
 
@@ -12,30 +13,29 @@ from harness.bench import Bench
 from harness.devices import InprocDevice, describe
 from harness.dut import Dut, open_dut
 from harness.errors import AnalogrigError
-from harness.played import Finding, Played
 from harness.properties import Play, with_some_seed
-from harness.properties.test_detection import stays_quiet
+from harness.properties.test_detection import SURELY, passes, stays_quiet
 from harness.rig import EmulatorRig, Rig
 from harness.scenario import Scenario
-from harness.statistics import Design
-from harness.strategies import link_faults, profile, seeds
+from harness.statistics import Design, lower_rate
+from harness.strategies import link_faults, profile, random_suspensions, seeds
 from harness.trials import Trials, are_possible
 from harness.verdict import judge
 
 SHORT = Scenario(samples=300, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
 CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=5)
 CERTIFIED_RUN_N = 20_000
+PLANTS_N = 40
 
 
-def passes(played: Played) -> Finding:
-    return Finding(played.verdict.outcome == "passed", "; ".join(played.verdict.reasons))
-
-
-@pytest.mark.needs("tweak", "excite")
+@pytest.mark.needs("excite")
+@pytest.mark.parametrize("drift_ppm", [-20.0, 20.0])
 @profile()
 @given(seed=seeds())
-def test_edges_that_drift_against_the_samples_are_no_change(play: Play, seed: int) -> None:
-    assert with_some_seed(play, "thesis-free-running", seed, stays_quiet)
+def test_edges_that_drift_past_the_samples_are_no_change(play: Play, drift_ppm: float, seed: int) -> None:
+    phase = 2e-4 if drift_ppm < 0.0 else 1.0 - 2e-4  # they come to a sample's instant after a thousand samples
+    excitation = Excitation(low_v=0.1, high_v=9.9, phase=phase, clock="free", drift_ppm=drift_ppm)
+    assert with_some_seed(play, Scenario(2000, excitation, name="drifting"), seed, stays_quiet)
 
 
 @pytest.mark.parametrize("rig", ["emulator-0-10v"], indirect=True)
@@ -63,7 +63,7 @@ def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
 
 
 @pytest.mark.needs("excite")
-def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(rig: Rig, dut: Dut) -> None:
+def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(rig: Rig, dut: Dut, play: Play) -> None:
     described = describe(dut.name)
     if not isinstance(rig, EmulatorRig) or not are_possible(rig, described):
         pytest.skip(
@@ -73,5 +73,24 @@ def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(rig: Rig,
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=CERTIFIED_RUN_N)
     warm_n = CERTIFIED_RUN_N - described.estimator.warm_up_n
     runs = -(-CERTIFIED.trials // warm_n)
-    alarms = sum(len(trials.alarms(scenario, seed)) for seed in range(runs))
-    assert alarms <= CERTIFIED.allowed, f"{alarms} false alarms in {runs * warm_n} samples"
+    alarms = [len(trials.alarms(scenario, seed)) for seed in range(runs)]
+    if sum(alarms) > CERTIFIED.allowed:
+        play(dataclasses.replace(scenario, samples=2000), int(np.argmax(alarms)))  # to leave a recording
+    assert sum(alarms) <= CERTIFIED.allowed, f"{sum(alarms)} false alarms in {runs * warm_n} samples"
+
+
+@pytest.mark.needs("excite")
+def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(rig: Rig, dut: Dut, play: Play) -> None:
+    described = describe(dut.name)
+    if not isinstance(rig, EmulatorRig) or not are_possible(rig, described):
+        pytest.skip(f"takes {PLANTS_N * CERTIFIED_RUN_N} samples: analogrig campaign, --dut inproc, not {dut.name}")
+    trials = Trials(rig, described)
+    healthy = dataclasses.replace(Scenario.load("healthy"), samples=CERTIFIED_RUN_N)
+    plants = random_suspensions(PLANTS_N, seed=1)
+    alarms = [len(trials.alarms(dataclasses.replace(healthy, plant=plant), 1)) for plant in plants]
+    samples = PLANTS_N * CERTIFIED_RUN_N
+    if lower_rate(sum(alarms), samples, SURELY) > CERTIFIED.rate:
+        play(dataclasses.replace(healthy, plant=plants[int(np.argmax(alarms))], samples=2000), 1)
+    assert lower_rate(sum(alarms), samples, SURELY) <= CERTIFIED.rate, (
+        f"{sum(alarms)} false alarms in {samples} samples"
+    )

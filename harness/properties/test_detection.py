@@ -25,8 +25,8 @@ MOST_LATENCY = 1.35
 LEAST_RIGHT, SURELY = 0.9, 1.0 - 1e-7
 
 
-def detects(played: Played) -> Finding:
-    return played.detects()
+def passes(played: Played) -> Finding:
+    return Finding(played.verdict.outcome == "passed", "; ".join(played.verdict.reasons))
 
 
 def stays_quiet(played: Played) -> Finding:
@@ -36,9 +36,9 @@ def stays_quiet(played: Played) -> Finding:
 @pytest.mark.needs("tweak", "excite")
 @profile()
 @given(scenario=scenarios(expect=PATIENT), seed=seeds())
-def test_every_change_that_can_be_seen_is_found(play: Play, scenario: Scenario, seed: int) -> None:
+def test_every_change_that_can_be_seen_is_found_once(play: Play, scenario: Scenario, seed: int) -> None:
     assume(detectable(scenario, ARL0**MOST_INFORMATION))
-    assert with_some_seed(play, scenario, seed, detects)
+    assert with_some_seed(play, scenario, seed, passes)
 
 
 @pytest.mark.needs("excite")

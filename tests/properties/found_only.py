@@ -1,0 +1,11 @@
+"""A plugin of pytest: a property that fails is found and not shrunk."""
+
+from __future__ import annotations
+
+from hypothesis import Phase, settings
+
+from harness import strategies
+
+settings.register_profile(
+    "analogrig-ci", parent=strategies.profile("ci"), phases=[Phase.explicit, Phase.generate], report_multiple_bugs=False
+)
