@@ -141,7 +141,7 @@ def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     _run("make", cwd=users_repository)
     found = _ended(1, users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
     assert "1 failed, 1 passed" in found
-    assert "B, K at 1500 was missed" in found
+    assert "B at 1400 was missed" in found
     repeat = re.search(r"^repeat it with: analogrig (.*)$", found, re.MULTILINE)
     assert repeat is not None
     again = _ended(1, users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository)
