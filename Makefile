@@ -40,7 +40,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults \
+.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -89,6 +89,9 @@ fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers,
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
+
+defects: $(PRODUCTS) ## whether the shipped properties find each defect that is planted in the device; the table of tests/properties/README.md
+	@$(BIN)/python -m tests.properties.planted
 
 coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
 	@$(BIN)/python -m estimator_c.evidence.coverage

@@ -315,7 +315,7 @@ class InprocDevice(EitherDevice):
     @property
     def library_path(self) -> Path:
         """That is loaded."""
-        return Path(self.library) if self.library else LIBRARY
+        return Path(self.library).absolute() if self.library else LIBRARY
 
     @property
     def elsewhere(self) -> str:

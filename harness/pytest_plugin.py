@@ -161,10 +161,13 @@ def _in_one_line() -> Iterator[None]:
     from emulator.errors import EmulatorError
     from harness.errors import AnalogrigError
 
+    failure = ""
     try:
         yield
     except (AnalogrigError, EmulatorError) as error:
-        pytest.fail(str(error), pytrace=False)
+        failure = str(error)
+    if failure:  # not where it was caught, or pytest would tell of all that led to it
+        pytest.fail(failure, pytrace=False)
 
 
 def _chosen(request: pytest.FixtureRequest, name: str) -> str:

@@ -8,6 +8,8 @@ from typing import TypeVar
 
 import pytest
 
+collect_ignore = ["user_repository"]  # test_packaging.py runs it where it belongs
+
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 

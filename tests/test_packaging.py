@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import resource
+import shlex
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,65 @@ def test_main_job_works_from_the_wheel(environment: Path, tmp_path: Path) -> Non
     _run(environment / "analogrig", "run", "--out", tmp_path)
     assert (tmp_path / "run.npz").stat().st_size > 0
     assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def users_environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with what the plugin for pytest asks for."""
+    folder = tmp_path_factory.mktemp("users")
+    venv.create(folder, with_pip=False, symlinks=True)
+    _run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", f"{wheel}[pytest]", cwd=folder)
+    return folder / "bin"
+
+
+@pytest.fixture
+def users_repository(distributions: Path, tmp_path: Path) -> Path:
+    """tests/user_repository in a folder of its own, with the sources of the device as the sdist has them."""
+    repository = shutil.copytree(CHECKOUT / "tests" / "user_repository", tmp_path / "repository")
+    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
+        sdist.extractall(tmp_path / "sdist", filter="data")
+    (sources,) = (tmp_path / "sdist").iterdir()
+    shutil.copytree(sources / "estimator_c", repository / "vendor" / "estimator_c")
+    generate = sources / "estimator_c" / "catalogue" / "generate.py"
+    (repository / "vendor" / "generated").mkdir()
+    _run(sys.executable, generate, repository / "vendor" / "generated", tmp_path / "tables.py", cwd=sources)
+    return repository
+
+
+def test_users_repository_passes_without_its_bug(users_environment: Path, users_repository: Path) -> None:
+    _run("make", "BUG=0", cwd=users_repository)
+    assert "2 passed" in _run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
+
+
+def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
+    users_environment: Path, users_repository: Path
+) -> None:
+    _run("make", cwd=users_repository)
+    found = _ended(1, users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
+    assert "1 failed, 1 passed" in found
+    assert "B at 1400 was missed" in found
+    repeat = re.search(r"^repeat it with: analogrig (.*)$", found, re.MULTILINE)
+    assert repeat is not None
+    again = _ended(1, users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository)
+    assert "missed" in again
+    suite = _ended(
+        1,
+        users_environment / "python",
+        "-m",
+        "pytest",
+        "-q",
+        "failed",
+        "--scenario-dir",
+        "failed",
+        cwd=users_repository,
+    )
+    assert "1 failed" in suite
+
+
+def _ended(status: int, *command: str | Path, cwd: Path) -> str:
+    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    assert done.returncode == status, f"{command} ended with status {done.returncode}:\n{done.stdout}"
+    return done.stdout
 
 
 def test_help_loads_nothing_heavy(environment: Path) -> None:

@@ -17,7 +17,7 @@ __all__ = ["TRIES", "Play", "with_some_seed"]
 
 Play = Callable[..., Played]
 
-TRIES = 4
+TRIES = 5
 """What chance may spoil has failed when it did so with as many seeds, one after the other."""
 
 

@@ -6,6 +6,4 @@ from hypothesis import Phase, settings
 
 from harness import strategies
 
-settings.register_profile(
-    "analogrig-ci", parent=strategies.profile("ci"), phases=[Phase.explicit, Phase.generate], report_multiple_bugs=False
-)
+settings.register_profile("analogrig-ci", parent=strategies.profile("ci"), phases=[Phase.explicit, Phase.generate])

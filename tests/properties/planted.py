@@ -88,7 +88,15 @@ def planted(defect: Defect | None, folder: Path) -> Path:
         for file in sorted(sources.glob(f"{part}/*.c"))
     ]
     include = [f"-I{sources / part}" for part in FOLDERS] + [f"-I{GENERATED}"]
-    command = [os.environ.get("CC", "cc"), *FLAGS, *include, *files, *sorted(GENERATED.glob("*.c")), "-o", library]
+    command: list[str | Path] = [
+        os.environ.get("CC", "cc"),
+        *FLAGS,
+        *include,
+        *files,
+        *sorted(GENERATED.glob("*.c")),
+        "-o",
+        library,
+    ]
     subprocess.run(command, check=True)
     return library
 
@@ -96,7 +104,7 @@ def planted(defect: Defect | None, folder: Path) -> Path:
 def tried(library: Path, name: str, folder: Path, *, shrunk: bool) -> Found:
     """Runs one property against a device."""
     runs = folder / "runs"
-    command = [
+    command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
         *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "--pyargs", "harness.properties", "-k", name),
         *("--dut", f"inproc:{library}", "--runs-dir", runs),
@@ -118,13 +126,13 @@ def simplest(runs: Path) -> str:
 
 def _words(scenario: dict[str, Any]) -> str:
     if scenario.get("description"):
-        return f"{Path(str(scenario.get('rig', ''))).stem or 'emulator'}: {scenario['description']}, seed {scenario['seed']}"
+        rig = Path(str(scenario.get("rig", ""))).stem or "emulator"
+        return f"{rig}: {scenario['description']}; {scenario['samples']} samples, seed {scenario['seed']}"
     plant, excitation = scenario["plant"], scenario["excitation"]
     units = (("mass_kg", "M"), ("damping_n_s_per_m", "B"), ("stiffness_n_per_m", "K"))
     words = [", ".join(f"{short} {plant[key]:g}" for key, short in units if key in plant) or plant["set"]]
-    words.append(
-        f"{excitation['shape']} {excitation['low_v']:g} to {excitation['high_v']:g} V, {excitation['frequency_hz']:g} Hz"
-    )
+    levels = f"{excitation['low_v']:g} to {excitation['high_v']:g} V"
+    words.append(f"{excitation['shape']} {levels}, {excitation['frequency_hz']:g} Hz")
     words += [
         f"at {tweak['sample']} {', '.join(f'{short} {tweak[key]:g}' for key, short in units if key in tweak)}"
         for tweak in scenario.get("tweaks", [])

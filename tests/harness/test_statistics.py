@@ -1,0 +1,110 @@
+"""Rates and their bounds: against published figures, and against their own promise by simulation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from harness.statistics import (
+    ConfidenceSequence,
+    Decision,
+    Design,
+    SequentialTest,
+    lower_rate,
+    rate_interval,
+    upper_rate,
+)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "allowed", "trials"),
+    [
+        *((0.95, allowed, n) for allowed, n in ((0, 299_573), (1, 474_386), (2, 629_579), (5, 1_051_303))),
+        *((0.999, allowed, n) for allowed, n in ((0, 690_775), (1, 923_341), (2, 1_122_887), (5, 1_645_474))),
+    ],
+)
+def test_length_of_a_certificate_is_that_of_the_exact_bound(confidence: float, allowed: int, trials: int) -> None:
+    """The figures are those of the facts this project began with, from the Poisson limit: within a few in a million."""
+    assert Design(1e-5, confidence, allowed).trials == pytest.approx(trials, rel=1e-5)
+
+
+def test_no_event_in_n_has_the_bound_in_closed_form() -> None:
+    assert upper_rate(0, 1000, 0.95) == pytest.approx(1.0 - 0.05 ** (1 / 1000), rel=1e-12)
+    assert lower_rate(1000, 1000, 0.95) == pytest.approx(0.05 ** (1 / 1000), rel=1e-12)
+    assert (lower_rate(0, 10, 0.9), upper_rate(10, 10, 0.9)) == (0.0, 1.0)
+
+
+def test_interval_of_clopper_and_pearson_is_the_published_one() -> None:
+    """10 of 100 at 95 %: 0.0490 to 0.1762 (Newcombe, Statistics in Medicine 17, 1998, and many tables)."""
+    assert rate_interval(10, 100, 0.95) == pytest.approx((0.0490, 0.1762), abs=5e-5)
+
+
+def test_chance_to_pass_at_the_limit_is_what_the_confidence_leaves() -> None:
+    assert Design(1e-3, 0.99, 3).chance_to_pass(1e-3) == pytest.approx(0.01, rel=5e-3)
+    assert Design(1e-3, 0.99, 3).chance_to_pass(1e-5) > 0.999
+
+
+def test_sequential_test_is_wrong_no_more_often_than_it_says() -> None:
+    """1000 runs at each of the two rates; a fifth is promised, 4.7 standard errors are allowed."""
+    rng = np.random.default_rng(7)
+    wrong = dict.fromkeys((0.01, 0.05), 0)
+    for rate in wrong:
+        for _ in range(1000):
+            test = SequentialTest(good=0.01, bad=0.05, miss=0.2, false_alarm=0.2)
+            while test.decision is Decision.OPEN:
+                test.add(20, int(rng.binomial(20, rate)))
+            wrong[rate] += test.decision is (Decision.BELOW if rate == 0.05 else Decision.ABOVE)
+    assert all(0 < count < 1000 * (0.2 + 4.7 * math.sqrt(0.2 * 0.8 / 1000)) for count in wrong.values()), wrong
+
+
+def test_sequential_test_without_events_ends_where_it_says() -> None:
+    test = SequentialTest(good=1e-6, bad=1e-5, miss=1e-3, false_alarm=1e-6)
+    assert test.add(test.fewest_trials - 1, 0) is Decision.OPEN
+    assert test.add(1, 0) is Decision.BELOW
+    assert test.fewest_trials == pytest.approx(math.log(1000) / 9e-6, rel=1e-4)
+
+
+def test_confidence_sequence_ever_leaves_the_truth_as_seldom_as_it_says() -> None:
+    """It is looked at after every trial, where an interval of Clopper and Pearson would be wrong far more often."""
+    rng = np.random.default_rng(11)
+    left = left_fixed = 0
+    for _ in range(60):
+        sequence = ConfidenceSequence(0.9, expected_rate=0.1)
+        outside = outside_fixed = False
+        for event in rng.random(150) < 0.1:
+            low, high = sequence.add(1, int(event))
+            outside |= not low <= 0.1 <= high
+            fixed = rate_interval(sequence.events, sequence.trials, 0.9)
+            outside_fixed |= not fixed[0] <= 0.1 <= fixed[1]
+        left += outside
+        left_fixed += outside_fixed
+    assert left <= 60 * 0.1 + 4.7 * math.sqrt(60 * 0.09)
+    assert left_fixed > 2 * left
+
+
+def test_confidence_sequence_decides_on_either_side() -> None:
+    sequence = ConfidenceSequence(0.999, expected_rate=1e-5)
+    assert sequence.decision(1e-5) is Decision.OPEN
+    sequence.add(3_000_000, 1)
+    assert sequence.decision(1e-5) is Decision.BELOW
+    sequence.add(0, 0)
+    assert ConfidenceSequence(0.999, 1e-5, trials=100_000, events=20).decision(1e-5) is Decision.ABOVE
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: upper_rate(2, 1, 0.9), "there cannot be 2 events in 1 trials"),
+        (lambda: upper_rate(0, 0, 0.9), "nothing is known without a trial"),
+        (lambda: lower_rate(0, 1, 1.0), "confidence must be between 0 and 1, not 1"),
+        (lambda: Design(0.0, 0.9), "rate must be between 0 and 1, not 0"),
+        (lambda: SequentialTest(0.2, 0.1, 0.1, 0.1), "good must be below bad"),
+        (lambda: SequentialTest(0.1, 0.2, 0.6, 0.1), "error probabilities must be between 0 and 0.5"),
+        (lambda: ConfidenceSequence(0.9, 0.0), "expected_rate must be between 0 and 1, not 0"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(call: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()  # type: ignore[operator]

@@ -1,0 +1,133 @@
+"""What the strategies draw: playable, within what the device is held to, and simple when it is shrunk."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Callable
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+
+from emulator.excitation import Excitation
+from harness import config
+from harness.devices import InprocDevice
+from harness.information import detectable, predicted_bounds
+from harness.played import Played
+from harness.rig import EmulatorDescription, EmulatorRig, open_rig
+from harness.scenario import PLANTS, PlantChoice, Scenario, Tweak
+from harness.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
+from harness.trials import Trials
+from harness.verdict import judge
+from tests.harness.runs import made_run
+
+quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+
+
+@pytest.fixture(scope="module")
+def trials() -> Trials:
+    rig = open_rig("emulator")
+    assert isinstance(rig, EmulatorRig)
+    return Trials(rig, InprocDevice(name="inproc"))
+
+
+def test_drawn_scenario_makes_a_valid_run_and_can_be_written_to_a_file(trials: Trials) -> None:
+    @quick
+    @given(scenario=scenarios(together=2), seed=seeds())
+    def check(scenario: Scenario, seed: int) -> None:
+        assert judge(trials.run(scenario, seed)).valid
+        table = tomllib.loads(config.to_toml(scenario.as_table()))
+        assert Scenario.from_table(table, "the file") == scenario
+
+    check()
+
+
+def test_drawn_rig_can_be_set_up() -> None:
+    @quick
+    @given(rig=rigs())
+    def check(rig: EmulatorDescription) -> None:
+        EmulatorRig(rig).set_up(Scenario(10, Excitation()), 1)
+
+    check()
+
+
+def test_drawn_faults_are_such_that_a_line_has() -> None:
+    @quick
+    @given(faults=link_faults())
+    def check(faults: str) -> None:
+        assert InprocDevice(name="inproc", wire_faults=faults).faults() is not None or not faults
+
+    check()
+
+
+def test_random_plants_are_those_that_the_device_is_held_to() -> None:
+    for choice in random_suspensions(200, seed=3):
+        plant = choice.plant()
+        ratio = plant.damping_n_s_per_m / (2.0 * (plant.stiffness_n_per_m * plant.mass_kg) ** 0.5)
+        assert DAMPING_RATIO[0] - 1e-4 <= ratio <= DAMPING_RATIO[1] + 1e-4
+        for name, (low, high) in REACH.items():
+            assert low <= plant.parameters()[name] <= high
+
+
+@pytest.mark.parametrize(
+    ("fails", "expected"),
+    [
+        (lambda _: True, {"samples": 700, "tweaks": 1}),
+        (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
+        (lambda scenario: any("mass_kg" in tweak.given() for tweak in scenario.tweaks), {"tweaks": 1}),
+    ],
+)
+def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(
+    fails: Callable[[Scenario], bool], expected: dict[str, int]
+) -> None:
+    found = hypothesis.find(scenarios(), fails, settings=settings(quick, max_examples=200, phases=list(Phase)))
+    assert found.plant.plant() == PLANTS["front"]
+    assert found.excitation == Excitation(low_v=0.1, high_v=9.9)
+    assert len(found.tweaks) == expected["tweaks"]
+    assert found.samples == expected.get("samples", found.samples)
+
+
+HALF = Excitation(low_v=0.1, high_v=9.9)
+FALLS = Scenario(1000, HALF, tweaks=(Tweak(600, stiffness_n_per_m=18000.0),))
+
+
+def test_change_of_nothing_that_shows_is_not_detectable() -> None:
+    assert detectable(FALLS, 1e5)
+    still = dataclasses.replace(HALF, low_v=0.0, high_v=0.0)
+    assert not detectable(dataclasses.replace(FALLS, excitation=still), 1e5)
+    assert not detectable(dataclasses.replace(FALLS, samples=602), 1e300)
+
+
+def test_predicted_bound_is_that_of_the_run(trials: Trials) -> None:
+    (predicted,) = predicted_bounds(FALLS, 1e5)
+    (tweak,) = judge(trials.run(FALLS, 1)).tweaks
+    assert predicted is not None and tweak.bound_n is not None
+    assert abs(predicted - tweak.bound_n) <= 1
+
+
+def test_played_says_what_it_shows_and_why(trials: Trials) -> None:
+    played = Played(trials.run(dataclasses.replace(FALLS, name="falls"), 1))
+    assert played.detects(within=6.0) and played.stays_quiet() and played.estimates(0.05) and played.isolates()
+    late = played.detects(within=0.0)
+    assert not late and "K at 600" in late.why and "allowed 1" in late.why
+    assert not Played(trials.run(dataclasses.replace(FALLS, tweaks=()), 1)).detects()
+
+
+def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(trials: Trials) -> None:
+    played = Played(trials.run(FALLS, 1))
+    theta = played.run.theta.astype(float)
+    assert played.follows(theta, 0.0)
+    shifted = theta.copy()
+    shifted[5:] = theta[:-5]
+    assert not played.follows(shifted, 1e-9)
+    shifted[-5:] = np.nan  # what comes later is not known there
+    assert played.follows(shifted, 1e-9, time_tolerance=5)
+    with pytest.raises(ValueError, match="reference has the shape"):
+        played.follows(theta[:-1], 0.1)
+
+
+def test_alarms_without_a_change_are_counted() -> None:
+    finding = Played(made_run(np.zeros(100), [(0, PlantChoice().plant())], alarms=[7, 50])).stays_quiet()
+    assert not finding and finding.why == "2 false alarms in 100 samples: 7, 50"

@@ -1,0 +1,13 @@
+"""What our estimator must do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def test_every_change_of_the_thesis_is_found_in_time(play: Any) -> None:
+    assert play("thesis", seed=3).detects(within=6.0)
+
+
+def test_healthy_suspension_raises_no_alarm(play: Any) -> None:
+    assert play("healthy", seed=3).stays_quiet()
