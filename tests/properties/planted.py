@@ -57,7 +57,7 @@ class Found:
         """What the property said last."""
         said = re.findall(r"^E +(?:AssertionError: |Failed: )?(?:assert )?(.*)$", self.output, re.MULTILINE)
         finding = [re.sub(r"^<no: (.*)>$", r"\1", line) for line in said if line.strip()]
-        finding = finding or re.findall(r"(INCONCLUSIVE: .*)$", self.output, re.MULTILINE)
+        finding = finding or re.findall(r"(INCONCLUSIVE: .*|^device .*)$", self.output, re.MULTILINE)
         finding = [re.sub(r"device \S+: ", "", line) for line in finding]
         return finding[0][:110] if finding else ""
 
