@@ -249,6 +249,7 @@ class _Player:
         self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
     ) -> Played:
         from harness.counterexample import command_of
+        from harness.errors import AnalogrigError
         from harness.played import Played
         from harness.scenario import DEFAULT_SEED, Scenario
 
@@ -256,6 +257,9 @@ class _Player:
             chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
             drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
             run = self.bench.play(chosen, drawn)
+        if run.conditions.faults:  # nothing of it may reach the next play of this test
+            with contextlib.suppress(AnalogrigError):
+                self.bench.dut.handshake()
         played = Played(run, command_of(run))
         self.item.stash.setdefault(_PLAYS, []).append(played)
         _note(self.item, played)

@@ -55,9 +55,10 @@ class Found:
     @property
     def why(self) -> str:
         """What the property said last."""
-        said = re.findall(r"^E +(?:AssertionError: |assert |Failed: )?(.*)$", self.output, re.MULTILINE)
+        said = re.findall(r"^E +(?:AssertionError: |Failed: )?(?:assert )?(.*)$", self.output, re.MULTILINE)
         finding = [re.sub(r"^<no: (.*)>$", r"\1", line) for line in said if line.strip()]
-        finding = finding or re.findall(r"^INCONCLUSIVE: .*$", self.output, re.MULTILINE)
+        finding = finding or re.findall(r"(INCONCLUSIVE: .*|^device .*)$", self.output, re.MULTILINE)
+        finding = [re.sub(r"device \S+: ", "", line) for line in finding]
         return finding[0][:110] if finding else ""
 
 
