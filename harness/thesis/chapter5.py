@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.plant import Plant
+from harness.plant import AT_REST, Plant, SampledPlant
 from harness.run import Run
 from harness.thesis.chapter4 import CHANGE_LABELS, UNITS_PER_M, zeta
 from harness.thesis.circuit import (
@@ -32,7 +32,7 @@ from harness.thesis.circuit import (
     track_codes,
 )
 from harness.thesis.document import Chapter, Claim, Curve, Erratum, Figure, Number, Panel, Signal
-from harness.thesis.model import FRONT, PROFILE, SHOCK, Arx, time_varying
+from harness.thesis.model import FRONT, PERIOD_S, PROFILE, SHOCK, Arx, square, time_varying
 from harness.thesis.schemes import schemes
 from harness.thesis.tracking import Performance, Track, marks, performance, track
 
@@ -279,11 +279,34 @@ def _on_card(rig: str, plant: Plant, seed: int) -> Arx:
     return Model.of_theta(track(BATCH, u, y).theta[-1], n_per_code, m_per_code).arx
 
 
+EARLY = 0.2
+"""Of a sample: 10 us at 20 kHz."""
+
+
+def _early_edge() -> Arx:
+    """The batch estimate if both channels are sampled at once, each edge of the force coming 10 us before."""
+    u, y, state = square(FIRST_N, 0.0, 2940.0, 200), np.empty(FIRST_N), AT_REST
+    before, after = (SampledPlant.of(INFERRED, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
+    for k in range(FIRST_N):
+        state = after.next(before.next(state, float(u[k - 1]) if k else 0.0), float(u[k]))
+        y[k] = state[0]
+    y_per_m = 1e5
+    a1, a2, b0, b1 = np.linalg.lstsq(_equations(u, y * y_per_m), y[2:] * y_per_m, rcond=None)[0][:4].tolist()
+    return Arx(a1, a2, b0 / y_per_m, b1 / y_per_m)
+
+
+def _equations(u: Signal, y: Signal) -> Signal:
+    """(n - 2, 5) of a1, a2, b0, b1, d."""
+    return np.stack([-y[1:-1], -y[:-2], u[1:-1], u[:-2], np.ones(len(u) - 2)], axis=1)
+
+
 def _identification_claims(circuit: Circuit, model: Model) -> tuple[Claim, ...]:
     difference = circuit.comparison.channel("displacement") * 1e3 - _simulated_mm(circuit.comparison)
     lsb_mm = circuit.comparison.conditions.channels["displacement"].lsb * 1e3
     ours = _deviations(model.arx)
     many = np.array([list(_deviations(_on_card(SKEWED, INFERRED, seed)).values()) for seed in SEEDS])
+    mean = dict(zip(ours, many.mean(axis=0).tolist(), strict=True))
+    early = _deviations(_early_edge())
     within = int((np.abs(many) <= 0.03).all(axis=1).sum())
     readings = {
         "the inferred plant without the skew": _deviations(_on_card(NOISY, INFERRED, SEED)),
@@ -314,18 +337,21 @@ def _identification_claims(circuit: Circuit, model: Model) -> tuple[Claim, ...]:
             "5.3, Equ. 5.4",
             "The analog to digital converter implements a “simultaneous sample and hold” for each A/D channel"
             " ensuring that there are no lags between sampled input and output.",
-            "does not hold",
-            "<strong>This is an inference</strong>, not a fact of the text: Equ. 5.4 looks like a card without"
-            " simultaneous sampling. If the force is converted one conversion of the 100 kHz card, 10 µs, before the"
-            f" displacement, a plant with M = {INFERRED.mass_kg:g} kg, B = {INFERRED.damping_n_s_per_m:g} N s/m, K ="
-            f" {INFERRED.stiffness_n_per_m:g} N/m gives a1, b0, b1 within {_three(ours)} of the printed ones ({within}"
-            f" of {len(SEEDS)} seeds: all three within 3 %). Two"
+            "holds with a reading",
+            "<strong>This is an inference</strong>, not a fact of the text: Equ. 5.4 looks like a force that is 10 µs,"
+            " one conversion of the 100 kHz card, ahead of the displacement. Two readings give the same data."
+            " Simultaneous sampling, and a generator locked to the card whose edge comes 10 µs before the sample: the"
+            f" sentence holds (without noise {_three(early)}). Or a card that converts the force first: it does not"
+            f" (played here). A plant with M = {INFERRED.mass_kg:g} kg, B = {INFERRED.damping_n_s_per_m:g} N s/m, K ="
+            f" {INFERRED.stiffness_n_per_m:g} N/m then gives a1, b0, b1 within {_three(ours)} of the printed ones, on"
+            f" the mean of {len(SEEDS)} seeds {_three(mean)} ({within} seeds: all three within 3 %). Two"
             " numbers, M and B, were fitted to three. Deviations of other readings: " + tried + ".",
             {
                 "deviations": ours,
                 "seeds_within_3_percent": within,
                 "seeds": len(SEEDS),
-                "mean_deviations": many.mean(axis=0).tolist(),
+                "mean_deviations": list(mean.values()),
+                "deviations_with_an_early_edge": early,
                 "deviations_of_other_readings": readings,
             },
             ("5.5",),
@@ -375,7 +401,7 @@ def _as_printed(u: Signal) -> Signal:
 
 def _variances(u: Signal, y: Signal, model: Model) -> tuple[float, ...]:
     """Of a1, a2, b0, b1 (the last two in 1e-5 m/N), as batch least squares states them: s^2 (Phi' Phi)^-1."""
-    phi = np.stack([-y[1:-1], -y[:-2], u[1:-1], u[:-2], np.ones(len(u) - 2)], axis=1)
+    phi = _equations(u, y)
     residual = y[2:] - phi @ model.theta
     covariance = float(residual @ residual) / (len(residual) - phi.shape[1]) * np.linalg.inv(phi.T @ phi)
     to_si = np.array([1.0, 1.0, model.arx.b0 / model.theta[2] * 1e5, model.arx.b1 / model.theta[3] * 1e5])
