@@ -495,6 +495,7 @@ def _tracking_claims(simulation: Simulation) -> tuple[Claim, ...]:
     }
     since_start = _mean_since_start(simulation)
     left = [float(since_start.statistic[end]) for end in ends[1:]]
+    near_zero = (np.flatnonzero(since_start.statistic[ends[0] + 1 :] < 0.05 * MEAN_CEILING) + ends[0] + 1).tolist()
     above = int((since_start.statistic > MEAN_CEILING).sum())
     signed, absolute = (_sweep(simulation, "mean-between-faults", absolute=each) for each in (False, True))
     from_the_alarm = track(
@@ -567,11 +568,11 @@ def _tracking_claims(simulation: Simulation) -> tuple[Claim, ...]:
             "4.8-never-zero",
             "4.4.3, Fig. 4.8",
             "the mean error never actually reconverges to its steady state value i.e. zero.",
-            "holds",
-            "At the ends of the stretches after the changes it is "
-            + ", ".join(f"{x:.0f}" for x in left)
-            + " units, nowhere near zero.",
-            {"mean_at_the_ends": left},
+            "holds with a reading",
+            "Reading: it never stays at zero. Its magnitude is below 15 units, 5 % of the ceiling, at"
+            f" {len(near_zero)} samples between {near_zero[0]} and {near_zero[-1]}, where the mean passes through zero;"
+            " at the ends of the stretches after the changes it is " + ", ".join(f"{x:.0f}" for x in left) + " units.",
+            {"mean_at_the_ends": left, "samples_below_15": near_zero},
             ("4.8",),
         ),
         Claim(
