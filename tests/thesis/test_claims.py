@@ -66,7 +66,7 @@ def test_every_figure_of_the_thesis_is_there(claims: Claims) -> None:
 def test_every_claim_names_figures_that_exist_and_has_a_verdict(claims: Claims) -> None:
     assert len({each["ident"] for each in claims["claims"]}) == len(claims["claims"]) >= 29
     for each in claims["claims"]:
-        assert each["verdict"] in ("holds", "holds with a reading", "does not hold")
+        assert each["verdict"] in ("holds", "holds with a reading", "does not hold", "not reproduced")
         assert set(each["figures"]) <= set(claims["figures"])
         assert each["measured"]
 
@@ -490,7 +490,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
             and max(m["spread_of_M_B_K"]["mean-between-faults"]) < 5e-4
         ),
     ),
-    "4.9-level": ("holds", lambda m, _: m["alarms"] == 0),
+    "4.9-level": ("not reproduced", lambda m, _: m["alarms"] == 0),
     "5.3-parity": ("holds", lambda m, _: m["difference_rms_lsb"] < 2.0),
     "5.4-skew": ("holds with a reading", _skewed),
     "5.4-variance": (
