@@ -102,6 +102,25 @@ _ERRATA = (
         " sides differ by R φ(k+1).",
     ),
     Erratum(
+        "Equ. 3.26, 3.28",
+        "E(w(k)) = R",
+        "E(w(k) wᵀ(k)) = R, with E(w(k)) = 0",
+        "The mean of a vector is a vector, and R is added to the matrix P in Equ. 3.23d: it is the covariance.",
+    ),
+    Erratum(
+        "Section 3.6, the changing b0",
+        "b0 = −0.9 for k < 200, −0.5 for 200 < k < 400",
+        "−0.5 for 200 ≤ k < 400",
+        "At k = 200 and k = 400 b0 is undefined as printed; assumed here is that the new value begins there.",
+    ),
+    Erratum(
+        "Numbers of equations",
+        "the measurement y(k) = H x(k) + v(k) is Equ. 3.24b; two equations are 3.23a, two 3.24b",
+        "3.23b, or numbers of their own",
+        "The state equation before it is 3.23a, and so is the first line of the filter. Equ. 3.24b is, further down,"
+        " y(k) = φᵀ(k) x(k) + e(k) as well.",
+    ),
+    Erratum(
         "Equ. A.2.3",
         "φᵀ(t+1)φ(t+1) = [φᵀ(t) φ(t+1)][φ(t) φᵀ(t+1)], a product",
         "φᵀ(t)φ(t) + φ(t+1)φᵀ(t+1), a sum",

@@ -94,7 +94,8 @@ def chapter(simulation: Simulation) -> Chapter:
         "System simulation",
         "The plant is the exact zero-order-hold model at 100 Hz; a change jumps in its physical state, position and"
         " velocity go on. The square wave begins high and has 100 samples a period. Where nothing else is said y is"
-        f" in units of {1e6 / UNITS_PER_M:g} µm: only in such units do ceilings of 1500 and 300 make sense (see the"
+        f" in units of {1e6 / UNITS_PER_M:g} µm: only in units of about 1e7 to the metre do"
+        " ceilings of 1500 and 300 make sense (see the"
         f" readings below), and with it θ = 0 and P = {P0:g} I at the start.",
         figures=(*_stationary_figures(identified), *_tracking_figures(simulation)),
         numbers=_numbers(identified),
@@ -175,6 +176,13 @@ def _errata() -> tuple[Erratum, ...]:
             f"({front.b0 * 1e6:.4f}e-6 z + {front.b1 * 1e6:.4f}e-6) / (z² − {-front.a1:.4f} z + {front.a2:.4f})",
             f"The static gain must be 1/24500. As printed it is 1/{1 / PRINTED_4_8.gain:.0f}; with both signs"
             f" positive, the order exchanged and 1e-6 it is 1/{1 / front.gain:.0f}.",
+        ),
+        Erratum(
+            "Section 4.3, Fig. 4.1",
+            "±1470 N, the force that fully compresses the shock absorber of 12 cm of stroke",
+            "a swing of 1470 N",
+            f"1470 / 12250 = {SHOCK_FORCE_N / SHOCK.stiffness_n_per_m * 1e3:.0f} mm to either side, 240 mm in all:"
+            " twice the stroke. The linear model does not mind.",
         ),
         Erratum(
             "Section 4.4.1, table",

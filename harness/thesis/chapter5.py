@@ -172,6 +172,12 @@ def _errata(model: Model) -> tuple[Erratum, ...]:
             " claims.",
         ),
         Erratum(
+            "Sections 5.1, 5.2",
+            "two equations are Equ. 5.2",
+            "numbers of their own",
+            "i = C de/dt is one, M ẍ + B ẋ + K x = F the other.",
+        ),
+        Erratum(
             "Section 5.6",
             "“implemented in section 5.6”",
             "section 5.5",

@@ -542,6 +542,21 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
 """Of every claim its verdict, and whether what it measured is what the oracle has."""
 
 
+@pytest.mark.parametrize(
+    ("where", "right"),
+    [
+        ("Equ. 3.26, 3.28", "E(w(k) wᵀ(k)) = R"),
+        ("Section 3.6, the changing b0", "200 ≤ k < 400"),
+        ("Numbers of equations", "3.23b"),
+        ("Section 4.3, Fig. 4.1", "a swing of 1470 N"),
+        ("Sections 5.1, 5.2", "numbers of their own"),
+    ],
+)
+def test_erratum_is_there(claims: Claims, where: str, right: str) -> None:
+    (erratum,) = (each for each in claims["errata"] if each["where"] == where)
+    assert right in erratum["right"]
+
+
 def test_table_of_verdicts_has_every_claim(claims: Claims) -> None:
     assert {each["ident"] for each in claims["claims"]} == set(VERDICTS)
 
