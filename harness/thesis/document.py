@@ -14,7 +14,7 @@ Signal = NDArray[np.float64]
 
 Ink = Literal["first", "second", "third", "truth"]
 
-Verdict = Literal["holds", "holds with a reading", "does not hold"]
+Verdict = Literal["holds", "holds with a reading", "does not hold", "not reproduced"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,12 @@ from harness.thesis.tracking import Performance
 
 _FOLDER = Path(__file__).parent
 
-_CLASSES: dict[Verdict, str] = {"holds": "holds", "holds with a reading": "reading", "does not hold": "fails"}
+_CLASSES: dict[Verdict, str] = {
+    "holds": "holds",
+    "holds with a reading": "reading",
+    "does not hold": "fails",
+    "not reproduced": "fails",
+}
 
 
 def render(chapters: Sequence[Chapter], comparison: Comparison) -> str:
@@ -91,7 +96,12 @@ def _summary(claims: Sequence[Claim]) -> str:
 def _verb(verdict: Verdict, count: int) -> str:
     if count == 1:
         return verdict
-    return {"holds": "hold", "holds with a reading": "hold with a reading", "does not hold": "do not hold"}[verdict]
+    return {
+        "holds": "hold",
+        "holds with a reading": "hold with a reading",
+        "does not hold": "do not hold",
+        "not reproduced": "are not reproduced",
+    }[verdict]
 
 
 def _contents(chapters: Sequence[Chapter]) -> str:

@@ -6,6 +6,7 @@ and 3.20 as they are printed, the triggers follow sections 4.4.2 and 4.4.3.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -60,27 +61,41 @@ def suspension(u: Signal) -> Signal:
 
 
 class Rls:
-    """Equ 3.19 and 3.20, with the reset and the trigger of the thesis."""
+    """Equ 3.19 and 3.20, with the forgetting factor, the random walk, the reset and the triggers of the thesis."""
 
     def __init__(
-        self, kind: str = "none", ceiling: float = math.inf, *, hold_off_n: int = 4, warm_up_n: int = 50
+        self,
+        kind: str = "none",
+        ceiling: float = math.inf,
+        *,
+        hold_off_n: int = 4,
+        warm_up_n: int = 50,
+        nb: int = 2,
+        offset: bool = False,
+        forgetting: float = 1.0,
+        random_walk: float = 0.0,
     ) -> None:
         self.kind, self.ceiling, self.hold_off_n, self.warm_up_n = kind, ceiling, hold_off_n, warm_up_n
+        self.nb, self.offset, self.forgetting, self.random_walk = nb, offset, forgetting, random_walk
+        self.errors: Signal = np.empty(0)
 
     def run(self, u: Signal, y: Signal) -> tuple[Signal, list[int]]:
-        """The estimates (n, 4) and the samples with an alarm."""
-        theta, p = np.zeros(4), 10.0 * np.eye(4)
-        out, alarms = np.zeros((len(u), 4)), []
+        """The estimates (n, p) and the samples with an alarm; ``errors`` are those of prediction (n,)."""
+        p0 = np.diag([10.0] * (2 + self.nb) + [1e6] * self.offset)
+        theta, p = np.zeros(len(p0)), p0
+        out, alarms = np.zeros((len(u), len(p0))), []
+        self.errors = np.zeros(len(u))
         quiet, total, count, begin = self.warm_up_n, 0.0, 0, 2
         for k in range(len(u)):
             out[k] = theta
             if k < begin:
                 continue  # the equation reaches back by two samples, to none of before an alarm
-            phi = np.array([-y[k - 1], -y[k - 2], u[k - 1], u[k - 2]])
-            error = y[k] - phi @ theta
-            gain = p @ phi / (1.0 + phi @ p @ phi)
+            inputs = [u[k - 1 - i] for i in range(self.nb)]
+            phi = np.array([-y[k - 1], -y[k - 2], *inputs, *[1.0] * self.offset])
+            error = self.errors[k] = y[k] - phi @ theta
+            gain = p @ phi / (self.forgetting + phi @ p @ phi)
             theta = theta + gain * error
-            p = p - np.outer(gain, phi @ p)
+            p = (p - np.outer(gain, phi @ p)) / self.forgetting + self.random_walk * np.eye(len(p0))
             p = (p + p.T) / 2.0
             if quiet:
                 quiet -= 1
@@ -89,11 +104,60 @@ class Rls:
                 statistic = abs(error) if self.kind == "prediction-error" else abs(total / count)
                 if self.kind != "none" and statistic >= self.ceiling:
                     alarms.append(k)
-                    p, quiet, total, count, begin = 10.0 * np.eye(4), self.hold_off_n, 0.0, 0, k + 3
+                    p, quiet, total, count, begin = p0, self.hold_off_n, 0.0, 0, k + 3
                     if self.kind == "prediction-error":
-                        theta = np.zeros(4)
+                        theta = np.zeros(len(p0))
             out[k] = theta
         return out, alarms
+
+
+def physical(theta: Signal, y_per_m: float, u_per_n: float = 1.0) -> Signal:
+    """M, B, K (n, 3) of a1, a2, b0, b1 (n, 4): the poles' logarithms and the static gain; NaN without a suspension."""
+    out = np.full((len(theta), 3), np.nan)
+    for row, (a1, a2, b0, b1) in zip(out, theta[:, :4], strict=True):
+        poles = np.roots([1.0, a1, a2]).astype(complex)
+        if b0 + b1 == 0.0 or 0.0 in poles:
+            continue
+        stiffness = y_per_m / u_per_n * (1.0 + a1 + a2) / (b0 + b1)
+        rates = -np.log(poles) / PERIOD_S
+        mass = stiffness / (rates[0] * rates[1]).real
+        found = mass, mass * rates.sum().real, stiffness
+        if min(found) > 0.0:
+            row[:] = found
+    return out
+
+
+def errors_of(parameters: Signal, starts: Sequence[int]) -> Signal:
+    """(n, 3) relative errors of M, B, K, the plants of the profile beginning at ``starts``."""
+    truth = np.empty_like(parameters)
+    for start, plant in zip(starts, PROFILE.values(), strict=True):
+        truth[start:] = plant
+    return parameters / truth - 1.0
+
+
+def reconverged(error: Signal, starts: Sequence[int], within: float = 0.05) -> list[int | None]:
+    """Samples from each change until all errors stay within; the sample of the change itself is the old plant's."""
+    out: list[int | None] = []
+    for start, end in zip(starts, [*starts[1:], len(error)], strict=True):
+        after = next((k for k in range(start + 1, end) if (np.abs(error[k:end]) <= within).all()), None)
+        out.append(None if after is None else after - start)
+    return out
+
+
+def excursions(error: Signal, starts: Sequence[int], beyond: float = 0.5) -> int:
+    """How often an estimate leaves the truth by so much, NaN being out."""
+    count = 0
+    for start, end in zip(starts, [*starts[1:], len(error)], strict=True):
+        good = np.asarray((np.abs(error[start + 1 : end]) <= beyond).all(axis=1))
+        count += sum(1 for before, now in itertools.pairwise(good.tolist()) if before and not now)
+    return count
+
+
+def late_scatter(values: NDArray[np.floating], starts: Sequence[int]) -> Signal:
+    """Of each column: the root of the mean variance in the second halves of the stretches."""
+    values = values.astype(np.float64)
+    stretches = zip(starts, [*starts[1:], len(values)], strict=True)
+    return np.asarray(np.sqrt(np.mean([values[(a + b) // 2 : b].var(axis=0) for a, b in stretches], axis=0)))
 
 
 def latencies(alarms: Sequence[int], n: int) -> list[int | None]:
