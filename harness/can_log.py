@@ -52,25 +52,29 @@ class _Writer(Protocol):
 
 
 class CanLog:
-    """A listener to a link that writes each frame to a file; there is none before the first frame.
+    """A listener to a link that writes each frame to a file; there is none before the first frame after ``begin``.
 
     A disk that is full does not end the run: ``close`` tells.
     """
 
     def __init__(self, path: Path) -> None:
-        """The suffix of ``path`` is one of WRITTEN. What an earlier run has left there goes.
-
-        :raises RecordingError: it cannot go.
-        """
+        """The suffix of ``path`` is one of WRITTEN."""
         self.path = path
+        self._held: list[can.Message] | None = []
+        """What passed before the beginning."""
         self._writer: _Writer | None = None
         self._failure: Exception | None = None
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be removed: {error.strerror or error}") from error
+
+    def begin(self) -> None:
+        """The device has answered: what an earlier run has left in the file may go, what was said so far is written."""
+        held, self._held = self._held or [], None
+        for frame in held:
+            self(frame)
 
     def __call__(self, frame: can.Message) -> None:
+        if self._held is not None:
+            self._held.append(frame)
+            return
         if self._failure is not None:
             return
         try:

@@ -39,18 +39,43 @@ def prepare(out: Path, rig: Rig) -> None:
         raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
 
 
-def can_log(arguments: argparse.Namespace) -> CanLog | None:
+def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
     """What listens to the CAN frames of the run, if they shall be kept; a run on another link has none.
 
-    :raises RecordingError: the log of an earlier run is in the way.
+    :raises ConfigurationError: the run would overwrite the log that is being played.
     """
-    from harness.can_log import WRITTEN, CanLog
+    from harness.can_log import CanLog
+    from harness.errors import ConfigurationError
+    from harness.rig import RecordingRig
 
-    kept = None
-    for suffix in WRITTEN:
-        log = CanLog(arguments.out / f"{CAN_LOG}.{suffix}")
-        kept = log if suffix == arguments.can_log else kept
-    return kept
+    if isinstance(rig, RecordingRig) and rig.path.resolve() in {path.resolve() for path in _can_logs(arguments.out)}:
+        raise ConfigurationError(
+            f"--out {arguments.out}: would overwrite the CAN log that is played; choose another folder"
+        )
+    return None if arguments.can_log == "none" else CanLog(arguments.out / f"{CAN_LOG}.{arguments.can_log}")
+
+
+def _can_logs(out: Path) -> list[Path]:
+    """Wherever a run leaves one."""
+    from harness.can_log import WRITTEN
+
+    return [out / f"{CAN_LOG}.{suffix}" for suffix in WRITTEN]
+
+
+def _begin(log: CanLog | None, out: Path) -> None:
+    """What an earlier run has left goes, now that there is a device to play with.
+
+    :raises RecordingError: it cannot go.
+    """
+    from harness.errors import RecordingError
+
+    for path in _can_logs(out):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be removed: {error.strerror or error}") from error
+    if log is not None:
+        log.begin()
 
 
 def play(
@@ -59,6 +84,7 @@ def play(
     from harness.bench import Bench
     from harness.errors import RecordingError
 
+    _begin(log, arguments.out)
     run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
     status = conclude(run, arguments)
     try:

@@ -57,6 +57,7 @@ def traffic() -> tuple[Run, list[can.Message]]:
 
 def written(path: Path, frames: Iterable[can.Message]) -> Path:
     log = CanLog(path)
+    log.begin()
     for frame in frames:
         log(frame)
     log.close()
@@ -150,6 +151,7 @@ def test_log_holds_the_same_run(tmp_path: Path, traffic: tuple[Run, list[can.Mes
 )
 def test_log_of_another_exchange_holds_the_same_run(tmp_path: Path, device: str, changes: dict[str, Any]) -> None:
     log = CanLog(tmp_path / "can.log")
+    log.begin()
     run = played(log, device=device, **changes)
     log.close()
     again = captured(tmp_path / "can.log")
@@ -388,6 +390,7 @@ def test_disk_that_is_full_is_told_when_the_log_is_closed(
     traffic: tuple[Run, list[can.Message]], tmp_path: Path
 ) -> None:
     log = CanLog(tmp_path / "gone" / "can.log")  # a folder that is not there
+    log.begin()
     for frame in traffic[1][:10]:
         log(frame)
     with pytest.raises(RecordingError, match=r"can\.log: cannot be written: No such file"):
@@ -416,6 +419,22 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     assert "say --scenario" in capsys.readouterr().err
     assert main(["replay", log, "--scenario", "thesis"]) == 2
     assert "say --dut" in capsys.readouterr().err
+
+
+def test_log_that_is_played_or_of_an_earlier_run_is_not_lost_before_the_run(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = written(tmp_path / "can.log", traffic[1])
+    before = log.read_bytes()
+    (tmp_path / "can.blf").write_text("of an earlier run")
+    replay = ["replay", str(log), "--scenario", "thesis", "--out", str(tmp_path)]
+    for words in ([*replay, "--dut", "inproc"], [*replay, "--dut", DEVICE, "--can-log", "mf4"]):
+        assert main(words) == 2
+        assert "would overwrite the CAN log that is played; choose another folder" in capsys.readouterr().err
+    unreachable = ["--dut", DEVICE, "--wire-faults", "drop@1.0"]
+    assert main(["run", *unreachable, "--scenario", "thesis", "--out", str(tmp_path)]) == 2
+    assert log.read_bytes() == before
+    assert (tmp_path / "can.blf").read_text() == "of an earlier run"
 
 
 def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
