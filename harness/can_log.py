@@ -293,6 +293,7 @@ class CapturedRun:
     torn: set[int] = field(default_factory=set)
     """Samples among whose answers messages are not there."""
     faults: list[str] = field(default_factory=list)
+    """Why it cannot be judged."""
 
     @property
     def extent(self) -> int:
@@ -310,7 +311,10 @@ class _Listener:
         self._settings: dict[int, float] = {}
         self._identity: dict[str, int] = {}
         self._report_interval_n = 1
-        self._seqs: dict[bool, int] = {}
+        self._last: dict[bool, Message] = {}
+        """Of the harness and of the device."""
+        self._early_faults: list[str] = []
+        """What was wrong before the run."""
         self._torn = False
         self._undated: catalogue.Diagnosis | None = None
         self._at = {True: 0, False: 0}
@@ -329,17 +333,27 @@ class _Listener:
     def _is_next(self, message: Message) -> bool:
         """Not one that came before; notes what is lacking before it."""
         from_harness = LAYOUTS[type(message).__name__].from_harness
-        last = self._seqs.get(from_harness)
-        self._seqs[from_harness] = message.seq
+        last = self._last.get(from_harness)
+        self._last[from_harness] = message
         if last is None or isinstance(message, catalogue.Identify | catalogue.Hello):
             return True
-        step = (message.seq - last) % _SEQ
+        step = (message.seq - last.seq) % _SEQ
         if step == 0:
+            if type(message) is not type(last) or message != last:
+                who = "harness" if from_harness else "device"
+                self._doubt(f"{_brief(last)} and {_brief(message)} have the same number: two speak as the {who}")
             self.line["messages_repeated"] += 1
             return False
         self.line["messages_lacking"] += step - 1
         self._torn |= step > 1 and not from_harness
         return True
+
+    def _doubt(self, fault: str) -> None:
+        """Of what was said nobody knows what is true; once for each run is enough."""
+        is_over = not self.runs or bool(self.runs[-1].counters)
+        for faults in (*([self.runs[-1].faults] if self.runs else []), *([self._early_faults] if is_over else [])):
+            if not faults:
+                faults.append(fault)
 
     def _begun(self) -> CapturedRun:
         if not self.runs:
@@ -347,7 +361,12 @@ class _Listener:
         return self.runs[-1]
 
     def _begin(self, run: int | None) -> None:
-        self.runs.append(CapturedRun(run, self._report_interval_n, dict(self._settings), dict(self._identity)))
+        self.runs.append(
+            CapturedRun(
+                run, self._report_interval_n, dict(self._settings), dict(self._identity), faults=self._early_faults
+            )
+        )
+        self._early_faults = []
         self._at, self._torn, self._undated = {True: 0, False: 0}, False, None
 
     def _index(self, wire_index: int, *, of_sample: bool) -> int:
@@ -384,7 +403,9 @@ class _Listener:
     def _enter(self, wire_index: int, force: int, displacement: int, *, missing: bool) -> None:
         index = self._index(wire_index, of_sample=True)
         if index >= 0:
-            self.runs[-1].samples.setdefault(index, (force, displacement, missing))
+            sample = (force, displacement, missing)
+            if self.runs[-1].samples.setdefault(index, sample) != sample:
+                self._doubt(f"sample {index} was sent twice, and not the same")
 
     # ---- of the device
 
@@ -420,8 +441,10 @@ class _Listener:
             self.runs[-1].counters[known[message.counter]] = message.value
 
     def _estimate(self, message: catalogue.Estimate) -> None:
-        elements = self._begun().estimates.setdefault(self._index(message.sample_index, of_sample=False), {})
-        elements.setdefault(message.element, message.value)
+        index = self._index(message.sample_index, of_sample=False)
+        elements = self._begun().estimates.setdefault(index, {})
+        if elements.setdefault(message.element, message.value) != message.value:
+            self._doubt(f"element {message.element} of the estimate of sample {index} was said twice, and not the same")
 
     def _alarm(self, message: catalogue.Alarm) -> None:
         index = self._index(message.sample_index, of_sample=False)
@@ -445,7 +468,15 @@ class _Listener:
             run.torn.add(index)
             self._torn = False
         self._date_diagnosis(index)
-        run.steps.setdefault(index, (message.flags & _FLAGS, message.statistic))
+        step = (message.flags & _FLAGS, message.statistic)
+        if run.steps.setdefault(index, step) != step:
+            self._doubt(f"the step of sample {index} was said twice, and not the same")
+
+
+def _brief(message: Message) -> str:
+    """Its type, and its sample if it is about one."""
+    index = getattr(message, "sample_index", None)
+    return type(message).__name__ if index is None else f"{type(message).__name__} {index}"
 
 
 def _heard(listener: _Listener, frames: CapturedFrames) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import random
 import subprocess
@@ -250,6 +251,34 @@ def test_frame_that_was_not_captured_makes_the_run_inconclusive(
     assert int(again.lost.sum()) == (1 if name != "Stepped" else int(again.lost.sum()))
     assert 1 <= int(again.lost.sum()) <= 2
     assert judge(again).outcome == "inconclusive"
+
+
+@pytest.mark.parametrize("name", ["Configured", "Sample", "Estimate", "Stepped", "Alarm", "Status"])
+def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 0)
+    other = copy.copy(frames[at])
+    other.data = other.data[:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    twice = written(tmp_path / "twice.log", [*frames[:at], frames[at], *frames[at:]])
+    assert judge(captured(twice)).outcome == "passed"
+    verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]])))
+    assert verdict.outcome == "inconclusive"
+    assert "have the same number: two speak as the " in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("name", ["Sample", "Estimate", "Stepped"])
+def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 40)
+    other = copy.copy(frames[at])
+    other.data = bytes(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0].endswith("twice, and not the same")
 
 
 def test_gaps_up_to_the_limit_are_allowed(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
