@@ -105,7 +105,7 @@ def conclude(run: Run, arguments: argparse.Namespace) -> int:
 
     verdict = judge(run)
     if arguments.json:
-        show(json.dumps(_as_json(run, verdict, arguments.out)))
+        show(json.dumps(_as_json(run, verdict, arguments.out), allow_nan=False))
     else:
         show(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import random
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -279,6 +280,21 @@ def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].endswith("twice, and not the same")
+
+
+@pytest.mark.parametrize("name", ["Estimate", "Stepped", "Alarm"])
+def test_number_that_is_none_counts_as_damaged(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 0)
+    frames[at] = copy.copy(frames[at])
+    frames[at].data = frames[at].data[:-4] + struct.pack("<f", float("nan"))
+    again = captured(written(tmp_path / "can.log", frames))
+    assert np.isfinite(again.theta).all()
+    assert np.isfinite(again.statistic).all()
+    assert again.conditions.link_counters["frames_dropped"] == 1
+    assert judge(again).outcome == "inconclusive"
 
 
 def test_gaps_up_to_the_limit_are_allowed(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
