@@ -22,7 +22,7 @@ import numpy as np
 from harness import catalogue
 from harness.catalogue import CATALOGUE_HASH, LAYOUTS, RUN_SHIFT, RUNS, Message, SteppedFlag, unpack
 from harness.errors import ConfigurationError, RecordingError
-from harness.estimator_config import EstimatorConfig
+from harness.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from harness.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from harness.scenario import Scenario
 
@@ -568,7 +568,8 @@ def _why(listener: _Listener, frames: CapturedFrames) -> str:
 def _run(
     path: Path, said: CapturedRun, scenario: Scenario, rig: Rig, *, most_lost_n: int, line: Mapping[str, int], end: str
 ) -> Run:
-    estimator = EstimatorConfig.from_settings(said.settings, str(path))
+    most = min(MAX_PARAMETERS, said.identity.get("theta_max", MAX_PARAMETERS))
+    estimator = EstimatorConfig.from_settings(said.settings, str(path), most)
     rows = _Rows(said, estimator.parameters)
     n = said.extent
     lost = int(((rows.flags & LOST) != 0).sum())

@@ -18,7 +18,7 @@ import pytest
 
 from harness.bench import Bench
 from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
-from harness.catalogue import LAYOUTS, Hello, Key, pack
+from harness.catalogue import LAYOUTS, Hello, Key, pack, unpack
 from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
@@ -185,6 +185,41 @@ def test_settings_give_the_estimator_back() -> None:
 def test_setting_that_is_no_number_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="here: na = nan is no setting of an estimator"):
         EstimatorConfig.from_settings({Key.NA: float("nan")}, "here")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *((Key.NA, value) for value in (0.0, 9.0, 1.5, 1e30)),
+        *((Key.NB, value) for value in (-5.0, 0.0, 2e6)),
+        *((Key.NC, value) for value in (-1.0, 250.0)),
+        *((Key.TRIGGER, value) for value in (-1.0, 99.0)),
+        *((Key.FORGETTING, value) for value in (-1.0, 0.0, 1.5)),
+        *((key, -1.0) for key in (Key.P0, Key.NOISE_VARIANCE, Key.EDGE_CODES, Key.WARM_UP_N, Key.NK)),
+        (Key.OFFSET, 7.0),
+        (Key.RESET, 9.0),
+        (Key.CODE_LOW, 3e38),
+        (Key.C1, 1e38),
+    ],
+)
+def test_setting_that_no_device_can_have_is_refused(key: Key, value: float) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^here: {key.name.lower()} = .* is no setting of an estimator$"):
+        EstimatorConfig.from_settings({key: value}, "here")
+
+
+def test_parameters_for_which_the_device_has_no_room_are_refused(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    with pytest.raises(ConfigurationError, match="^here: 19 parameters, of at most 17$"):
+        EstimatorConfig.from_settings({Key.NB: 16.0}, "here")
+    frames = list(traffic[1])
+    at = nth(frames, "Hello", 0)
+    hello = unpack(bytes((frames[at].arbitration_id,)) + bytes(frames[at].data))
+    assert isinstance(hello, Hello)
+    frames[at] = copy.copy(frames[at])
+    frames[at].data = bytearray(pack(hello._replace(theta_max=5))[1:])
+    with pytest.raises(ConfigurationError, match=r"can\.log: 6 parameters, of at most 5$"):
+        captured(written(tmp_path / "can.log", frames))
 
 
 def test_foreign_frames_and_times_of_others_change_nothing(
