@@ -7,9 +7,13 @@ lacks is as if it had been lost on the way to the device; from the numbers of th
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import gc
 import io
 import itertools
+import struct
+import sys
 import typing
 from collections import Counter as Tally
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 import numpy as np
 
 from harness import catalogue
-from harness.catalogue import CATALOGUE_HASH, LAYOUTS, RUN_SHIFT, RUNS, Message, SteppedFlag, unpack
+from harness.catalogue import CATALOGUE_HASH, LAYOUTS, RUN_SHIFT, RUNS, Message, SteppedFlag, pack, unpack
 from harness.errors import ConfigurationError, RecordingError
 from harness.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from harness.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
@@ -184,20 +188,39 @@ class CapturedFrames:
         # Opened here, since readers that fail leave the file open.
         with self.path.open("rb") as raw:
             file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
-            try:
-                for frame in readers[suffix](file):
-                    yield frame
-                    n += 1
-            except Exception as error:  # noqa: BLE001 - as above
-                said = " ".join(str(error).split()) or type(error).__name__
-                self.end = f"{self.path} is damaged after {n} frames: {said}"
+            with _asammdf_silenced():
+                try:
+                    for frame in readers[suffix](file):
+                        yield frame
+                        n += 1
+                except Exception as error:  # noqa: BLE001 - as above
+                    said = " ".join(str(error).split()) or type(error).__name__
+                    self.end = f"{self.path} is damaged after {n} frames: {said}"
+                if self.end:
+                    gc.collect()
+
+
+@contextlib.contextmanager
+def _asammdf_silenced() -> Iterator[None]:
+    """Of a file that it could not open its destructor complains, with a traceback and when the garbage is collected."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if not str(getattr(unraisable.object, "__module__", "")).startswith("asammdf"):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 class Dictionary:
     """The messages as they are on the bus: those of this build, or those of a DBC that has them elsewhere."""
 
     def __init__(self, dbc: Path | None = None) -> None:
-        """:raises ConfigurationError: ``dbc`` is none, or lacks a signal of a message that it has."""
+        """:raises ConfigurationError: ``dbc`` is none, or a message that it has lacks a signal or is multiplexed."""
         self.dbc = dbc
         self._messages = {} if dbc is None else _messages(dbc)
 
@@ -241,6 +264,8 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
         lacking = set(_signals(message.name)) - {signal.name for signal in message.signals}
         if lacking:
             raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(lacking))}")
+        if message.is_multiplexed():
+            raise ConfigurationError(f"--dbc {dbc}: message {message.name} is multiplexed")
     return {(message.frame_id, message.is_extended_frame): message for message in known}
 
 
@@ -255,17 +280,22 @@ def _signal(name: str) -> str:
 
 
 def _translated(known: Any, data: bytes) -> Message | None:
-    """By the names of message and signals; None: of the wrong length."""
+    """By the names of message and signals; None: of the wrong length, or with a value that ours cannot have."""
+    from cantools.database import DecodeError
+
     layout = LAYOUTS[known.name]
     if len(data) != known.length:
         return None
-    said = known.decode(data, decode_choices=False, scaling=False)
-    flags = sum(int(said[_signal(bit)]) << shift for bit, (shift, _) in layout.bits.items())
-    values = [flags if name == "flags" else said[_signal(name)] for name in layout.fields]
-    if known.name == "SampleBlock":
-        values = [*values[:4], tuple(values[4:])]
-    message: Message = getattr(catalogue, known.name)(*values)
-    return message
+    try:
+        said = known.decode(data, decode_choices=False, scaling=False)
+        flags = sum(int(said[_signal(bit)]) << shift for bit, (shift, _) in layout.bits.items())
+        values = [flags if name == "flags" else said[_signal(name)] for name in layout.fields]
+        if known.name == "SampleBlock":
+            values = [*values[:4], tuple(values[4:])]
+        message: Message = getattr(catalogue, known.name)(*values)
+        return unpack(pack(message))
+    except (DecodeError, struct.error, ArithmeticError, ValueError):
+        return None
 
 
 # -------------------------------------------------------------------------------------------------- what was said

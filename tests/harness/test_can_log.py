@@ -274,6 +274,31 @@ def test_log_with_identifiers_of_another_dbc_is_understood(
         captured(log)
 
 
+@pytest.mark.parametrize("force", [100_000, -5])
+def test_value_that_our_message_cannot_have_counts_as_dropped(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], force: int
+) -> None:
+    """A bench whose codes have 32 bits and a sign."""
+    dbc = tmp_path / "bench.dbc"
+    dbc.write_text(
+        DBC.read_text()
+        .replace("BO_ 24 Sample: 8", "BO_ 24 Sample: 12")
+        .replace(" SG_ Force : 32|16@1+", " SG_ Force : 32|32@1-")
+        .replace(" SG_ Displacement : 48|16@1+", " SG_ Displacement : 64|32@1+")
+    )
+    frames = [copy.copy(frame) for frame in traffic[1]]
+    for frame in frames:
+        if frame.arbitration_id == identifier("Sample"):
+            codes = struct.unpack("<HH", frame.data[4:8])
+            frame.data, frame.dlc, frame.is_fd = frame.data[:4] + struct.pack("<iI", *codes), 12, True
+    assert judge(captured(written(tmp_path / "whole.log", frames), dbc=dbc)).outcome == "passed"
+    at = nth(frames, "Sample", 40)
+    frames[at].data = frames[at].data[:4] + struct.pack("<i", force) + frames[at].data[8:]
+    again = captured(written(tmp_path / "can.log", frames), dbc=dbc)
+    assert again.conditions.link_counters["frames_dropped"] == 1
+    assert np.flatnonzero(again.lost).tolist() == [40]
+
+
 # -------------------------------------------------------------------------------------------------------- what lacks
 
 
@@ -311,7 +336,9 @@ def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
     frames = list(traffic[1])
     at = nth(frames, name, 40)
     other = copy.copy(frames[at])
-    other.data = bytes(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    other.data = (
+        bytearray(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    )
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].endswith("twice, and not the same")
@@ -375,7 +402,7 @@ def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tupl
     assert again.conditions.link_counters["lines_damaged"] == len(reader.damaged)
 
 
-@pytest.mark.filterwarnings("ignore:.*MDF4.__del__")  # asammdf, of a file that it could not open
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")  # asammdf has a destructor that fails
 @pytest.mark.parametrize("suffix", ["blf", "mf4", "asc"])
 def test_file_cut_anywhere_is_refused_or_inconclusive(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], suffix: str
@@ -387,6 +414,20 @@ def test_file_cut_anywhere_is_refused_or_inconclusive(
         said = outcome_or_error(cut)
         assert said == "inconclusive" or said.startswith(f"{cut}: holds no run of a device"), part
         assert "\n" not in said
+
+
+def test_measurement_that_is_damaged_is_refused_in_one_line(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
+    whole = written(tmp_path / "whole.mf4", traffic[1]).read_bytes()
+    cut = tmp_path / "cut.mf4"
+    cut.write_bytes(whole[:3000])
+    words = ["-m", "harness.cli", "judge", str(cut), "--scenario", "thesis", "--out", str(tmp_path)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.decode().startswith(f"analogrig: {cut}: holds no run of a device: {cut} is damaged after 0 ")
+    assert done.stderr.count(b"\n") == 1
 
 
 def outcome_or_error(path: Path) -> str:
@@ -443,6 +484,10 @@ def test_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, t
         (
             'VERSION ""\nBU_: A\nBO_ 24 Sample: 8 A\n SG_ Seq : 0|8@1+ (1,0) [0|0] "" A\n',
             "Sample lacks Displacement, F",
+        ),
+        (
+            DBC.read_text().replace(" SG_ Value :", " SG_ Value m1 :").replace(" SG_ Element :", " SG_ Element M :"),
+            "Estimate is multiplexed",
         ),
     ],
 )
