@@ -44,6 +44,8 @@ _INDICES = 1 << 16
 """Sequence numbers and indices of samples are modulo these in a message."""
 _FLAGS = sum(SteppedFlag)
 _MOST_NAMED = 3
+_COUNTERS = ("updated", "refused", "alarms", "samples_lost")
+"""Of the device; by these it is known whether all that it did was heard."""
 
 
 # --------------------------------------------------------------------------------------------------------- writing
@@ -606,6 +608,9 @@ def _run(
     counters = dict(said.counters)
     if counters.get("alarms", len(said.alarms)) != len(said.alarms):
         said.faults.append(f"the device raised {counters['alarms']} alarms, {path} holds {len(said.alarms)}")
+    lacking = [name for name in _COUNTERS if name not in counters]
+    if lacking:
+        said.faults.append(f"the device's counters {', '.join(lacking)} after the run are not in {path}")
     if lost > counters.get("samples_lost", lost):  # it has seen what the capture has not
         counters = {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
     performance = rig.perform(scenario, 0)

@@ -377,7 +377,19 @@ def test_capture_that_ended_early_is_inconclusive(tmp_path: Path, traffic: tuple
     frames = traffic[1]
     verdict = judge(captured(written(tmp_path / "can.log", frames[: nth(frames, "Stepped", 299) + 1])))
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons == ("the run ended after 300 of 600 samples",)
+    assert "the run ended after 300 of 600 samples" in verdict.reasons
+
+
+def test_capture_without_the_counters_of_the_device_is_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    frames = traffic[1]
+    silent = [frame for frame in frames if frame.arbitration_id != identifier("Status")]
+    for heard in (silent, frames[: nth(frames, "Stepped", -1) + 1]):
+        verdict = judge(captured(written(tmp_path / "can.log", heard)))
+        assert verdict.outcome == "inconclusive"
+        (reason,) = verdict.reasons
+        assert reason.startswith("the device's counters updated, refused, alarms, samples_lost after the run are not")
 
 
 def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
