@@ -574,6 +574,15 @@ def test_log_that_is_played_or_of_an_earlier_run_is_not_lost_before_the_run(
     assert (tmp_path / "can.blf").read_text() == "of an earlier run"
 
 
+@pytest.mark.parametrize("option", ["--most-lost", "--run"])
+@pytest.mark.parametrize("value", ["-1", "1.5", "many", "9" * 30])
+def test_number_of_samples_or_of_a_run_is_a_count(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["judge", "can.log", "--scenario", "thesis", f"{option}={value}"])
+    assert end.value.code == 2
+    assert f"argument {option}: must be a whole number from 0" in capsys.readouterr().err
+
+
 def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
     assert main(["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
