@@ -632,6 +632,7 @@ def _run(
                 "report_interval_n": said.report_interval_n,
                 "most_lost_n": most_lost_n,
                 "estimator": estimator.as_table(),
+                "assumed_n": sum(key not in said.settings for key, _ in estimator.settings()),
                 "identity": dict(said.identity),
             },
             link=str(path),

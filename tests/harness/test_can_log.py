@@ -172,6 +172,16 @@ def singled(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: float(np.float32(value)) if isinstance(value, float) else value for key, value in table.items()}
 
 
+def test_capture_without_the_handshake_has_a_note(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    frames = traffic[1]
+    whole = captured(written(tmp_path / "whole.log", frames))
+    assert "not in the log" not in summary(whole, judge(whole))
+    later = captured(written(tmp_path / "can.log", frames[nth(frames, "Sample", 0) :]))
+    n = len(list(EstimatorConfig().settings()))
+    said = f"note: {n} settings of the device are not in the log and were taken to be as by default"
+    assert said in summary(later, judge(later))
+
+
 def test_settings_give_the_estimator_back() -> None:
     for estimator in (
         EstimatorConfig(na=1, nb=1, c=(0.5,), trigger="none", offset=False),
