@@ -71,6 +71,11 @@ class CanLog:
         self._writer: _Writer | None = None
         self._failure: Exception | None = None
 
+    @property
+    def has_heard(self) -> bool:
+        """Whether a frame has passed before the beginning; after the handshake with a device on a CAN bus some have."""
+        return bool(self._held)
+
     def begin(self) -> None:
         """The device has answered: what an earlier run has left in the file may go, what was said so far is written."""
         held, self._held = self._held or [], None

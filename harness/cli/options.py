@@ -104,8 +104,8 @@ def add_can_log(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--can-log",
         choices=("log", "blf", "asc", "mf4", "none"),
-        default="log",
-        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz",
+        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz (default: log"
+        " on a CAN bus)",
     )
 
 

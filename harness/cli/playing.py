@@ -44,7 +44,7 @@ def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
 
     :raises ConfigurationError: the run would overwrite the log that is being played.
     """
-    from harness.can_log import CanLog
+    from harness.can_log import WRITTEN, CanLog
     from harness.errors import ConfigurationError
     from harness.rig import RecordingRig
 
@@ -52,7 +52,8 @@ def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
         raise ConfigurationError(
             f"--out {arguments.out}: would overwrite the CAN log that is played; choose another folder"
         )
-    return None if arguments.can_log == "none" else CanLog(arguments.out / f"{CAN_LOG}.{arguments.can_log}")
+    asked = arguments.can_log or WRITTEN[0]
+    return None if asked == "none" else CanLog(arguments.out / f"{CAN_LOG}.{asked}")
 
 
 def _can_logs(out: Path) -> list[Path]:
@@ -81,9 +82,12 @@ def _begin(log: CanLog | None, out: Path) -> None:
 def play(
     rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace, log: CanLog | None = None
 ) -> int:
+    """:raises ConfigurationError: a log was asked for of a device that is on no CAN bus."""
     from harness.bench import Bench
-    from harness.errors import RecordingError
+    from harness.errors import ConfigurationError, RecordingError
 
+    if arguments.can_log is not None and log is not None and not log.has_heard:
+        raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
     _begin(log, arguments.out)
     run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
     status = conclude(run, arguments)

@@ -594,9 +594,14 @@ def test_number_of_samples_or_of_a_run_is_a_count(option: str, value: str, capsy
     assert f"argument {option}: must be a whole number from 0" in capsys.readouterr().err
 
 
-def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
-    assert main(["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
+def test_serial_run_leaves_no_can_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]
+    assert main([*words, "--can-log", "blf"]) == 2
+    assert "--can-log blf: device inproc is not on a CAN bus" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    for more in ([], ["--can-log", "none"]):
+        assert main([*words, *more]) == 0
+        assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
 
 
 def test_replay_of_a_log_plays_the_samples_that_it_has(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
