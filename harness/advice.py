@@ -27,6 +27,7 @@ _SAMPLES_LOOKED_AT = 4000
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences, the gravest first; empty if all is well."""
     return (
+        *_assumed(run),
         *_overloads(verdict),
         *_noise(run),
         *_edges(run),
@@ -35,6 +36,15 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_unseen(verdict),
         *_unidentified(verdict),
     )
+
+
+def _assumed(run: Run) -> Iterator[str]:
+    assumed_n = run.conditions.dut.get("assumed_n", 0)
+    if assumed_n:
+        yield (
+            f"{assumed_n} settings of the device are not in the log and were taken to be as by default:"
+            " if they were not, bounds and estimates are wrong; capture from the handshake on"
+        )
 
 
 def _overloads(verdict: Verdict) -> Iterator[str]:

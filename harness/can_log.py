@@ -7,9 +7,13 @@ lacks is as if it had been lost on the way to the device; from the numbers of th
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import gc
 import io
 import itertools
+import struct
+import sys
 import typing
 from collections import Counter as Tally
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,9 +24,9 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 import numpy as np
 
 from harness import catalogue
-from harness.catalogue import CATALOGUE_HASH, LAYOUTS, RUN_SHIFT, RUNS, Message, SteppedFlag, unpack
+from harness.catalogue import CATALOGUE_HASH, LAYOUTS, RUN_SHIFT, RUNS, Message, SteppedFlag, pack, unpack
 from harness.errors import ConfigurationError, RecordingError
-from harness.estimator_config import EstimatorConfig
+from harness.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from harness.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from harness.scenario import Scenario
 
@@ -40,6 +44,8 @@ _INDICES = 1 << 16
 """Sequence numbers and indices of samples are modulo these in a message."""
 _FLAGS = sum(SteppedFlag)
 _MOST_NAMED = 3
+_COUNTERS = ("updated", "refused", "alarms", "samples_lost")
+"""Of the device; by these it is known whether all that it did was heard."""
 
 
 # --------------------------------------------------------------------------------------------------------- writing
@@ -52,25 +58,34 @@ class _Writer(Protocol):
 
 
 class CanLog:
-    """A listener to a link that writes each frame to a file; there is none before the first frame.
+    """A listener to a link that writes each frame to a file; there is none before the first frame after ``begin``.
 
     A disk that is full does not end the run: ``close`` tells.
     """
 
     def __init__(self, path: Path) -> None:
-        """The suffix of ``path`` is one of WRITTEN. What an earlier run has left there goes.
-
-        :raises RecordingError: it cannot go.
-        """
+        """The suffix of ``path`` is one of WRITTEN."""
         self.path = path
+        self._held: list[can.Message] | None = []
+        """What passed before the beginning."""
         self._writer: _Writer | None = None
         self._failure: Exception | None = None
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be removed: {error.strerror or error}") from error
+
+    @property
+    def has_heard(self) -> bool:
+        """Whether a frame has passed before the beginning; after the handshake with a device on a CAN bus some have."""
+        return bool(self._held)
+
+    def begin(self) -> None:
+        """The device has answered: what an earlier run has left in the file may go, what was said so far is written."""
+        held, self._held = self._held or [], None
+        for frame in held:
+            self(frame)
 
     def __call__(self, frame: can.Message) -> None:
+        if self._held is not None:
+            self._held.append(frame)
+            return
         if self._failure is not None:
             return
         try:
@@ -180,20 +195,39 @@ class CapturedFrames:
         # Opened here, since readers that fail leave the file open.
         with self.path.open("rb") as raw:
             file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
-            try:
-                for frame in readers[suffix](file):
-                    yield frame
-                    n += 1
-            except Exception as error:  # noqa: BLE001 - as above
-                said = " ".join(str(error).split()) or type(error).__name__
-                self.end = f"{self.path} is damaged after {n} frames: {said}"
+            with _asammdf_silenced():
+                try:
+                    for frame in readers[suffix](file):
+                        yield frame
+                        n += 1
+                except Exception as error:  # noqa: BLE001 - as above
+                    said = " ".join(str(error).split()) or type(error).__name__
+                    self.end = f"{self.path} is damaged after {n} frames: {said}"
+                if self.end:
+                    gc.collect()
+
+
+@contextlib.contextmanager
+def _asammdf_silenced() -> Iterator[None]:
+    """Of a file that it could not open its destructor complains, with a traceback and when the garbage is collected."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if not str(getattr(unraisable.object, "__module__", "")).startswith("asammdf"):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 class Dictionary:
     """The messages as they are on the bus: those of this build, or those of a DBC that has them elsewhere."""
 
     def __init__(self, dbc: Path | None = None) -> None:
-        """:raises ConfigurationError: ``dbc`` is none, or lacks a signal of a message that it has."""
+        """:raises ConfigurationError: ``dbc`` is none, or a message that it has lacks a signal or is multiplexed."""
         self.dbc = dbc
         self._messages = {} if dbc is None else _messages(dbc)
 
@@ -237,6 +271,8 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
         lacking = set(_signals(message.name)) - {signal.name for signal in message.signals}
         if lacking:
             raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(lacking))}")
+        if message.is_multiplexed():
+            raise ConfigurationError(f"--dbc {dbc}: message {message.name} is multiplexed")
     return {(message.frame_id, message.is_extended_frame): message for message in known}
 
 
@@ -251,17 +287,22 @@ def _signal(name: str) -> str:
 
 
 def _translated(known: Any, data: bytes) -> Message | None:
-    """By the names of message and signals; None: of the wrong length."""
+    """By the names of message and signals; None: of the wrong length, or with a value that ours cannot have."""
+    from cantools.database import DecodeError
+
     layout = LAYOUTS[known.name]
     if len(data) != known.length:
         return None
-    said = known.decode(data, decode_choices=False, scaling=False)
-    flags = sum(int(said[_signal(bit)]) << shift for bit, (shift, _) in layout.bits.items())
-    values = [flags if name == "flags" else said[_signal(name)] for name in layout.fields]
-    if known.name == "SampleBlock":
-        values = [*values[:4], tuple(values[4:])]
-    message: Message = getattr(catalogue, known.name)(*values)
-    return message
+    try:
+        said = known.decode(data, decode_choices=False, scaling=False)
+        flags = sum(int(said[_signal(bit)]) << shift for bit, (shift, _) in layout.bits.items())
+        values = [flags if name == "flags" else said[_signal(name)] for name in layout.fields]
+        if known.name == "SampleBlock":
+            values = [*values[:4], tuple(values[4:])]
+        message: Message = getattr(catalogue, known.name)(*values)
+        return unpack(pack(message))
+    except (DecodeError, struct.error, ArithmeticError, ValueError):
+        return None
 
 
 # -------------------------------------------------------------------------------------------------- what was said
@@ -289,6 +330,7 @@ class CapturedRun:
     torn: set[int] = field(default_factory=set)
     """Samples among whose answers messages are not there."""
     faults: list[str] = field(default_factory=list)
+    """Why it cannot be judged."""
 
     @property
     def extent(self) -> int:
@@ -306,7 +348,10 @@ class _Listener:
         self._settings: dict[int, float] = {}
         self._identity: dict[str, int] = {}
         self._report_interval_n = 1
-        self._seqs: dict[bool, int] = {}
+        self._last: dict[bool, Message] = {}
+        """Of the harness and of the device."""
+        self._early_faults: list[str] = []
+        """What was wrong before the run."""
         self._torn = False
         self._undated: catalogue.Diagnosis | None = None
         self._at = {True: 0, False: 0}
@@ -325,17 +370,27 @@ class _Listener:
     def _is_next(self, message: Message) -> bool:
         """Not one that came before; notes what is lacking before it."""
         from_harness = LAYOUTS[type(message).__name__].from_harness
-        last = self._seqs.get(from_harness)
-        self._seqs[from_harness] = message.seq
+        last = self._last.get(from_harness)
+        self._last[from_harness] = message
         if last is None or isinstance(message, catalogue.Identify | catalogue.Hello):
             return True
-        step = (message.seq - last) % _SEQ
+        step = (message.seq - last.seq) % _SEQ
         if step == 0:
+            if type(message) is not type(last) or message != last:
+                who = "harness" if from_harness else "device"
+                self._doubt(f"{_brief(last)} and {_brief(message)} have the same number: two speak as the {who}")
             self.line["messages_repeated"] += 1
             return False
         self.line["messages_lacking"] += step - 1
         self._torn |= step > 1 and not from_harness
         return True
+
+    def _doubt(self, fault: str) -> None:
+        """Of what was said nobody knows what is true; once for each run is enough."""
+        is_over = not self.runs or bool(self.runs[-1].counters)
+        for faults in (*([self.runs[-1].faults] if self.runs else []), *([self._early_faults] if is_over else [])):
+            if not faults:
+                faults.append(fault)
 
     def _begun(self) -> CapturedRun:
         if not self.runs:
@@ -343,7 +398,12 @@ class _Listener:
         return self.runs[-1]
 
     def _begin(self, run: int | None) -> None:
-        self.runs.append(CapturedRun(run, self._report_interval_n, dict(self._settings), dict(self._identity)))
+        self.runs.append(
+            CapturedRun(
+                run, self._report_interval_n, dict(self._settings), dict(self._identity), faults=self._early_faults
+            )
+        )
+        self._early_faults = []
         self._at, self._torn, self._undated = {True: 0, False: 0}, False, None
 
     def _index(self, wire_index: int, *, of_sample: bool) -> int:
@@ -380,7 +440,9 @@ class _Listener:
     def _enter(self, wire_index: int, force: int, displacement: int, *, missing: bool) -> None:
         index = self._index(wire_index, of_sample=True)
         if index >= 0:
-            self.runs[-1].samples.setdefault(index, (force, displacement, missing))
+            sample = (force, displacement, missing)
+            if self.runs[-1].samples.setdefault(index, sample) != sample:
+                self._doubt(f"sample {index} was sent twice, and not the same")
 
     # ---- of the device
 
@@ -416,8 +478,10 @@ class _Listener:
             self.runs[-1].counters[known[message.counter]] = message.value
 
     def _estimate(self, message: catalogue.Estimate) -> None:
-        elements = self._begun().estimates.setdefault(self._index(message.sample_index, of_sample=False), {})
-        elements.setdefault(message.element, message.value)
+        index = self._index(message.sample_index, of_sample=False)
+        elements = self._begun().estimates.setdefault(index, {})
+        if elements.setdefault(message.element, message.value) != message.value:
+            self._doubt(f"element {message.element} of the estimate of sample {index} was said twice, and not the same")
 
     def _alarm(self, message: catalogue.Alarm) -> None:
         index = self._index(message.sample_index, of_sample=False)
@@ -441,7 +505,15 @@ class _Listener:
             run.torn.add(index)
             self._torn = False
         self._date_diagnosis(index)
-        run.steps.setdefault(index, (message.flags & _FLAGS, message.statistic))
+        step = (message.flags & _FLAGS, message.statistic)
+        if run.steps.setdefault(index, step) != step:
+            self._doubt(f"the step of sample {index} was said twice, and not the same")
+
+
+def _brief(message: Message) -> str:
+    """Its type, and its sample if it is about one."""
+    index = getattr(message, "sample_index", None)
+    return type(message).__name__ if index is None else f"{type(message).__name__} {index}"
 
 
 def _heard(listener: _Listener, frames: CapturedFrames) -> None:
@@ -533,13 +605,17 @@ def _why(listener: _Listener, frames: CapturedFrames) -> str:
 def _run(
     path: Path, said: CapturedRun, scenario: Scenario, rig: Rig, *, most_lost_n: int, line: Mapping[str, int], end: str
 ) -> Run:
-    estimator = EstimatorConfig.from_settings(said.settings, str(path))
+    most = min(MAX_PARAMETERS, said.identity.get("theta_max", MAX_PARAMETERS))
+    estimator = EstimatorConfig.from_settings(said.settings, str(path), most)
     rows = _Rows(said, estimator.parameters)
     n = said.extent
     lost = int(((rows.flags & LOST) != 0).sum())
     counters = dict(said.counters)
     if counters.get("alarms", len(said.alarms)) != len(said.alarms):
         said.faults.append(f"the device raised {counters['alarms']} alarms, {path} holds {len(said.alarms)}")
+    lacking = [name for name in _COUNTERS if name not in counters]
+    if lacking:
+        said.faults.append(f"the device's counters {', '.join(lacking)} after the run are not in {path}")
     if lost > counters.get("samples_lost", lost):  # it has seen what the capture has not
         counters = {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
     performance = rig.perform(scenario, 0)
@@ -561,6 +637,7 @@ def _run(
                 "report_interval_n": said.report_interval_n,
                 "most_lost_n": most_lost_n,
                 "estimator": estimator.as_table(),
+                "assumed_n": sum(key not in said.settings for key, _ in estimator.settings()),
                 "identity": dict(said.identity),
             },
             link=str(path),

@@ -7,6 +7,7 @@ the generated tables. A *packet* is what any link carries: the byte of the ident
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 from struct import Struct
 from typing import Any, NamedTuple, TypeAlias
 
@@ -229,6 +230,8 @@ class _Packing(NamedTuple):
     pack: Callable[..., bytes]
     unpack: Callable[[bytes, int], tuple[Any, ...]]
     make: Callable[[tuple[Any, ...]], Message]
+    has_float: bool = False
+    """It is the last field."""
 
 
 def pack(message: Message) -> bytes:
@@ -241,11 +244,13 @@ def pack(message: Message) -> bytes:
 
 
 def unpack(packet: bytes) -> Message | None:
-    """The message in a packet; None if the catalogue has no such message of that length."""
+    """The message in a packet; None if the catalogue has no such message of that length, or of no such numbers: what no
+    device computes is damaged."""
     packing = _BY_IDENTIFIER.get(packet[0]) if packet else None
     if packing is None or len(packet) != packing.length:
         return None
-    return packing.make(packing.unpack(packet, 1))
+    values = packing.unpack(packet, 1)
+    return packing.make(values) if not packing.has_float or isfinite(values[-1]) else None
 
 
 def _packing(message_type: Any) -> _Packing:
@@ -257,7 +262,12 @@ def _packing(message_type: Any) -> _Packing:
     if message_type._fields != layout.fields:
         raise TypeError(f"{message_type.__name__} has the fields {message_type._fields}, the catalogue {layout.fields}")
     struct = Struct(layout.format)
-    return _Packing(bytes([layout.id]), 1 + layout.length, struct.pack, struct.unpack_from, message_type._make)
+    has_float = "f" in layout.format
+    if has_float and not layout.format.endswith("f"):
+        raise TypeError(f"{message_type.__name__} has a float that is not its last field")
+    return _Packing(
+        bytes([layout.id]), 1 + layout.length, struct.pack, struct.unpack_from, message_type._make, has_float
+    )
 
 
 def _block_packing(layout: Layout) -> _Packing:

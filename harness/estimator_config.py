@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from harness import config
-from harness.catalogue import Key, Trigger
+from harness.catalogue import Element, Key, Trigger
 from harness.errors import ConfigurationError
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
@@ -36,8 +36,45 @@ DEFAULT_ARL0 = 1e5
 MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
 """The catalogue has keys for so many coefficients of C; a build of the device may take fewer."""
 
+MAX_PARAMETERS = sum(element.name.startswith("THETA_") for element in Element)
+"""The catalogue has names for so many elements of theta; a build of the device may have fewer."""
+
 MOST_CEILING = 1e9
 """As EST_CEILING_LIMIT in est.h."""
+
+_VARIANCES, _CODES, _U16 = (1e-9, 1e9), (-1e6, 1e6), (0, 65535)
+_SWITCH = (0, 1)
+
+_IN_RANGE: Mapping[str, tuple[float, float]] = {
+    "na": (1, MAX_NA),
+    "nb": (1, MAX_PARAMETERS),
+    "nk": (0, 255),
+    "nc": (0, MAX_PARAMETERS),
+    "offset": _SWITCH,
+    "noise_estimated": _SWITCH,
+    "refresh_n": _U16,
+    "stuck_n": (0, 255),
+    "idle_n": _U16,
+    "forgetting": (0.5, 1.0),
+    "random_walk": (0.0, _VARIANCES[1]),
+    "p0": _VARIANCES,
+    "p0_offset": _VARIANCES,
+    "noise_variance": _VARIANCES,
+    "edge_codes": (0.0, _CODES[1]),
+    "code_low": _CODES,
+    "code_high": _CODES,
+    "isolation": _SWITCH,
+    "hold_off_n": _U16,
+    "warm_up_n": _U16,
+    "absolute": _SWITCH,
+    "trigger": (0, len(Trigger) - 1),
+    "edge_instants": (0, len(_EDGE_INSTANTS) - 1),
+    "reset": (0, len(_RESETS) - 1),
+}
+"""What est_config_valid() lets through at most, whatever the build."""
+_NOT_WHOLE = frozenset(
+    {"forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"}
+)
 
 
 @dataclass(frozen=True)
@@ -145,15 +182,19 @@ class EstimatorConfig:
         yield Key.RESET, float(_RESETS.index(self.reset))
 
     @classmethod
-    def from_settings(cls, settings: Mapping[int, float], where: str) -> Self:
+    def from_settings(cls, settings: Mapping[int, float], where: str, most_parameters: int = MAX_PARAMETERS) -> Self:
         """What a device says that it has, by its keys; what it has not said is as by default.
 
+        :param most_parameters: it has room for no more elements of theta.
         :raises ConfigurationError: no device can have that; ``where`` leads.
         """
         said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
         for key, value in said.items():
-            if not math.isfinite(value):
-                raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
+            name = key.name.lower()
+            low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
+            is_whole = name not in _IN_RANGE or name in _NOT_WHOLE or value.is_integer()
+            if not low <= value <= high or not is_whole:
+                raise ConfigurationError(f"{where}: {name} = {value:g} is no setting of an estimator")
         table: dict[str, Any] = {}
         kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
         for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
@@ -166,13 +207,16 @@ class EstimatorConfig:
             Key.RESET: _RESETS,
         }
         for key, names in words.items():
-            if key in said and 0 <= said[key] < len(names):
+            if key in said:
                 table[key.name.lower()] = names[int(said[key])]
         if table.get("trigger") == "none":
             table.pop("ceiling", None)
         if Key.C1 in said:
             table["c"] = [said.get(Key[f"C{i + 1}"], 0.0) for i in range(int(table.get("na", cls.na)))]
-        return config.build(cls, table, where)
+        made = config.build(cls, table, where)
+        if made.parameters > most_parameters:
+            raise ConfigurationError(f"{where}: {made.parameters} parameters, of at most {most_parameters}")
+        return made
 
     def as_table(self) -> dict[str, Any]:
         """In plain values, from which the same can be made; the ceiling instead of arl0."""

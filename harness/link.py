@@ -89,10 +89,11 @@ class FramedLink:
         self.line = line
         self._decoder = frame.FrameDecoder()
         self._messages: deque[Message] = deque()
+        self._no_messages_n = 0
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return {"frames_dropped": self._decoder.dropped}
+        return {"frames_dropped": self._decoder.dropped + self._no_messages_n}
 
     def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - there is nothing to tell it
         return False
@@ -122,6 +123,7 @@ class FramedLink:
             message = unpack(packet)
             if message is not None:
                 self._messages.append(message)
+            self._no_messages_n += message is None
 
     def _time(self, passed: bytes) -> None:
         """One direction after the other."""

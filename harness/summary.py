@@ -8,7 +8,7 @@ from harness.advice import advice
 from harness.bus_load import BusLoad, load_of
 from harness.plant import UNITS
 from harness.run import Run
-from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
+from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
 
 SHOWN_ALARMS = 10
 
@@ -33,7 +33,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         ]
     lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
     if verdict.missing_n:
-        lines += [f"  clipped and missing for the device: {verdict.missing_n} samples"]
+        lines += [f"  {missing_text(run)}: {verdict.missing_n} samples"]
     if verdict.overloads:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
     if seen := line_text(conditions.link_counters):

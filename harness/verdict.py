@@ -148,6 +148,16 @@ class Verdict:
         return self.outcome != "inconclusive"
 
 
+def is_captured(run: Run) -> bool:
+    """Whether it was read from a CAN log, whose gaps say nothing of what the device had."""
+    return bool(run.conditions.dut.get("kind") == "log")
+
+
+def missing_text(run: Run) -> str:
+    """What the samples are that count as missing: ``clipped and missing for the device``."""
+    return "missing for the device or not in the log" if is_captured(run) else "clipped and missing for the device"
+
+
 def judge(run: Run) -> Verdict:
     """Judge ``run`` by the expectations of the scenario it carries."""
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
@@ -294,7 +304,7 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     missing = int(run.missing.sum())
     if run.samples and missing > expect.max_missing_fraction * run.samples:
         reasons.append(
-            f"{missing} of {run.samples} samples were clipped and missing for the device,"
+            f"{missing} of {run.samples} samples were {missing_text(run)},"
             f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
         )
     return reasons
@@ -303,7 +313,8 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
 def _losses(run: Run) -> list[str]:
     """Samples that never came to the device: more than its description allows, or not those that the harness knows."""
     most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
-    reasons = [f"{lost} samples were lost on the way to the device, more than {most}"] if lost > most else []
+    where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
+    reasons = [f"{lost} samples were {where}, more than {most}"] if lost > most else []
     heard = np.flatnonzero(~run.lost)
     known = int(run.lost[: heard[-1]].sum()) if len(heard) else 0  # of those after the last one heard it cannot know
     missed = run.conditions.counters.get("samples_lost", known)

@@ -50,6 +50,12 @@ def seed(text: str) -> int:
     raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
 
 
+def count(text: str) -> int:
+    if text.isascii() and text.isdecimal() and len(text) <= 9:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 999999999, not {text[:40]!r}")
+
+
 def factor(text: str) -> float:
     try:
         factor = float(text)
@@ -98,8 +104,8 @@ def add_can_log(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--can-log",
         choices=("log", "blf", "asc", "mf4", "none"),
-        default="log",
-        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz",
+        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz (default: log"
+        " on a CAN bus)",
     )
 
 
@@ -159,9 +165,9 @@ def add_capture(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
     )
-    command.add_argument("--run", type=int, metavar="N", help="which of several runs in a CAN log, from 1")
+    command.add_argument("--run", type=count, metavar="N", help="which of several runs in a CAN log, from 1")
     command.add_argument(
-        "--most-lost", type=int, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
+        "--most-lost", type=count, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
     )
 
 

@@ -39,26 +39,56 @@ def prepare(out: Path, rig: Rig) -> None:
         raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
 
 
-def can_log(arguments: argparse.Namespace) -> CanLog | None:
+def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
     """What listens to the CAN frames of the run, if they shall be kept; a run on another link has none.
 
-    :raises RecordingError: the log of an earlier run is in the way.
+    :raises ConfigurationError: the run would overwrite the log that is being played.
     """
     from harness.can_log import WRITTEN, CanLog
+    from harness.errors import ConfigurationError
+    from harness.rig import RecordingRig
 
-    kept = None
-    for suffix in WRITTEN:
-        log = CanLog(arguments.out / f"{CAN_LOG}.{suffix}")
-        kept = log if suffix == arguments.can_log else kept
-    return kept
+    if isinstance(rig, RecordingRig) and rig.path.resolve() in {path.resolve() for path in _can_logs(arguments.out)}:
+        raise ConfigurationError(
+            f"--out {arguments.out}: would overwrite the CAN log that is played; choose another folder"
+        )
+    asked = arguments.can_log or WRITTEN[0]
+    return None if asked == "none" else CanLog(arguments.out / f"{CAN_LOG}.{asked}")
+
+
+def _can_logs(out: Path) -> list[Path]:
+    """Wherever a run leaves one."""
+    from harness.can_log import WRITTEN
+
+    return [out / f"{CAN_LOG}.{suffix}" for suffix in WRITTEN]
+
+
+def _begin(log: CanLog | None, out: Path) -> None:
+    """What an earlier run has left goes, now that there is a device to play with.
+
+    :raises RecordingError: it cannot go.
+    """
+    from harness.errors import RecordingError
+
+    for path in _can_logs(out):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be removed: {error.strerror or error}") from error
+    if log is not None:
+        log.begin()
 
 
 def play(
     rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace, log: CanLog | None = None
 ) -> int:
+    """:raises ConfigurationError: a log was asked for of a device that is on no CAN bus."""
     from harness.bench import Bench
-    from harness.errors import RecordingError
+    from harness.errors import ConfigurationError, RecordingError
 
+    if arguments.can_log is not None and log is not None and not log.has_heard:
+        raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
+    _begin(log, arguments.out)
     run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
     status = conclude(run, arguments)
     try:
@@ -79,7 +109,7 @@ def conclude(run: Run, arguments: argparse.Namespace) -> int:
 
     verdict = judge(run)
     if arguments.json:
-        show(json.dumps(_as_json(run, verdict, arguments.out)))
+        show(json.dumps(_as_json(run, verdict, arguments.out), allow_nan=False))
     else:
         show(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
     try:

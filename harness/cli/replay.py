@@ -30,7 +30,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"{arguments.file}: does not say which device it was: say --dut")
     with RecordingRig.of(recorded(arguments), arguments.file) as rig:
         prepare(arguments.out, rig)
-        log = can_log(arguments)
+        log = can_log(rig, arguments)
         changes = {"listener": log, **changes_of_dut(arguments)}
         with open_dut(named, **changes) if named else reopen_dut(rig.run.conditions.dut, **changes) as dut:
             return play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments, log)

@@ -24,6 +24,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
     with opened(arguments) as (rig, scenario, seed):
         prepare(arguments.out, rig)
-        log = can_log(arguments)
+        log = can_log(rig, arguments)
         with open_dut(arguments.dut, listener=log, **changes_of_dut(arguments)) as dut:
             return play(rig, dut, scenario, seed, arguments, log)

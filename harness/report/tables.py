@@ -11,7 +11,7 @@ from harness.bus_load import load_of
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
 from harness.summary import lamps_text, load_text
-from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
+from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
 
 _MAX_FALSE_ALARMS = 20
 """Rows of their table; the plots mark them all."""
@@ -163,7 +163,7 @@ def _plural(count: int, noun: str) -> str:
 def _samples(run: Run, verdict: Verdict) -> str:
     asked = run.conditions.samples_asked
     played = f"{run.samples:,}" if run.samples == asked else f"{run.samples:,} of {asked:,} asked"
-    return f"{played}; {verdict.missing_n:,} clipped and missing for the device"
+    return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
 def _tweak_row(tweak: TweakVerdict) -> str:

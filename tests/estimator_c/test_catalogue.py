@@ -7,6 +7,7 @@ import importlib.util
 import math
 import random
 import re
+import struct
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +20,23 @@ from cantools.database.can import Database, Message
 from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.signal import Signal
 
-from harness.catalogue import CATALOGUE_HASH, LAYOUTS, Change, Hello, Identify, Key, SampleBlock, Trigger, pack, unpack
+from harness.catalogue import (
+    CATALOGUE_HASH,
+    LAYOUTS,
+    Alarm,
+    Change,
+    Configured,
+    Diagnosis,
+    Estimate,
+    Hello,
+    Identify,
+    Key,
+    SampleBlock,
+    Stepped,
+    Trigger,
+    pack,
+    unpack,
+)
 from harness.wire import LIBRARY
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
@@ -242,3 +259,16 @@ def test_triggers_have_the_numbers_of_the_core() -> None:
     assert {trigger.name: trigger.value for trigger in Trigger} | {"CUSTOM": 4} == {
         name: int(n) for name, n in numbers.items()
     }
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_number_that_is_none_is_no_message(value: float) -> None:
+    for message in (
+        Estimate(1, 2, 3, value),
+        Stepped(1, 0, 3, value),
+        Alarm(1, Trigger.CUSUM, 3, value),
+        Diagnosis(1, Change.MASS, 3, value),
+        Configured(1, Key.P0, 2, 0, value),
+    ):
+        assert unpack(pack(message)) is None
+        assert unpack(pack(message)[:-4] + struct.pack("<f", 1.5)) is not None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import random
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,7 +18,7 @@ import pytest
 
 from harness.bench import Bench
 from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
-from harness.catalogue import LAYOUTS, Hello, Key, pack
+from harness.catalogue import LAYOUTS, Hello, Key, pack, unpack
 from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
@@ -57,6 +59,7 @@ def traffic() -> tuple[Run, list[can.Message]]:
 
 def written(path: Path, frames: Iterable[can.Message]) -> Path:
     log = CanLog(path)
+    log.begin()
     for frame in frames:
         log(frame)
     log.close()
@@ -150,6 +153,7 @@ def test_log_holds_the_same_run(tmp_path: Path, traffic: tuple[Run, list[can.Mes
 )
 def test_log_of_another_exchange_holds_the_same_run(tmp_path: Path, device: str, changes: dict[str, Any]) -> None:
     log = CanLog(tmp_path / "can.log")
+    log.begin()
     run = played(log, device=device, **changes)
     log.close()
     again = captured(tmp_path / "can.log")
@@ -168,6 +172,16 @@ def singled(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: float(np.float32(value)) if isinstance(value, float) else value for key, value in table.items()}
 
 
+def test_capture_without_the_handshake_has_a_note(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    frames = traffic[1]
+    whole = captured(written(tmp_path / "whole.log", frames))
+    assert "not in the log" not in summary(whole, judge(whole))
+    later = captured(written(tmp_path / "can.log", frames[nth(frames, "Sample", 0) :]))
+    n = len(list(EstimatorConfig().settings()))
+    said = f"note: {n} settings of the device are not in the log and were taken to be as by default"
+    assert said in summary(later, judge(later))
+
+
 def test_settings_give_the_estimator_back() -> None:
     for estimator in (
         EstimatorConfig(na=1, nb=1, c=(0.5,), trigger="none", offset=False),
@@ -181,6 +195,41 @@ def test_settings_give_the_estimator_back() -> None:
 def test_setting_that_is_no_number_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="here: na = nan is no setting of an estimator"):
         EstimatorConfig.from_settings({Key.NA: float("nan")}, "here")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *((Key.NA, value) for value in (0.0, 9.0, 1.5, 1e30)),
+        *((Key.NB, value) for value in (-5.0, 0.0, 2e6)),
+        *((Key.NC, value) for value in (-1.0, 250.0)),
+        *((Key.TRIGGER, value) for value in (-1.0, 99.0)),
+        *((Key.FORGETTING, value) for value in (-1.0, 0.0, 1.5)),
+        *((key, -1.0) for key in (Key.P0, Key.NOISE_VARIANCE, Key.EDGE_CODES, Key.WARM_UP_N, Key.NK)),
+        (Key.OFFSET, 7.0),
+        (Key.RESET, 9.0),
+        (Key.CODE_LOW, 3e38),
+        (Key.C1, 1e38),
+    ],
+)
+def test_setting_that_no_device_can_have_is_refused(key: Key, value: float) -> None:
+    with pytest.raises(ConfigurationError, match=rf"^here: {key.name.lower()} = .* is no setting of an estimator$"):
+        EstimatorConfig.from_settings({key: value}, "here")
+
+
+def test_parameters_for_which_the_device_has_no_room_are_refused(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    with pytest.raises(ConfigurationError, match="^here: 19 parameters, of at most 17$"):
+        EstimatorConfig.from_settings({Key.NB: 16.0}, "here")
+    frames = list(traffic[1])
+    at = nth(frames, "Hello", 0)
+    hello = unpack(bytes((frames[at].arbitration_id,)) + bytes(frames[at].data))
+    assert isinstance(hello, Hello)
+    frames[at] = copy.copy(frames[at])
+    frames[at].data = bytearray(pack(hello._replace(theta_max=5))[1:])
+    with pytest.raises(ConfigurationError, match=r"can\.log: 6 parameters, of at most 5$"):
+        captured(written(tmp_path / "can.log", frames))
 
 
 def test_foreign_frames_and_times_of_others_change_nothing(
@@ -235,6 +284,31 @@ def test_log_with_identifiers_of_another_dbc_is_understood(
         captured(log)
 
 
+@pytest.mark.parametrize("force", [100_000, -5])
+def test_value_that_our_message_cannot_have_counts_as_dropped(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], force: int
+) -> None:
+    """A bench whose codes have 32 bits and a sign."""
+    dbc = tmp_path / "bench.dbc"
+    dbc.write_text(
+        DBC.read_text()
+        .replace("BO_ 24 Sample: 8", "BO_ 24 Sample: 12")
+        .replace(" SG_ Force : 32|16@1+", " SG_ Force : 32|32@1-")
+        .replace(" SG_ Displacement : 48|16@1+", " SG_ Displacement : 64|32@1+")
+    )
+    frames = [copy.copy(frame) for frame in traffic[1]]
+    for frame in frames:
+        if frame.arbitration_id == identifier("Sample"):
+            codes = struct.unpack("<HH", frame.data[4:8])
+            frame.data, frame.dlc, frame.is_fd = frame.data[:4] + struct.pack("<iI", *codes), 12, True
+    assert judge(captured(written(tmp_path / "whole.log", frames), dbc=dbc)).outcome == "passed"
+    at = nth(frames, "Sample", 40)
+    frames[at].data = frames[at].data[:4] + struct.pack("<i", force) + frames[at].data[8:]
+    again = captured(written(tmp_path / "can.log", frames), dbc=dbc)
+    assert again.conditions.link_counters["frames_dropped"] == 1
+    assert np.flatnonzero(again.lost).tolist() == [40]
+
+
 # -------------------------------------------------------------------------------------------------------- what lacks
 
 
@@ -250,6 +324,51 @@ def test_frame_that_was_not_captured_makes_the_run_inconclusive(
     assert judge(again).outcome == "inconclusive"
 
 
+@pytest.mark.parametrize("name", ["Configured", "Sample", "Estimate", "Stepped", "Alarm", "Status"])
+def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 0)
+    other = copy.copy(frames[at])
+    other.data = other.data[:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    twice = written(tmp_path / "twice.log", [*frames[:at], frames[at], *frames[at:]])
+    assert judge(captured(twice)).outcome == "passed"
+    verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]])))
+    assert verdict.outcome == "inconclusive"
+    assert "have the same number: two speak as the " in verdict.reasons[0]
+
+
+@pytest.mark.parametrize("name", ["Sample", "Estimate", "Stepped"])
+def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 40)
+    other = copy.copy(frames[at])
+    other.data = (
+        bytearray(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    )
+    verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0].endswith("twice, and not the same")
+
+
+@pytest.mark.parametrize("name", ["Estimate", "Stepped", "Alarm"])
+def test_number_that_is_none_counts_as_damaged(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
+) -> None:
+    frames = list(traffic[1])
+    at = nth(frames, name, 0)
+    frames[at] = copy.copy(frames[at])
+    frames[at].data = frames[at].data[:-4] + struct.pack("<f", float("nan"))
+    again = captured(written(tmp_path / "can.log", frames))
+    assert np.isfinite(again.theta).all()
+    assert np.isfinite(again.statistic).all()
+    assert again.conditions.link_counters["frames_dropped"] == 1
+    assert judge(again).outcome == "inconclusive"
+
+
 def test_gaps_up_to_the_limit_are_allowed(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     run, frames = traffic
     gaps = [nth(frames, "Sample", n) for n in (10, 200, 210)]
@@ -257,7 +376,8 @@ def test_gaps_up_to_the_limit_are_allowed(tmp_path: Path, traffic: tuple[Run, li
     assert judge(captured(log, most_lost_n=3)).outcome == "passed"
     verdict = judge(captured(log, most_lost_n=2))
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons[0] == "3 samples were lost on the way to the device, more than 2"
+    assert verdict.reasons[0] == "3 samples were not or only in part in the log, more than 2"
+    assert "missing for the device or not in the log: 3 samples" in summary(captured(log), verdict)
     lost = captured(log)
     assert np.flatnonzero(lost.flags & LOST).tolist() == [10, 200, 210]
     assert lost.missing[[10, 200, 210]].all()
@@ -268,7 +388,19 @@ def test_capture_that_ended_early_is_inconclusive(tmp_path: Path, traffic: tuple
     frames = traffic[1]
     verdict = judge(captured(written(tmp_path / "can.log", frames[: nth(frames, "Stepped", 299) + 1])))
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons == ("the run ended after 300 of 600 samples",)
+    assert "the run ended after 300 of 600 samples" in verdict.reasons
+
+
+def test_capture_without_the_counters_of_the_device_is_inconclusive(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    frames = traffic[1]
+    silent = [frame for frame in frames if frame.arbitration_id != identifier("Status")]
+    for heard in (silent, frames[: nth(frames, "Stepped", -1) + 1]):
+        verdict = judge(captured(written(tmp_path / "can.log", heard)))
+        assert verdict.outcome == "inconclusive"
+        (reason,) = verdict.reasons
+        assert reason.startswith("the device's counters updated, refused, alarms, samples_lost after the run are not")
 
 
 def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
@@ -293,7 +425,7 @@ def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tupl
     assert again.conditions.link_counters["lines_damaged"] == len(reader.damaged)
 
 
-@pytest.mark.filterwarnings("ignore:.*MDF4.__del__")  # asammdf, of a file that it could not open
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")  # asammdf has a destructor that fails
 @pytest.mark.parametrize("suffix", ["blf", "mf4", "asc"])
 def test_file_cut_anywhere_is_refused_or_inconclusive(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], suffix: str
@@ -305,6 +437,20 @@ def test_file_cut_anywhere_is_refused_or_inconclusive(
         said = outcome_or_error(cut)
         assert said == "inconclusive" or said.startswith(f"{cut}: holds no run of a device"), part
         assert "\n" not in said
+
+
+def test_measurement_that_is_damaged_is_refused_in_one_line(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
+    pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
+    whole = written(tmp_path / "whole.mf4", traffic[1]).read_bytes()
+    cut = tmp_path / "cut.mf4"
+    cut.write_bytes(whole[:3000])
+    words = ["-m", "harness.cli", "judge", str(cut), "--scenario", "thesis", "--out", str(tmp_path)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.decode().startswith(f"analogrig: {cut}: holds no run of a device: {cut} is damaged after 0 ")
+    assert done.stderr.count(b"\n") == 1
 
 
 def outcome_or_error(path: Path) -> str:
@@ -362,6 +508,10 @@ def test_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, t
             'VERSION ""\nBU_: A\nBO_ 24 Sample: 8 A\n SG_ Seq : 0|8@1+ (1,0) [0|0] "" A\n',
             "Sample lacks Displacement, F",
         ),
+        (
+            DBC.read_text().replace(" SG_ Value :", " SG_ Value m1 :").replace(" SG_ Element :", " SG_ Element M :"),
+            "Estimate is multiplexed",
+        ),
     ],
 )
 def test_dbc_that_does_not_serve_is_refused_in_one_line(
@@ -388,6 +538,7 @@ def test_disk_that_is_full_is_told_when_the_log_is_closed(
     traffic: tuple[Run, list[can.Message]], tmp_path: Path
 ) -> None:
     log = CanLog(tmp_path / "gone" / "can.log")  # a folder that is not there
+    log.begin()
     for frame in traffic[1][:10]:
         log(frame)
     with pytest.raises(RecordingError, match=r"can\.log: cannot be written: No such file"):
@@ -418,9 +569,39 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     assert "say --dut" in capsys.readouterr().err
 
 
-def test_serial_run_leaves_no_can_log(tmp_path: Path) -> None:
-    assert main(["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
+def test_log_that_is_played_or_of_an_earlier_run_is_not_lost_before_the_run(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = written(tmp_path / "can.log", traffic[1])
+    before = log.read_bytes()
+    (tmp_path / "can.blf").write_text("of an earlier run")
+    replay = ["replay", str(log), "--scenario", "thesis", "--out", str(tmp_path)]
+    for words in ([*replay, "--dut", "inproc"], [*replay, "--dut", DEVICE, "--can-log", "mf4"]):
+        assert main(words) == 2
+        assert "would overwrite the CAN log that is played; choose another folder" in capsys.readouterr().err
+    unreachable = ["--dut", DEVICE, "--wire-faults", "drop@1.0"]
+    assert main(["run", *unreachable, "--scenario", "thesis", "--out", str(tmp_path)]) == 2
+    assert log.read_bytes() == before
+    assert (tmp_path / "can.blf").read_text() == "of an earlier run"
+
+
+@pytest.mark.parametrize("option", ["--most-lost", "--run"])
+@pytest.mark.parametrize("value", ["-1", "1.5", "many", "9" * 30])
+def test_number_of_samples_or_of_a_run_is_a_count(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["judge", "can.log", "--scenario", "thesis", f"{option}={value}"])
+    assert end.value.code == 2
+    assert f"argument {option}: must be a whole number from 0" in capsys.readouterr().err
+
+
+def test_serial_run_leaves_no_can_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]
+    assert main([*words, "--can-log", "blf"]) == 2
+    assert "--can-log blf: device inproc is not on a CAN bus" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    for more in ([], ["--can-log", "none"]):
+        assert main([*words, *more]) == 0
+        assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
 
 
 def test_replay_of_a_log_plays_the_samples_that_it_has(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
