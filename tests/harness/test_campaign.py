@@ -239,6 +239,10 @@ def _die(_: int) -> int:
     raise AssertionError
 
 
+def _own_pid(_: int) -> int:
+    return os.getpid()
+
+
 class DyingOnce:
     """``_die_once`` with its folder, as it crosses the border between processes."""
 
@@ -259,6 +263,17 @@ def test_only_the_task_of_a_killed_worker_is_played_again(tmp_path: Path) -> Non
 def test_task_that_kills_every_worker_ends_the_campaign() -> None:
     with pytest.raises(WorkerError, match=f"7: {MOST_DEATHS} workers died over it"):
         list(Processes(1).play(_die, iter([7])))
+
+
+def test_worker_that_is_killed_while_it_has_no_task_is_replaced() -> None:
+    workers = []
+    for _, pid in Processes(1).play(_own_pid, iter(range(MOST_DEATHS + 1))):
+        workers.append(pid)
+        os.kill(pid, signal.SIGKILL)
+        deadline_s = time.monotonic() + 30.0
+        while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline_s:
+            time.sleep(0.01)  # until the pool has noticed, and buried it
+    assert len(set(workers)) == MOST_DEATHS + 1
 
 
 def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:
