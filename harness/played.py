@@ -38,7 +38,7 @@ class Played:
 
     run: Run
     repeat: str = ""
-    """The command that repeats it."""
+    """The command that repeats it; empty: no names or files say what was played."""
 
     @functools.cached_property
     def verdict(self) -> Verdict:

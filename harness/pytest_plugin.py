@@ -171,6 +171,13 @@ def _chosen(request: pytest.FixtureRequest, name: str) -> str:
     return str(getattr(request, "param", None) or _OPTIONS[name].value(request.config))
 
 
+def _said(item: pytest.Item, name: str) -> str:
+    """As ``_chosen``, for the fixture of that name."""
+    callspec = getattr(item, "callspec", None)
+    given = callspec.params.get(name) if callspec is not None else None
+    return given if isinstance(given, str) else _OPTIONS[name].value(item.config)
+
+
 @pytest.fixture
 def scenario_dir(request: pytest.FixtureRequest) -> Path | None:
     """The folder of --scenario-dir."""
@@ -253,7 +260,8 @@ class _Player:
             chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
             drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
             run = self.bench.play(chosen, drawn)
-        played = Played(run, command_of(run))
+        said = "" if isinstance(scenario, Scenario) else str(scenario)
+        played = Played(run, command_of(run, said, _said(self.item, "rig"), _said(self.item, "dut")))
         self.item.stash.setdefault(_PLAYS, []).append(played)
         _note(self.item, played)
         if not played.verdict.valid and not allow_inconclusive:
