@@ -24,7 +24,7 @@ from harness.campaign_workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
-from harness.rig import open_rig
+from harness.rig import EmulatorRig, open_rig
 from harness.scenario import Scenario, Tweak
 from harness.verdict import judge
 
@@ -263,6 +263,25 @@ def test_only_the_task_of_a_killed_worker_is_played_again(tmp_path: Path) -> Non
 def test_task_that_kills_every_worker_ends_the_campaign() -> None:
     with pytest.raises(WorkerError, match=f"7: {MOST_DEATHS} workers died over it"):
         list(Processes(1).play(_die, iter([7])))
+
+
+@pytest.mark.parametrize("device", ["inproc", "host"])
+def test_rig_of_a_trial_is_left_as_it_was_entered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    close_devices()
+    happened: list[str] = []
+
+    def enter(rig: EmulatorRig) -> EmulatorRig:
+        happened.append("entered")
+        return rig
+
+    monkeypatch.setattr(EmulatorRig, "__enter__", enter)
+    monkeypatch.setattr(EmulatorRig, "__exit__", lambda *_: happened.append("left"))
+    plan = planned(tmp_path, f'devices = ["{device}"]\n{SPEC}')
+    happened.clear()
+    play_chunk(plan.as_json(), (0, 0))
+    assert happened == ["entered"]
+    close_devices()
+    assert happened == ["entered", "left"]
 
 
 def test_worker_that_is_killed_while_it_has_no_task_is_replaced() -> None:
