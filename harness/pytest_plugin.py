@@ -140,15 +140,14 @@ class _Devices:
 
 
 def _check_owner(name: str) -> None:
-    """A device elsewhere, of which there is one, belongs to one worker of pytest-xdist.
+    """A device of which there is only one belongs to one worker of pytest-xdist.
 
     :raises pytest.UsageError: this is another one.
     """
-    from harness.devices import InprocDevice, QemuDevice, describe
+    from harness.devices import describe
 
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    described = describe(name)
-    if worker != "gw0" and described.elsewhere and not isinstance(described, InprocDevice | QemuDevice):
+    if worker != "gw0" and describe(name).only_one:
         raise pytest.UsageError(f"device {name}: one worker owns it; run pytest with -n 1, or without -n")
 
 

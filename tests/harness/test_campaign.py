@@ -18,10 +18,11 @@ from harness.bench import Bench
 from harness.campaign import Tally, conduct, journal_of
 from harness.campaign_journal import Journal
 from harness.campaign_results import Results, Summary, text
-from harness.campaign_spec import CampaignSpec, Chunk, Plan
+from harness.campaign_spec import CampaignSpec, Chunk, Plan, one_worker_only
 from harness.campaign_trial import close_devices, play_chunk, row
 from harness.campaign_workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
+from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
 from harness.rig import EmulatorRig, open_rig
@@ -263,6 +264,22 @@ def test_only_the_task_of_a_killed_worker_is_played_again(tmp_path: Path) -> Non
 def test_task_that_kills_every_worker_ends_the_campaign() -> None:
     with pytest.raises(WorkerError, match=f"7: {MOST_DEATHS} workers died over it"):
         list(Processes(1).play(_die, iter([7])))
+
+
+@pytest.mark.parametrize(
+    ("name", "only_one"),
+    [
+        ("inproc", ""),
+        ("inproc:./own.so", ""),
+        ("host", ""),
+        ("qemu-m4:own.elf", ""),
+        ("can:virtual", ""),
+        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0"),
+        ("can:socketcan/can0", "can:socketcan/can0"),
+    ],
+)
+def test_device_of_which_there_is_only_one_takes_one_worker(name: str, only_one: str) -> None:
+    assert describe(name).only_one == one_worker_only(describe(name).as_table()) == only_one
 
 
 @pytest.mark.parametrize("device", ["inproc", "host"])
