@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from harness import config
-from harness.devices import DeviceDescription, QemuDevice, describe, from_table
+from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import ConfigurationError
 from harness.rig import EmulatorDescription, EmulatorRig, RecordingRig, Rig, open_rig
 from harness.scenario import Scenario, Tweak
@@ -300,8 +300,7 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
 
 def one_worker_only(table: Mapping[str, Any]) -> str:
     """The name of a device of which there is only one, so that two workers cannot both have it; "" for any other."""
-    device = device_of(table)
-    return device.elsewhere if not isinstance(device, QemuDevice) else ""
+    return device_of(table).only_one
 
 
 def rig_table(name: str) -> Mapping[str, Any]:

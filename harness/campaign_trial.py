@@ -138,31 +138,33 @@ class _Players(threading.local):
     MOST = 64
 
     def __init__(self) -> None:
-        self._kept: dict[str, _InProcess | _OnBench] = {}
+        self._kept: dict[str, tuple[_InProcess | _OnBench, contextlib.ExitStack]] = {}
 
     def player(self, case: Case) -> _InProcess | _OnBench:
         key = json.dumps([case.rig, case.device], sort_keys=True)
         if key not in self._kept:
             while len(self._kept) >= self.MOST:
-                self._kept.pop(next(iter(self._kept))).close()
-            self._kept[key] = _player(case)
-        return self._kept[key]
+                self._kept.pop(next(iter(self._kept)))[1].close()
+            with contextlib.ExitStack() as held:
+                player = _player(held.enter_context(open_table(case.rig)), case)
+                held.callback(player.close)
+                self._kept[key] = player, held.pop_all()
+        return self._kept[key][0]
 
     def close(self) -> None:
         while self._kept:
-            self._kept.popitem()[1].close()
+            self._kept.popitem()[1][1].close()
 
 
 _players = _Players()
 
 
 def close_devices() -> None:
-    """Let go of the devices that this thread's chunks have opened."""
+    """Let go of the devices and rigs that this thread's chunks have opened."""
     _players.close()
 
 
-def _player(case: Case) -> _InProcess | _OnBench:
-    rig = open_table(case.rig)
+def _player(rig: Rig, case: Case) -> _InProcess | _OnBench:
     if isinstance(rig, EmulatorRig) and are_possible(rig, device_of(case.device)):
         return _InProcess(rig, case)
     return _OnBench(rig, case)

@@ -67,7 +67,7 @@ class Processes:
             while True:
                 while free and (task := next(tasks, None)) is not None:
                     number = free.pop()
-                    busy[pools[number].submit(work, task)] = (number, task, 0)
+                    busy[_submit(pools, number, work, task)] = (number, task, 0)
                 if not busy:
                     return
                 for future in wait(busy, return_when=FIRST_COMPLETED).done:
@@ -76,9 +76,7 @@ class Processes:
                         result = future.result()
                     except BrokenProcessPool as error:
                         _check_deaths(task, deaths + 1, error)
-                        pools[number].shutdown(wait=False)
-                        pools[number] = _pool()
-                        busy[pools[number].submit(work, task)] = (number, task, deaths + 1)
+                        busy[_submit(pools, number, work, task)] = (number, task, deaths + 1)
                         continue
                     free.append(number)
                     yield task, result
@@ -132,6 +130,18 @@ class Dask:
 
     def close(self) -> None:
         self._client.close()
+
+
+def _submit(
+    pools: list[ProcessPoolExecutor], number: int, work: Callable[[Task], Result], task: Task
+) -> Future[Result]:
+    """To the pool of that number, or to a new one in its place if its worker has died, be it while it had no task."""
+    try:
+        return pools[number].submit(work, task)
+    except BrokenProcessPool:
+        pools[number].shutdown(wait=False)
+        pools[number] = _pool()
+        return pools[number].submit(work, task)
 
 
 def _pool() -> ProcessPoolExecutor:

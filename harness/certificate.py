@@ -67,10 +67,13 @@ class Question:
     @property
     def useful_workers(self) -> int:
         """More would take longer to start than to play."""
-        device = device_of(self.device)
-        return (
-            max(1, self.design_n // WORTH_A_WORKER_N) if are_possible(open_table(self.rig), device) else self.design_n
-        )
+        return max(1, self.design_n // WORTH_A_WORKER_N) if self.is_in_process else self.design_n
+
+    @functools.cached_property
+    def is_in_process(self) -> bool:
+        """Whether it is played without a line."""
+        with open_table(self.rig) as rig:
+            return are_possible(rig, device_of(self.device))
 
     @functools.cached_property
     def design_n(self) -> int:
@@ -146,10 +149,9 @@ def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
 
 def _run_n(question: Question, most: int) -> int:
     """Such a length that a whole number of runs makes up a test of fixed length."""
-    device, rig = device_of(question.device), open_table(question.rig)
-    about = IN_PROCESS_RUN_N if are_possible(rig, device) else BENCH_RUN_N
+    about = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
     runs = math.ceil(most / about)
-    return math.ceil(most / runs) + device.estimator.warm_up_n + _LEAD_IN_N
+    return math.ceil(most / runs) + device_of(question.device).estimator.warm_up_n + _LEAD_IN_N
 
 
 _LEAD_IN_N = 16

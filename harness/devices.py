@@ -124,6 +124,12 @@ class DeviceDescription:
         """As the command line names it, if it is not safe to open it on the word of a recording."""
         return ""
 
+    @property
+    def only_one(self) -> str:
+        """As the command line names it, if there is one of it, which two processes cannot both have; "" for any that
+        each can start or load for itself."""
+        return self.elsewhere
+
     def as_table(self) -> dict[str, Any]:
         """In plain values, from which the same can be made."""
         table = {"kind": self.kind, **dataclasses.asdict(self), "estimator": self.estimator.as_table()}
@@ -321,6 +327,10 @@ class InprocDevice(EitherDevice):
     def elsewhere(self) -> str:
         return f"{self.kind}:{self.library}" if self.library else ""
 
+    @property
+    def only_one(self) -> str:
+        return ""
+
     def wire(self) -> Wire:
         return MemoryWire(boot_nonce=secrets.randbits(32), library=self.library_path)
 
@@ -385,6 +395,10 @@ class QemuDevice(EitherDevice):
     def elsewhere(self) -> str:
         """Firmware may ask its debugger for any file of this computer."""
         return f"{self.kind}:{self.firmware}" if self.firmware else ""
+
+    @property
+    def only_one(self) -> str:
+        return ""
 
     def _image(self) -> Path:
         """:raises LinkError: it is not there."""

@@ -7,8 +7,9 @@ assertion about it fails.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Concatenate, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,8 @@ from numpy.typing import ArrayLike
 from harness.run import Run
 from harness.statistics import upper_rate
 from harness.verdict import TweakVerdict, Verdict, judge
+
+Arguments = ParamSpec("Arguments")
 
 
 @dataclass(frozen=True)
@@ -32,18 +35,34 @@ class Finding:
         return f"<{'yes' if self.holds else 'no'}: {self.why}>"
 
 
+def _of_a_valid_play(
+    statement: Callable[Concatenate[Played, Arguments], Finding],
+) -> Callable[Concatenate[Played, Arguments], Finding]:
+    """Nothing holds of a play that is not valid."""
+
+    @functools.wraps(statement)
+    def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
+        if not played.verdict.valid:
+            return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
+        return statement(played, *args, **kwargs)
+
+    return checked
+
+
 @dataclass(frozen=True)
 class Played:
-    """One play of a scenario, valid (``Bench`` and the fixture ``play`` give no other), and its verdict."""
+    """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``play`` hands
+    one on only if it is asked to."""
 
     run: Run
     repeat: str = ""
-    """The command that repeats it."""
+    """The command that repeats it; empty: no names or files say what was played."""
 
     @functools.cached_property
     def verdict(self) -> Verdict:
         return judge(self.run)
 
+    @_of_a_valid_play
     def detects(self, within: float | None = None) -> Finding:
         """Every change that could be seen raised an alarm before the next one.
 
@@ -59,12 +78,14 @@ class Played:
         latencies = ", ".join(f"{tweak.what} after {tweak.latency_n} (bound {tweak.bound_n})" for tweak in seeable)
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
+    @_of_a_valid_play
     def stays_quiet(self) -> Finding:
         """No alarm but one for each change."""
         alarms = self.verdict.false_alarms
         where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
         return Finding(not alarms, f"{len(alarms)} false alarms in {self.run.samples} samples: {where}".rstrip(": "))
 
+    @_of_a_valid_play
     def isolates(self) -> Finding:
         """Whatever was said to have changed has changed. Silence is allowed."""
         said = [(tweak, tweak.diagnosis) for tweak in self.verdict.tweaks if tweak.diagnosis is not None]
@@ -74,6 +95,7 @@ class Played:
             not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.tweaks)} changes named, rightly"
         )
 
+    @_of_a_valid_play
     def estimates(self, within: float) -> Finding:
         """M, B and K at the end of every stretch are right to a part ``within``."""
         off = []
@@ -87,6 +109,7 @@ class Played:
             ]
         return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
 
+    @_of_a_valid_play
     def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:
         """The estimate goes the way of another one, in a tube around it.
 
@@ -124,8 +147,14 @@ def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
 
 
 def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
-    """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand."""
+    """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand.
+
+    It does not hold if one of them is not valid.
+    """
     plays = list(played)
+    invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
+    if invalid:
+        return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {len(plays)} plays, such as: {invalid[0]}")
     events = sum(len(each.verdict.false_alarms) for each in plays)
     samples = sum(each.run.samples for each in plays)
     bound = upper_rate(events, samples, confidence)

@@ -140,15 +140,14 @@ class _Devices:
 
 
 def _check_owner(name: str) -> None:
-    """A device elsewhere, of which there is one, belongs to one worker of pytest-xdist.
+    """A device of which there is only one belongs to one worker of pytest-xdist.
 
     :raises pytest.UsageError: this is another one.
     """
-    from harness.devices import InprocDevice, QemuDevice, describe
+    from harness.devices import describe
 
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-    described = describe(name)
-    if worker != "gw0" and described.elsewhere and not isinstance(described, InprocDevice | QemuDevice):
+    if worker != "gw0" and describe(name).only_one:
         raise pytest.UsageError(f"device {name}: one worker owns it; run pytest with -n 1, or without -n")
 
 
@@ -172,6 +171,13 @@ def _in_one_line() -> Iterator[None]:
 
 def _chosen(request: pytest.FixtureRequest, name: str) -> str:
     return str(getattr(request, "param", None) or _OPTIONS[name].value(request.config))
+
+
+def _said(item: pytest.Item, name: str) -> str:
+    """As ``_chosen``, for the fixture of that name."""
+    callspec = getattr(item, "callspec", None)
+    given = callspec.params.get(name) if callspec is not None else None
+    return given if isinstance(given, str) else _OPTIONS[name].value(item.config)
 
 
 @pytest.fixture
@@ -260,7 +266,8 @@ class _Player:
         if run.conditions.faults:  # nothing of it may reach the next play of this test
             with contextlib.suppress(AnalogrigError):
                 self.bench.dut.handshake()
-        played = Played(run, command_of(run))
+        said = "" if isinstance(scenario, Scenario) else str(scenario)
+        played = Played(run, command_of(run, said, _said(self.item, "rig"), _said(self.item, "dut")))
         self.item.stash.setdefault(_PLAYS, []).append(played)
         _note(self.item, played)
         if not played.verdict.valid and not allow_inconclusive:

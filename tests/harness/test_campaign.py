@@ -18,13 +18,14 @@ from harness.bench import Bench
 from harness.campaign import Tally, conduct, journal_of
 from harness.campaign_journal import Journal
 from harness.campaign_results import Results, Summary, text
-from harness.campaign_spec import CampaignSpec, Chunk, Plan
+from harness.campaign_spec import CampaignSpec, Chunk, Plan, one_worker_only
 from harness.campaign_trial import close_devices, play_chunk, row
 from harness.campaign_workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
+from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
-from harness.rig import open_rig
+from harness.rig import EmulatorRig, open_rig
 from harness.scenario import Scenario, Tweak
 from harness.verdict import judge
 
@@ -239,6 +240,10 @@ def _die(_: int) -> int:
     raise AssertionError
 
 
+def _own_pid(_: int) -> int:
+    return os.getpid()
+
+
 class DyingOnce:
     """``_die_once`` with its folder, as it crosses the border between processes."""
 
@@ -259,6 +264,52 @@ def test_only_the_task_of_a_killed_worker_is_played_again(tmp_path: Path) -> Non
 def test_task_that_kills_every_worker_ends_the_campaign() -> None:
     with pytest.raises(WorkerError, match=f"7: {MOST_DEATHS} workers died over it"):
         list(Processes(1).play(_die, iter([7])))
+
+
+@pytest.mark.parametrize(
+    ("name", "only_one"),
+    [
+        ("inproc", ""),
+        ("inproc:./own.so", ""),
+        ("host", ""),
+        ("qemu-m4:own.elf", ""),
+        ("can:virtual", ""),
+        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0"),
+        ("can:socketcan/can0", "can:socketcan/can0"),
+    ],
+)
+def test_device_of_which_there_is_only_one_takes_one_worker(name: str, only_one: str) -> None:
+    assert describe(name).only_one == one_worker_only(describe(name).as_table()) == only_one
+
+
+@pytest.mark.parametrize("device", ["inproc", "host"])
+def test_rig_of_a_trial_is_left_as_it_was_entered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    close_devices()
+    happened: list[str] = []
+
+    def enter(rig: EmulatorRig) -> EmulatorRig:
+        happened.append("entered")
+        return rig
+
+    monkeypatch.setattr(EmulatorRig, "__enter__", enter)
+    monkeypatch.setattr(EmulatorRig, "__exit__", lambda *_: happened.append("left"))
+    plan = planned(tmp_path, f'devices = ["{device}"]\n{SPEC}')
+    happened.clear()
+    play_chunk(plan.as_json(), (0, 0))
+    assert happened == ["entered"]
+    close_devices()
+    assert happened == ["entered", "left"]
+
+
+def test_worker_that_is_killed_while_it_has_no_task_is_replaced() -> None:
+    workers = []
+    for _, pid in Processes(1).play(_own_pid, iter(range(MOST_DEATHS + 1))):
+        workers.append(pid)
+        os.kill(pid, signal.SIGKILL)
+        deadline_s = time.monotonic() + 30.0
+        while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline_s:
+            time.sleep(0.01)  # until the pool has noticed, and buried it
+    assert len(set(workers)) == MOST_DEATHS + 1
 
 
 def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:

@@ -136,6 +136,48 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
 
 
+def test_failure_on_a_device_of_a_file_leaves_that_device_too(
+    user: pytest.Pytester, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user.path.joinpath("mydev.toml").write_text(
+        'kind = "inproc"\nexchange = "block"\nwire_faults = "duplicate@0.01,seed=3"\n[estimator]\nwarm_up_n = 150\n'
+    )
+    user.makepyfile(PLAYS.format(assertion="assert False"))
+    result = run(user, "--dut", "./mydev.toml", "--junitxml", "junit.xml")
+    (line,) = [line for line in result.outlines if line.startswith("repeat it with: ")]
+    (user.path / "mydev.toml").unlink()
+    monkeypatch.chdir(user.path)
+    cli.main([*line.split()[4:], "--json", "--out", str(user.path / "again")])
+    assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
+
+
+def test_command_of_a_play_names_files_as_the_user_does_and_says_nothing_when_nothing_does(
+    user: pytest.Pytester, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-0-10v.toml"
+    user.mkdir("own").joinpath("rig.toml").write_text(shipped.read_text())
+    user.path.joinpath("own", "dev.toml").write_text('kind = "inproc"\n[estimator]\nwarm_up_n = 150\n')
+    user.makepyfile(
+        """
+        import dataclasses
+        from harness.scenario import Scenario
+
+        def test_it(play):
+            played = play("short.toml", seed=5)
+            print(played.repeat, played.verdict.theta_hash, sep="#")
+            assert not play(dataclasses.replace(Scenario.load("short.toml"), samples=500)).repeat
+            assert play("thesis").repeat
+        """
+    )
+    result = run(user, "-s", "--dut", "own/dev.toml", "--rig", "own/rig.toml")
+    result.assert_outcomes(passed=1)
+    (line,) = [line for line in result.outlines if "#" in line]
+    command, _, theta = line[line.index("analogrig") :].partition("#")
+    monkeypatch.chdir(user.path)
+    assert cli.main([*command.split()[1:], "--json", "--out", str(user.path / "again")]) == 0
+    assert f'"theta_hash": "{theta}"' in capsys.readouterr().out
+
+
 def test_folder_of_scenarios_is_a_suite(user: pytest.Pytester) -> None:
     folder = user.mkdir("suite")
     (folder / "good.toml").write_text(SHORT.format(head="seed = 5", expect=""))
