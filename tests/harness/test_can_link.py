@@ -154,6 +154,19 @@ def test_own_echoes_are_passed_over(bus: Bus, is_rx: bool) -> None:  # noqa: FBT
     assert link.counters["frames_foreign"] == 0
 
 
+@pytest.mark.parametrize("is_rx", [True, False])
+def test_own_echoes_are_not_told_and_take_no_time(is_rx: bool) -> None:  # noqa: FBT001
+    bus = Bus(line=CanLine(1_000_000))
+    link = CanLink(bus)
+    told: list[can.Message] = []
+    link.listen(told.append)
+    link.send([SAMPLE])
+    sent_s = link.line_s
+    bus.said.append(frame(0x18, bytes(bus.sent[0].data), is_rx=is_rx))
+    assert link.receive(1.0) is None
+    assert len(told) == 1 and link.line_s == sent_s
+
+
 def test_somebody_else_who_speaks_as_the_harness_ends_the_talk(bus: Bus) -> None:
     link = CanLink(bus)
     link.send([SAMPLE])
