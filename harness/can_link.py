@@ -61,7 +61,8 @@ class CanLink:
     @property
     def counters(self) -> Mapping[str, int]:
         dropped = self._counted["frames_dropped"] + self.bus.damaged
-        return {"frames_dropped": dropped, "frames_foreign": 0, "error_frames": 0} | self._counted
+        no = {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
+        return no | self._counted | {"frames_dropped": dropped}
 
     @property
     def trouble(self) -> str:

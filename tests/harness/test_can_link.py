@@ -139,6 +139,14 @@ def test_what_should_be_the_devices_and_is_not_is_dropped(bus: Bus, damaged: can
     assert link.counters["frames_dropped"] == 1
 
 
+def test_what_was_no_frame_is_counted_with_what_was_dropped(bus: Bus) -> None:
+    bus.damaged = 3
+    bus.said.append(frame(0x20))
+    link = CanLink(bus)
+    assert link.receive(1.0) is None
+    assert link.counters["frames_dropped"] == 4
+
+
 def test_message_in_a_frame_of_can_fd_is_taken_where_there_is_can_fd() -> None:
     bus = Bus(is_fd=True)
     bus.said.append(estimate(is_fd=True))
