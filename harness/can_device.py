@@ -162,7 +162,7 @@ class InhabitedBus:
         self._said: dict[tuple[int, int], bytes] = {}
         """What the device has said last in each kind of message with each sequence number."""
         self._ends = threading.Event()
-        self._death: LinkError | None = None
+        self._death: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name=f"device on {bus.name}", daemon=True)
         self._thread.start()
 
@@ -193,7 +193,7 @@ class InhabitedBus:
                     for answer in self._device.answers([frame]):
                         self._said[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
-        except LinkError as error:
+        except Exception as error:  # whatever it is, nobody else in this thread would tell it
             self._death = error
 
     def _is_echo(self, frame: can.Message) -> bool:
