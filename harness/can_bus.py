@@ -160,6 +160,9 @@ class PythonCanBus:
                 raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
             self._forget_damage(error)
             return None
+        if frame is not None and not _is_sound(frame):
+            self.damaged += 1
+            return None
         if frame is not None and self._never_echoes:
             frame.is_rx = True  # for SocketCAN nothing is that comes from another program of this computer
         return frame
@@ -173,6 +176,25 @@ class PythonCanBus:
     def close(self) -> None:
         with contextlib.suppress(Exception):  # of a bus that is gone
             self._bus.shutdown()
+
+
+_FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator")
+_MOST_BYTES = 64
+
+
+def _is_sound(frame: can.Message) -> bool:
+    """Whether its fields are what they should be: python-can takes over what comes from a network."""
+    identifier: Any = frame.arbitration_id
+    bits = 29 if frame.is_extended_id or frame.is_error_frame else 11
+    return (
+        type(identifier) is int
+        and 0 <= identifier < 1 << bits
+        and all(isinstance(getattr(frame, flag), bool) for flag in _FLAGS)
+        and isinstance(frame.data, bytes | bytearray)
+        and len(frame.data) <= _MOST_BYTES
+        and type(frame.dlc) is int
+        and 0 <= frame.dlc <= _MOST_BYTES
+    )
 
 
 def _complete(asked: Mapping[str, Any]) -> dict[str, Any]:

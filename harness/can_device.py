@@ -159,8 +159,10 @@ class InhabitedBus:
         self._bus, self._devices_bus = bus, devices_bus
         self._device = LibraryCanDevice(is_fd=bus.is_fd, input_blocks=BUS_INPUT_BLOCKS)
         self._device.boot(boot_nonce)
+        self._said: dict[tuple[int, int], bytes] = {}
+        """What the device has said last in each kind of message with each sequence number."""
         self._ends = threading.Event()
-        self._death: LinkError | None = None
+        self._death: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name=f"device on {bus.name}", daemon=True)
         self._thread.start()
 
@@ -187,8 +189,15 @@ class InhabitedBus:
         try:
             while not self._ends.is_set():
                 frame = self._devices_bus.receive(_POLL_S)
-                if frame is not None:
+                if frame is not None and not self._is_echo(frame):
                     for answer in self._device.answers([frame]):
+                        self._said[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
-        except LinkError as error:
+        except Exception as error:  # whatever it is, nobody else in this thread would tell it
             self._death = error
+
+    def _is_echo(self, frame: can.Message) -> bool:
+        """Whether the interface shows the device what it has said itself, as udp_multicast does."""
+        if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame or not frame.data:
+            return False
+        return self._said.get((frame.arbitration_id, frame.data[0])) == frame.data

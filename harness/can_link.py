@@ -61,7 +61,8 @@ class CanLink:
     @property
     def counters(self) -> Mapping[str, int]:
         dropped = self._counted["frames_dropped"] + self.bus.damaged
-        return {"frames_dropped": dropped, "frames_foreign": 0, "error_frames": 0} | self._counted
+        no = {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
+        return no | self._counted | {"frames_dropped": dropped}
 
     @property
     def trouble(self) -> str:
@@ -112,7 +113,7 @@ class CanLink:
 
     def _message(self, frame: can.Message) -> Message | None:
         """Of the device; None if it is none."""
-        if frame.is_rx:  # not one that the system shows us because we sent it
+        if not self._is_echo(frame):
             self._passed(frame, is_rx=True)
         if frame.is_error_frame:
             self._note_error(frame)
@@ -127,10 +128,18 @@ class CanLink:
             return message
         return None
 
+    def _is_echo(self, frame: can.Message) -> bool:
+        """Whether the system shows it because we sent it; not all interfaces say so."""
+        if not frame.is_rx:
+            return True
+        if frame.arbitration_id not in _OURS or frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame:
+            return False
+        packet = bytes((frame.arbitration_id,)) + frame.data
+        return len(packet) > 1 and self._sent.get(packet[1]) == packet
+
     def _note_echo(self, frame: can.Message) -> None:
         """:raises LinkError: it is not one of ours."""
-        packet = bytes((frame.arbitration_id,)) + frame.data
-        if frame.is_rx and (len(packet) < 2 or self._sent.get(packet[1]) != packet):
+        if not self._is_echo(frame):
             raise LinkError(
                 f"{self.name}: somebody else speaks with the harness's identifiers (frame {frame.arbitration_id:#05x}"
                 f" with {frame.data.hex() or 'no data'}): another harness on the same bus?"

@@ -164,6 +164,31 @@ def test_what_the_interface_cannot_read_is_counted(bus: PythonCanBus, monkeypatc
     assert bus.damaged == 2
 
 
+@pytest.mark.parametrize(
+    "field",
+    [
+        {"arbitration_id": 32.0},
+        {"arbitration_id": float("nan")},
+        {"arbitration_id": 0x800},
+        {"arbitration_id": -1},
+        {"bitrate_switch": "yes"},
+        {"error_state_indicator": "yes"},
+        {"is_fd": 1},
+        {"dlc": 8.0},
+        {"data": bytearray(65)},
+    ],
+    ids=str,
+)
+def test_frame_with_a_field_that_makes_no_sense_is_counted(
+    bus: PythonCanBus, field: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a datagram of udp_multicast may have."""
+    strange = can.Message(**{"arbitration_id": 0x20, "is_extended_id": False, "data": bytes(8), **field})
+    monkeypatch.setattr(bus._bus, "recv", lambda _: strange)
+    assert bus.receive(1.0) is None
+    assert bus.damaged == 1
+
+
 def test_garbage_of_an_adapter_is_counted_and_its_end_told() -> None:
     ours, theirs = pty.openpty()
     path = os.ttyname(theirs)

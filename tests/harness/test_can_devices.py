@@ -228,6 +228,16 @@ def test_traffic_of_others_is_counted_and_does_no_harm() -> None:
     assert counters["frames_dropped"] == 0
 
 
+def test_device_does_not_count_what_it_said_itself_where_the_bus_shows_it() -> None:
+    heard: list[can.Message] = []
+    name = f"can:udp_multicast/239.74.163.2?device=inproc&port={free_port()}"
+    with open_dut(name, listener=heard.append) as dut:
+        dut.start()
+        dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+        assert dut.stop()["frames_foreign"] == 0
+    assert sum(each.arbitration_id == 0x18 for each in heard) == N
+
+
 def test_two_devices_on_one_bus_are_found_out() -> None:
     with connect(on_virtual("twins")), pytest.raises(LinkError):
         connect(on_virtual("twins"))

@@ -139,6 +139,14 @@ def test_what_should_be_the_devices_and_is_not_is_dropped(bus: Bus, damaged: can
     assert link.counters["frames_dropped"] == 1
 
 
+def test_what_was_no_frame_is_counted_with_what_was_dropped(bus: Bus) -> None:
+    bus.damaged = 3
+    bus.said.append(frame(0x20))
+    link = CanLink(bus)
+    assert link.receive(1.0) is None
+    assert link.counters["frames_dropped"] == 4
+
+
 def test_message_in_a_frame_of_can_fd_is_taken_where_there_is_can_fd() -> None:
     bus = Bus(is_fd=True)
     bus.said.append(estimate(is_fd=True))
@@ -152,6 +160,19 @@ def test_own_echoes_are_passed_over(bus: Bus, is_rx: bool) -> None:  # noqa: FBT
     bus.said += [frame(0x18, bytes(bus.sent[0].data), is_rx=is_rx), estimate()]
     assert link.receive(1.0) == ESTIMATE
     assert link.counters["frames_foreign"] == 0
+
+
+@pytest.mark.parametrize("is_rx", [True, False])
+def test_own_echoes_are_not_told_and_take_no_time(is_rx: bool) -> None:  # noqa: FBT001
+    bus = Bus(line=CanLine(1_000_000))
+    link = CanLink(bus)
+    told: list[can.Message] = []
+    link.listen(told.append)
+    link.send([SAMPLE])
+    sent_s = link.line_s
+    bus.said.append(frame(0x18, bytes(bus.sent[0].data), is_rx=is_rx))
+    assert link.receive(1.0) is None
+    assert len(told) == 1 and link.line_s == sent_s
 
 
 def test_somebody_else_who_speaks_as_the_harness_ends_the_talk(bus: Bus) -> None:
