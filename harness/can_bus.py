@@ -185,15 +185,17 @@ _MOST_BYTES = 64
 def _is_sound(frame: can.Message) -> bool:
     """Whether its fields are what they should be: python-can takes over what comes from a network."""
     identifier: Any = frame.arbitration_id
+    data: Any = frame.data
+    code: Any = frame.dlc
     bits = 29 if frame.is_extended_id or frame.is_error_frame else 11
     return (
         type(identifier) is int
         and 0 <= identifier < 1 << bits
         and all(isinstance(getattr(frame, flag), bool) for flag in _FLAGS)
-        and isinstance(frame.data, bytes | bytearray)
-        and len(frame.data) <= _MOST_BYTES
-        and type(frame.dlc) is int
-        and 0 <= frame.dlc <= _MOST_BYTES
+        and isinstance(data, bytes | bytearray)
+        and len(data) <= _MOST_BYTES
+        and type(code) is int
+        and 0 <= code <= _MOST_BYTES
     )
 
 

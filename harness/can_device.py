@@ -12,7 +12,7 @@ import can
 
 from harness.can_bus import CanBus
 from harness.catalogue import CATALOGUE_HASH, FirmwareId
-from harness.errors import LinkClosed, LinkError
+from harness.errors import LinkClosed
 from harness.line import CanLine
 from harness.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
 
@@ -193,11 +193,11 @@ class InhabitedBus:
                     for answer in self._device.answers([frame]):
                         self._said[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
-        except Exception as error:  # whatever it is, nobody else in this thread would tell it
+        except Exception as error:  # noqa: BLE001 - whatever ends the thread is told to who waits for it
             self._death = error
 
     def _is_echo(self, frame: can.Message) -> bool:
         """Whether the interface shows the device what it has said itself, as udp_multicast does."""
         if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame or not frame.data:
             return False
-        return self._said.get((frame.arbitration_id, frame.data[0])) == frame.data
+        return self._said.get((frame.arbitration_id, frame.data[0])) == bytes(frame.data)

@@ -1,5 +1,7 @@
-"""The C under libFuzzer and sanitizers of addresses and undefined behaviour: a minute for the core in CI, a quarter for each
-kind of line; briefly elsewhere."""
+"""The C under libFuzzer and sanitizers of addresses and undefined behaviour.
+
+In CI a minute for the core, a quarter for each kind of line; briefly elsewhere.
+"""
 
 from __future__ import annotations
 
