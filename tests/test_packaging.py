@@ -120,9 +120,10 @@ def users_environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 def users_repository(distributions: Path, tmp_path: Path) -> Path:
     """tests/user_repository in a folder of its own, with the sources of the device as the sdist has them."""
     repository = shutil.copytree(CHECKOUT / "tests" / "user_repository", tmp_path / "repository")
-    with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
-        sdist.extractall(tmp_path / "sdist", filter="data")
-    (sources,) = (tmp_path / "sdist").iterdir()
+    unpacked = tmp_path / "sdist"
+    unpacked.mkdir()
+    _run("tar", "-xzf", next(distributions.glob("*.tar.gz")), "-C", unpacked)
+    (sources,) = unpacked.iterdir()
     shutil.copytree(sources / "estimator_c", repository / "vendor" / "estimator_c")
     generate = sources / "estimator_c" / "catalogue" / "generate.py"
     (repository / "vendor" / "generated").mkdir()
