@@ -211,8 +211,9 @@ class Dut:
         """End the run and return the device's counters by name, as far as they have counted in this run.
 
         :raises DeviceError: the device was reset during the run.
+        :raises LinkError: a message was lost, or somebody else spoke as the device.
         """
-        self.identity()
+        self._is_there()  # without forgetting what was heard: who spoke as the device is found out by the next message
         self._control(Command.STOP)
         self._exchange = None
         return {name: value - self._before_run(name) for name, value in self.status().items()}

@@ -54,6 +54,14 @@ def test_as_many_lost_answers_as_there_are_sequence_numbers_are_noticed(first: i
     assert "the device took in 448 samples, where 224 were heard of" in played.why
 
 
+def test_collision_on_the_last_message_of_a_run_is_noticed() -> None:
+    """The genuine one comes when the run is to be stopped."""
+    last = max(number for number, step in enumerate(steps("sample", "can")["from"]) if step == "samples")
+    for seed in range(8):
+        faults = WireFaults((WireFault("collide", "from", last),), seed=seed)
+        assert play(Case(faults, link="can")).outcome == "inconclusive"
+
+
 @pytest.mark.parametrize("kind", ["drop", "duplicate", "reorder", "repeat", "flip"])
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind: str, direction: Direction) -> None:
