@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from harness import config
-from harness.campaign_spec import Case, device_of, open_table
-from harness.campaign_trial import Count, close_devices, count_alarms
-from harness.campaign_workers import Workers
+from harness.campaign.spec import Case, device_of, open_table
+from harness.campaign.trial import Count, close_devices, count_alarms
+from harness.campaign.workers import Workers
 from harness.errors import ConfigurationError
 from harness.scenario import Scenario
 from harness.statistics import ConfidenceSequence, Decision, Design, SequentialTest, lower_rate, upper_rate
@@ -46,7 +46,7 @@ class Question:
     far: float
     confidence: float
     rig: Any
-    """In plain values, as ``campaign_spec.open_table`` takes it."""
+    """In plain values, as ``campaign.spec.open_table`` takes it."""
     device: Any
     scenario: Any
     first_seed: int = 0

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status, pack
 from harness.errors import DeviceError, LinkError, LinkTimeout
-from harness.link import Link
+from harness.links.link import Link
 
 _SEQ = 256
 """Sequence numbers are modulo this."""

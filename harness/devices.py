@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from urllib.parse import unquote
 
 from harness import config
-from harness.child import Child, ChildWire
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
-from harness.faulty_wire import FaultyWire
-from harness.line import CanLine, SerialLine
-from harness.link import FramedLink, Link
-from harness.wire import DEFAULT_BAUD, LIBRARY, DescriptorWire, MemoryWire, PortWire, Wire
-from harness.wire_faults import WireFaults
+from harness.links.child import Child, ChildWire
+from harness.links.faulty_wire import FaultyWire
+from harness.links.line import CanLine, SerialLine
+from harness.links.link import FramedLink, Link
+from harness.links.wire import DEFAULT_BAUD, LIBRARY, DescriptorWire, MemoryWire, PortWire, Wire
+from harness.links.wire_faults import WireFaults
 
 if TYPE_CHECKING:  # python-can takes longer to import than all the rest
-    from harness.can_bus import CanBus, PythonCanBus
+    from harness.links.can_bus import CanBus, PythonCanBus
 
 HOST_PROGRAM = Path(__file__).parent / "bin" / "analogrig-device"
 FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
@@ -205,8 +205,8 @@ class FrameDevice(DeviceDescription):
             raise ValueError("data_bitrate is of CAN FD: say fd = true and the bitrate of the rest")
 
     def open(self) -> Link:
-        from harness.can_link import CanLink
-        from harness.faulty_bus import FaultyBus
+        from harness.links.can_link import CanLink
+        from harness.links.faulty_bus import FaultyBus
 
         faults = self.faults()
         return CanLink(self.bus() if faults is None else FaultyBus(self.bus, faults))
@@ -219,7 +219,7 @@ class FrameDevice(DeviceDescription):
         return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
 
     def fault_kinds(self) -> Collection[str]:
-        from harness.faulty_bus import FaultyBus
+        from harness.links.faulty_bus import FaultyBus
 
         return FaultyBus.HAPPENS
 
@@ -267,7 +267,7 @@ class HostDevice(EitherDevice):
         return host_wire()
 
     def bus(self) -> CanBus:
-        from harness.can_bus import ChildBus, PythonCanBus
+        from harness.links.can_bus import ChildBus, PythonCanBus
 
         child = host_child(["--slcan"])
         try:
@@ -335,7 +335,7 @@ class InprocDevice(EitherDevice):
         return MemoryWire(boot_nonce=secrets.randbits(32), library=self.library_path)
 
     def bus(self) -> CanBus:
-        from harness.can_device import MemoryBus
+        from harness.links.can_device import MemoryBus
 
         return MemoryBus(boot_nonce=secrets.randbits(32), is_fd=self.fd, line=self.line())
 
@@ -363,7 +363,7 @@ class QemuDevice(EitherDevice):
 
     def bus(self) -> CanBus:
         """On the second UART, as a terminal, since python-can's slcan opens nothing else as fast."""
-        from harness.can_bus import ChildBus, PythonCanBus
+        from harness.links.can_bus import ChildBus, PythonCanBus
 
         child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])
         try:
@@ -494,7 +494,7 @@ class CanDevice(FrameDevice):
         )
 
     def bus(self) -> CanBus:
-        from harness.can_bus import PythonCanBus
+        from harness.links.can_bus import PythonCanBus
 
         asked = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
         asked |= {"interface": self.interface or None, "channel": self.channel or None}
@@ -510,8 +510,8 @@ class CanDevice(FrameDevice):
 
     def _answered(self, bus: PythonCanBus, asked: Mapping[str, Any]) -> CanBus:
         """With the device that shall be on it."""
-        from harness.can_bus import ChildBus, PythonCanBus
-        from harness.can_device import InhabitedBus
+        from harness.links.can_bus import ChildBus, PythonCanBus
+        from harness.links.can_device import InhabitedBus
 
         who = self.device or ("inproc" if self.interface == "virtual" else "none")
         if who == "inproc":

@@ -48,7 +48,7 @@ from harness.errors import (
 )
 from harness.estimator_config import EstimatorConfig
 from harness.exchange import Exchange, Packing, RaisedAlarm, Replies, most_answers
-from harness.link import CanListener, Link
+from harness.links.link import CanListener, Link
 from harness.pace import Pace, check_line
 
 _HELLO_AGAIN_S = 0.25

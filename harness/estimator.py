@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from harness.errors import ConfigurationError, LinkError
 from harness.estimator_config import EstimatorConfig
-from harness.wire import LIBRARY
+from harness.links.wire import LIBRARY
 
 
 class StepStatus(enum.IntEnum):

@@ -7,8 +7,8 @@ import math
 from harness.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from harness.devices import DeviceDescription
 from harness.errors import ConfigurationError
-from harness.link import Link
-from harness.wire import Clock
+from harness.links.link import Link
+from harness.links.wire import Clock
 
 
 class Pace:

@@ -274,7 +274,7 @@ def seeds() -> st.SearchStrategy[int]:
 
 def link_faults(kinds: Sequence[str] | None = None, most: int = 3) -> st.SearchStrategy[str]:
     """What goes wrong on a line, as ``--wire-faults`` has it; shrinks to a line without faults."""
-    from harness.faulty_wire import FaultyWire
+    from harness.links.faulty_wire import FaultyWire
 
     where = st.one_of(
         st.builds("{}:{}".format, st.sampled_from(["to", "from"]), st.integers(0, 400)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from harness.advice import advice
-from harness.bus_load import BusLoad, load_of
+from harness.links.bus_load import BusLoad, load_of
 from harness.plant import UNITS
 from harness.run import Run
 from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text

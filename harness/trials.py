@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
+from harness.links.wire import LIBRARY
 from harness.rig import Block, EmulatorRig, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
-from harness.wire import LIBRARY
 
 BLOCK_SAMPLES = 16_384
 """Samples that pass from the circuit to the card and on to the estimator at a time: they stay within the cache."""

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show
 
 if TYPE_CHECKING:
-    from harness.campaign import Tally
-    from harness.campaign_spec import Plan
-    from harness.campaign_workers import Workers
+    from harness.campaign.conduct import Tally
+    from harness.campaign.spec import Plan
+    from harness.campaign.workers import Workers
 
 
 def add(commands: Any) -> None:
@@ -45,10 +45,10 @@ def add_workers(command: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign import conduct, journal_of
-    from harness.campaign_report import write_page
-    from harness.campaign_results import as_json, text
-    from harness.campaign_spec import CampaignSpec, Plan
+    from harness.campaign.conduct import conduct, journal_of
+    from harness.campaign.report import write_page
+    from harness.campaign.results import as_json, text
+    from harness.campaign.spec import CampaignSpec, Plan
     from harness.errors import DeviceError, LinkError, RigError, WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))
@@ -78,7 +78,7 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
     :raises ConfigurationError: they would have to share it.
     """
-    from harness.campaign_workers import Dask, Processes, ThisProcess
+    from harness.campaign.workers import Dask, Processes, ThisProcess
     from harness.errors import ConfigurationError
 
     if alone and (arguments.cluster or (arguments.workers or 1) > 1):
@@ -97,7 +97,7 @@ def progress(plan: Plan) -> Callable[[Tally], None] | None:
         return None
     import time
 
-    from harness.campaign_results import anytime_text
+    from harness.campaign.results import anytime_text
 
     most = len(plan.cells()) * plan.spec.trials
     next_s = 0.0

@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign_spec import one_worker_only, rig_table
+    from harness.campaign.spec import one_worker_only, rig_table
     from harness.certificate import certify, question_of
     from harness.devices import describe
     from harness.errors import DeviceError, LinkError, RigError, WorkerError

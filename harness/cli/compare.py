@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
 
 if TYPE_CHECKING:
-    from harness.comparison import Comparison
+    from harness.campaign.comparison import Comparison
 
 
 def add(commands: Any) -> None:
@@ -39,7 +39,7 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from harness.comparison import compare, load
+    from harness.campaign.comparison import compare, load
 
     found = compare(load(arguments.a), load(arguments.b), arguments.alpha)
     show(json.dumps(asdict(found)) if arguments.json else _text(found))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from harness.advice import advice
-from harness.bus_load import load_of
+from harness.links.bus_load import load_of
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
 from harness.summary import lamps_text, load_text

@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from harness import frame
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -23,7 +22,8 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.wire import LIBRARY, MemoryWire
+from harness.links import frame
+from harness.links.wire import LIBRARY, MemoryWire
 from tests.estimator_c.test_device import NONCE, blocks, codes
 
 EXTENDED, REMOTE, FD, ERROR = 1, 2, 4, 8

@@ -37,7 +37,7 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.wire import LIBRARY
+from harness.links.wire import LIBRARY
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 DBC = ESTIMATOR / "catalogue" / "analogrig.dbc"

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness import frame
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -46,8 +45,9 @@ from harness.catalogue import (
     Trigger,
     pack,
 )
-from harness.link import FramedLink
-from harness.wire import LIBRARY, MemoryWire
+from harness.links import frame
+from harness.links.link import FramedLink
+from harness.links.wire import LIBRARY, MemoryWire
 from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import FULL

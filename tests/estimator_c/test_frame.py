@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from harness import frame
 from harness.catalogue import CATALOGUE_HASH, LAYOUTS
-from harness.wire import LIBRARY
+from harness.links import frame
+from harness.links.wire import LIBRARY
 
 
 class Decoder(ctypes.Structure):

@@ -20,7 +20,7 @@ from can.util import CAN_FD_DLC
 
 from harness.catalogue import Alarm, unpack
 from harness.devices import HOST_PROGRAM
-from harness.wire import LIBRARY
+from harness.links.wire import LIBRARY
 from tests.estimator_c.shells import (
     EXTENDED,
     FD,

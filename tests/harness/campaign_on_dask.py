@@ -14,9 +14,9 @@ from pathlib import Path
 def main(spec: str, out: str) -> None:
     from distributed import LocalCluster
 
-    from harness.campaign import Tally, conduct
-    from harness.campaign_spec import CampaignSpec, Plan
-    from harness.campaign_workers import Dask
+    from harness.campaign.conduct import Tally, conduct
+    from harness.campaign.spec import CampaignSpec, Plan
+    from harness.campaign.workers import Dask
 
     with LocalCluster(  # type: ignore[no-untyped-call]  # Dask is annotated in part
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"

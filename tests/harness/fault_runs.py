@@ -26,23 +26,23 @@ from numpy.typing import NDArray
 
 from emulator.excitation import Excitation
 from harness.bench import Bench
-from harness.can_bus import CanBus
-from harness.can_device import MemoryBus
-from harness.can_link import CanLink
 from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
 from harness.devices import InprocDevice
 from harness.dut import Dut, Replies
 from harness.errors import AnalogrigError
 from harness.estimator_config import EstimatorConfig
-from harness.faulty_bus import FaultyBus
-from harness.faulty_wire import FaultyWire
-from harness.link import FramedLink, Link
+from harness.links.can_bus import CanBus
+from harness.links.can_device import MemoryBus
+from harness.links.can_link import CanLink
+from harness.links.faulty_bus import FaultyBus
+from harness.links.faulty_wire import FaultyWire
+from harness.links.link import FramedLink, Link
+from harness.links.wire import MemoryWire, Wire
+from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from harness.rig import Block, Performance
 from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
-from harness.wire import MemoryWire, Wire
-from harness.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 
 N = 60
 MOST_N = 480

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from harness.bench import Bench
-from harness.campaign import Tally, conduct, journal_of
-from harness.campaign_journal import Journal
-from harness.campaign_results import Results, Summary, text
-from harness.campaign_spec import CampaignSpec, Chunk, Plan, one_worker_only
-from harness.campaign_trial import close_devices, play_chunk, row
-from harness.campaign_workers import MOST_DEATHS, Processes, ThisProcess
+from harness.campaign.conduct import Tally, conduct, journal_of
+from harness.campaign.journal import Journal
+from harness.campaign.results import Results, Summary, text
+from harness.campaign.spec import CampaignSpec, Chunk, Plan, one_worker_only
+from harness.campaign.trial import close_devices, play_chunk, row
+from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
 from harness.devices import describe
 from harness.dut import open_dut

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
-from harness.campaign_report import render, write_page
-from harness.campaign_results import Results
-from harness.campaign_spec import CampaignSpec, Grid, Plan
-from harness.campaign_trial import Row
+from harness.campaign.report import render, write_page
+from harness.campaign.results import Results
+from harness.campaign.spec import CampaignSpec, Grid, Plan
+from harness.campaign.trial import Row
 from tests.harness.test_report_browser import Watched, browser
 
 __all__ = ["browser"]

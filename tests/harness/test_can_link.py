@@ -7,15 +7,15 @@ from collections import deque
 import can
 import pytest
 
-from harness.can_device import MemoryBus
-from harness.can_link import CanLink
 from harness.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
 from harness.conversation import Conversation
 from harness.devices import InprocDevice
 from harness.dut import Dut
 from harness.errors import ConfigurationError, LinkError, LinkTimeout
-from harness.line import CanLine
-from harness.wire import VirtualClock
+from harness.links.can_device import MemoryBus
+from harness.links.can_link import CanLink
+from harness.links.line import CanLine
+from harness.links.wire import VirtualClock
 
 SAMPLE = Sample(7, 0, 513, 1000, 2000)
 ESTIMATE = Estimate(3, 1, 513, 0.5)

@@ -14,12 +14,12 @@ import pytest
 from scipy import stats
 
 from harness.bench import Bench
-from harness.campaign_spec import rig_table
-from harness.campaign_trial import Count, Row
-from harness.campaign_workers import Processes, ThisProcess
+from harness.campaign.comparison import Difference, _worded, compare, load, permutation_p, sign_flip_p
+from harness.campaign.spec import rig_table
+from harness.campaign.trial import Count, Row
+from harness.campaign.workers import Processes, ThisProcess
 from harness.certificate import Certificate, Question, certify, question_of
 from harness.cli import main
-from harness.comparison import Difference, _worded, compare, load, permutation_p, sign_flip_p
 from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from harness import child as child_module
 from harness.catalogue import CATALOGUE_HASH, Hello, Identify
-from harness.child import TETHER, Child, ChildWire
 from harness.devices import host_wire
 from harness.errors import LinkClosed, LinkError
-from harness.link import FramedLink, Link
+from harness.links import child as child_module
+from harness.links.child import TETHER, Child, ChildWire
+from harness.links.link import FramedLink, Link
 from tests.harness.processes import LONG_S, children, ends
 
 

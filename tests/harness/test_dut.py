@@ -35,7 +35,6 @@ from harness.catalogue import (
     Stepped,
     SteppedFlag,
 )
-from harness.child import ChildWire
 from harness.devices import DeviceDescription, HostDevice, InprocDevice, SerialDevice, from_table, host_wire
 from harness.dut import Dut, Replies, connect, open_dut, reopen_dut
 from harness.errors import (
@@ -48,9 +47,10 @@ from harness.errors import (
     LinkTimeout,
 )
 from harness.estimator_config import EstimatorConfig
-from harness.link import CanListener, FramedLink, Link
+from harness.links.child import ChildWire
+from harness.links.link import CanListener, FramedLink, Link
+from harness.links.wire import MemoryWire, VirtualClock
 from harness.run import LOST
-from harness.wire import MemoryWire, VirtualClock
 from tests.harness.processes import children
 
 N = 400

@@ -12,8 +12,8 @@ from harness import config
 from harness.catalogue import Configure, Configured, Identify, Key, Trigger
 from harness.errors import ConfigurationError
 from harness.estimator_config import EstimatorConfig
-from harness.link import FramedLink
-from harness.wire import MemoryWire
+from harness.links.link import FramedLink
+from harness.links.wire import MemoryWire
 
 
 def test_defaults_are_those_of_the_device() -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from harness.devices import describe
-from harness.faulty_wire import FaultyWire
-from harness.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from harness.links.faulty_wire import FaultyWire
+from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from tests.harness.fault_runs import (
     BACK_AT,
     FAULTY,

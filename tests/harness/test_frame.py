@@ -8,7 +8,6 @@ import random
 
 import pytest
 
-from harness import frame
 from harness.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -24,6 +23,7 @@ from harness.catalogue import (
     pack,
     unpack,
 )
+from harness.links import frame
 
 POLYNOMIAL = 0x82F63B78
 """Castagnoli's, reflected."""

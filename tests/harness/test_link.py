@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from harness import frame
 from harness.catalogue import (
     CATALOGUE_HASH,
     Command,
@@ -27,8 +26,9 @@ from harness.catalogue import (
 )
 from harness.devices import HOST_PROGRAM
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.link import FramedLink
-from harness.wire import MemoryWire, PortWire
+from harness.links import frame
+from harness.links.link import FramedLink
+from harness.links.wire import MemoryWire, PortWire
 
 LONG_S = 20.0
 """For what comes at once unless something is broken."""
@@ -121,7 +121,7 @@ def test_other_end_that_hangs_up_is_told_from_silence(link: FramedLink, terminal
 
 
 def test_line_that_takes_nothing_is_an_error_not_a_hang(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.wire.WRITE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("harness.links.wire.WRITE_TIMEOUT_S", 0.05)
     link = at_port(terminal.path)
     with pytest.raises(LinkError, match="takes nothing"):
         link.send([Identify(0)] * 100_000)

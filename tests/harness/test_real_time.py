@@ -12,13 +12,13 @@ from harness.catalogue import BLOCK_SAMPLES, Sample
 from harness.devices import DeviceDescription, HostDevice, InprocDevice
 from harness.dut import Dut, connect
 from harness.errors import ConfigurationError
-from harness.line import SerialLine
-from harness.link import FramedLink
+from harness.links.line import SerialLine
+from harness.links.link import FramedLink
+from harness.links.wire import MemoryWire, VirtualClock
 from harness.rig import open_rig
 from harness.run import UNREPORTED, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
-from harness.wire import MemoryWire, VirtualClock
 
 PERIOD_S = 5e-5
 THESIS = Scenario.load("thesis")

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from harness import frame
 from harness.catalogue import Sample, pack
 from harness.devices import describe
 from harness.errors import ConfigurationError, LinkClosed
-from harness.faulty_wire import FaultyWire
-from harness.wire import VirtualClock
-from harness.wire_faults import WireFault, WireFaults
+from harness.links import frame
+from harness.links.faulty_wire import FaultyWire
+from harness.links.wire import VirtualClock
+from harness.links.wire_faults import WireFault, WireFaults
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 

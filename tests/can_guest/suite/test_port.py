@@ -28,8 +28,8 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.child import Child
 from harness.devices import HOST_PROGRAM
+from harness.links.child import Child
 from tests.harness.processes import LONG_S, children
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan

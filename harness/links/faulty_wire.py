@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Any, ClassVar
 
-from harness import frame
 from harness.catalogue import CATALOGUE_HASH, Hello, pack, unpack
-from harness.line import BITS_PER_BYTE
-from harness.wire import DEFAULT_BAUD, MemoryWire, VirtualClock, Wire
-from harness.wire_faults import DIRECTIONS, Direction, FaultyLine, Lane, WireFaults
+from harness.links import frame
+from harness.links.line import BITS_PER_BYTE
+from harness.links.wire import DEFAULT_BAUD, MemoryWire, VirtualClock, Wire
+from harness.links.wire_faults import DIRECTIONS, Direction, FaultyLine, Lane, WireFaults
 
 STRANGERS_HASH = CATALOGUE_HASH ^ 0x5A5A5A5A
 

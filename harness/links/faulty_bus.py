@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 
 import can
 
-from harness.can_bus import CanBus
-from harness.can_device import MemoryBus
-from harness.can_link import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
 from harness.catalogue import LAYOUTS, Hello, pack, unpack
-from harness.faulty_wire import STRANGERS_HASH
-from harness.line import CanLine
-from harness.wire import VirtualClock
-from harness.wire_faults import LONGEST_DELAY_S, Direction, FaultyLine, Lane, WireFaults
+from harness.links.can_bus import CanBus
+from harness.links.can_device import MemoryBus
+from harness.links.can_link import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
+from harness.links.faulty_wire import STRANGERS_HASH
+from harness.links.line import CanLine
+from harness.links.wire import VirtualClock
+from harness.links.wire_faults import LONGEST_DELAY_S, Direction, FaultyLine, Lane, WireFaults
 
 _FOREIGN = range(max(layout.id for layout in LAYOUTS.values()) + 1, 0x800)
 """Identifiers that give way to all of ours."""

@@ -20,7 +20,7 @@ from harness.errors import ConfigurationError, LinkClosed, LinkError
 DEFAULT_BAUD = 115_200
 WRITE_TIMEOUT_S = 2.0
 
-LIBRARY = Path(__file__).with_name("_device.so")
+LIBRARY = Path(__file__).parents[1] / "_device.so"
 
 _READ_BYTES = 65_536
 _POLL_S = 1e-3

@@ -16,10 +16,10 @@ from typing import Any, Protocol
 import can
 from can.interfaces.slcan import slcanBus
 
-from harness.child import Child
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.line import CanLine
-from harness.wire import WRITE_TIMEOUT_S, Clock
+from harness.links.child import Child
+from harness.links.line import CanLine
+from harness.links.wire import WRITE_TIMEOUT_S, Clock
 
 RECEIVED_AHEAD_N = 200
 """So many frames the system keeps for us at least: half of what a socket's buffer of 208 kB holds."""

@@ -20,8 +20,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.campaign_results import Results, label
-from harness.campaign_trial import Row, row
+from harness.campaign.results import Results, label
+from harness.campaign.trial import Row, row
 from harness.errors import RecordingError
 from harness.plant import PARAMETERS
 from harness.run import Run

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import can
 
-from harness.can_bus import CanBus
 from harness.catalogue import CATALOGUE_HASH, FirmwareId
 from harness.errors import LinkClosed
-from harness.line import CanLine
-from harness.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
+from harness.links.can_bus import CanBus
+from harness.links.line import CanLine
+from harness.links.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
 
 MOST_BYTES = 64
 """In a frame of CAN FD."""

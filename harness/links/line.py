@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from harness import frame
-from harness.bus_load import CLASSIC_BYTES, frame_s, message_s
 from harness.catalogue import LAYOUTS, Message
+from harness.links import frame
+from harness.links.bus_load import CLASSIC_BYTES, frame_s, message_s
 
 if TYPE_CHECKING:
     import can

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from harness.errors import LinkClosed, LinkError
-from harness.wire import Wire
+from harness.links.wire import Wire
 
-TETHER = Path(__file__).parent / "bin" / "analogrig-tether"
+TETHER = Path(__file__).parents[1] / "bin" / "analogrig-tether"
 
 START_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0

@@ -12,11 +12,11 @@ from collections.abc import Iterable, Mapping
 
 import can
 
-from harness.bus_load import CLASSIC_BYTES
-from harness.can_bus import CanBus
 from harness.catalogue import LAYOUTS, Message, pack, unpack
 from harness.errors import LinkError
-from harness.link import CanListener
+from harness.links.bus_load import CLASSIC_BYTES
+from harness.links.can_bus import CanBus
+from harness.links.link import CanListener
 
 _OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
 _DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}

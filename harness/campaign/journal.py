@@ -14,8 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from harness.campaign_spec import Chunk
-from harness.campaign_trial import Row
+from harness.campaign.spec import Chunk
+from harness.campaign.trial import Row
 from harness.errors import ConfigurationError, RecordingError
 
 FORMAT = "analogrig-campaign-journal"

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.campaign_results import CONFIDENCE, Results, Summary, label
+from harness.campaign.results import CONFIDENCE, Results, Summary, label
 from harness.report.page import FOLDER, assembled
 from harness.storage import replacing
 

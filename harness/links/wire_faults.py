@@ -17,7 +17,7 @@ from random import Random
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from harness.errors import ConfigurationError, LinkClosed
-from harness.wire import Clock
+from harness.links.wire import Clock
 
 Direction = Literal["to", "from"]
 """To the device, or from it."""

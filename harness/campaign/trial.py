@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.bench import INTERRUPTED_BY_USER, Bench
-from harness.campaign_spec import Case, Chunk, Plan, device_of, open_table
+from harness.campaign.spec import Case, Chunk, Plan, device_of, open_table
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
 from harness.rig import EmulatorRig, Rig

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from harness.campaign_journal import Journal
-from harness.campaign_results import Results
-from harness.campaign_spec import Chunk, Plan
-from harness.campaign_trial import Row, close_devices, play_chunk, samples_of
-from harness.campaign_workers import Workers
+from harness.campaign.journal import Journal
+from harness.campaign.results import Results
+from harness.campaign.spec import Chunk, Plan
+from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
+from harness.campaign.workers import Workers
 from harness.statistics import ConfidenceSequence, Decision
 
 _EXPOSURE = {"missed": "visible", "false_alarms": "samples"}

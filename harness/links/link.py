@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
-from harness import frame
 from harness.catalogue import Message, pack, unpack
-from harness.line import Line, SerialLine
-from harness.wire import Clock, Wire
+from harness.links import frame
+from harness.links.line import Line, SerialLine
+from harness.links.wire import Clock, Wire
 
 if TYPE_CHECKING:
     import can

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from harness import config
-from harness.campaign_spec import Cell, Plan
-from harness.campaign_trial import Row, samples_of
+from harness.campaign.spec import Cell, Plan
+from harness.campaign.trial import Row, samples_of
 from harness.errors import ConfigurationError, RecordingError
 from harness.statistics import ConfidenceSequence
 from harness.storage import replacing

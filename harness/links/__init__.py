@@ -1,0 +1,1 @@
+"""What carries messages between harness and device: wires, CAN buses, links over them, their faults, their load."""
