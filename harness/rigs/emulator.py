@@ -31,7 +31,7 @@ from emulator import (
 from emulator.opamp import preset
 from harness.errors import AnalogrigError, ConfigurationError, RigError
 from harness.plant import Plant
-from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Performance
+from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
 from harness.run import CHANNELS, Channel
 from harness.scenario import Scenario
 
@@ -204,9 +204,8 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            segments=scenario.segments(),
             blocks=_sampled(volts, Sampler(self._card, _Stream.CARD.generator(seed))),
-            lamps=lambda: _lit(computer, probes_per_sample(self._card)),
+            hindsight=lambda: Hindsight(scenario.segments(), _lit(computer, probes_per_sample(self._card))),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
