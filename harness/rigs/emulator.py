@@ -134,7 +134,7 @@ class EmulatorDescription:
     name: str = ""
 
 
-class _Stream(enum.IntEnum):
+class Stream(enum.IntEnum):
     """Independent streams of random numbers that one seed gives: to draw more of one changes none of the others."""
 
     EXCITATION = 0
@@ -182,11 +182,11 @@ class EmulatorRig:
         """
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
-            excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
+            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = _settings(computer, tweak.given())
+                settings = settings_of(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
@@ -196,7 +196,7 @@ class EmulatorRig:
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
-            jitter = _Stream.APERTURE.generator(seed)
+            jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
             )
@@ -204,7 +204,7 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            blocks=_sampled(volts, Sampler(self._card, _Stream.CARD.generator(seed))),
+            blocks=_sampled(volts, Sampler(self._card, Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(scenario.segments(), _lit(computer, probes_per_sample(self._card))),
         )
 
@@ -213,20 +213,18 @@ class EmulatorRig:
         computer = SuspensionComputer(
             scenario.plant.set,
             opamp=self._amplifier,
-            rng=_Stream.COMPONENTS.generator(seed),
+            rng=Stream.COMPONENTS.generator(seed),
             offset_v=drawn.offset_v,
             components=drawn.fitted(seed),
             sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
         )
-        computer.set(**_settings(computer, scenario.plant.given()))
+        computer.set(**settings_of(computer, scenario.plant.given()))
         return computer
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
         drawn = self._description.computer
         grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
-        return NoisySuspension(
-            computer, _Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c
-        )
+        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c)
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {
@@ -271,7 +269,7 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
-def _settings(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
     """The scenario's names of the parameters as the program has them."""
     names = {
         field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
