@@ -1,8 +1,10 @@
-"""SCPI: program messages in, responses out, for whatever instrument has a table of commands (SCPI 1999, IEEE 488.2).
+"""SCPI: program messages in, response messages out, for whatever instrument has a table of commands.
 
-A program message is a line; a command a header and its arguments, `ACQ:DEC 8`; several stand in a line behind semicolons. A
-header's words may be short or long, in capitals or not: the pattern `SYSTem:ERRor` is met by `syst:err` and
-`SYSTEM:ERROR`. `#` in a pattern stands for a number, `[...]` for words that may be left out.
+A program message is a line; a command a header and its arguments, `ACQ:DEC 8`; several stand in a line behind
+semicolons, and what they answer comes in a line too, behind semicolons (IEEE 488.2, 8.4). A header's words may be short
+or long, in capitals or not: the pattern `SYSTem:ERRor` is met by `syst:err` and `SYSTEM:ERROR`. `#` in a pattern stands
+for a number, 1 if there is none; `[...]` for words that may be left out. Behind a semicolon a header may begin where
+the one before it left off (SCPI 1999, 6.2.4), or at the root, with a colon or without.
 
 What is wrong goes into the queue of errors, which `SYST:ERR?` reads, and has no other effect.
 """
@@ -13,39 +15,58 @@ import itertools
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 MOST_LINE_BYTES = 4096
 MOST_ARGUMENTS = 16
 MOST_ERRORS = 32
-"""The queue holds no more; the last place is then taken by "queue overflow" (SCPI 1999, 21.8)."""
+"""The queue holds no more; the last place is then taken by "queue overflow" (SCPI 1999, 21.8.1)."""
+END = b"\r\n"
+
+ERRORS = {
+    0: "No error",
+    -101: "Invalid character",
+    -102: "Syntax error",
+    -104: "Data type error",
+    -108: "Parameter not allowed",
+    -109: "Missing parameter",
+    -113: "Undefined header",
+    -114: "Header suffix out of range",
+    -221: "Settings conflict",
+    -222: "Data out of range",
+    -223: "Too much data",
+    -224: "Illegal parameter value",
+    -230: "Data corrupt or stale",
+    -350: "Queue overflow",
+    -363: "Input buffer overrun",
+}
+"""SCPI 1999, 21.8.9 to 21.8.11."""
+_MOST_ERROR_CHARACTERS = 255
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_HEADER = re.compile(r"[*:A-Za-z_][*:\w]*\??")
+_HEADER = re.compile(r"(?:\*|:?[A-Za-z])[\w:]*\??")
 
 
 class ScpiError(Exception):
-    """A number of SCPI 1999, 21.8, and what it means."""
+    """One of ERRORS, and what it is here."""
 
-    def __init__(self, number: int, text: str) -> None:
-        super().__init__(text)
+    def __init__(self, number: int, detail: str = "") -> None:
+        super().__init__(number, detail)
         self.number = number
+        self._detail = detail
 
     def __str__(self) -> str:
-        return f'{self.number},"{self.args[0]}"'
+        text = ";".join(filter(None, (ERRORS[self.number], self._detail)))
+        return f'{self.number},"{text[:_MOST_ERROR_CHARACTERS]}"'
 
 
-def undefined_header(header: str) -> ScpiError:
-    return ScpiError(-113, f"Undefined header: {_shown(header)}")
+class DropOut(Exception):  # noqa: N818 - the word of the field
+    """The instrument ceases to answer, in the middle of a response."""
 
-
-def out_of_range(what: str) -> ScpiError:
-    return ScpiError(-222, f"Data out of range: {what}")
-
-
-def conflict(what: str) -> ScpiError:
-    return ScpiError(-221, f"Settings conflict: {what}")
+    def __init__(self, *, hangs_up: bool) -> None:
+        super().__init__("the connection is closed" if hangs_up else "nothing more is said")
+        self.hangs_up = hangs_up
 
 
 @dataclass(frozen=True)
@@ -60,38 +81,50 @@ class Call:
         """An argument that is one of some words, in capitals."""
         word = self._argument(at).upper()
         if word not in allowed:
-            raise ScpiError(-224, f"Illegal parameter value: {_shown(word)}, it may be {', '.join(allowed)}")
+            raise ScpiError(-224, f"{_shown(word)}, it may be {', '.join(allowed)}")
         return word
 
     def number(self, at: int, low: float, high: float) -> float:
         """An argument that is a number from ``low`` to ``high``."""
         text = self._argument(at)
         if not _NUMBER.fullmatch(text):
-            raise ScpiError(-104, f"Data type error: {_shown(text)} is no number")
+            raise ScpiError(-104, f"{_shown(text)} is no number")
         value = float(text)
         if not (math.isfinite(value) and low <= value <= high):
-            raise out_of_range(f"{_shown(text)}, it may be {low:g} to {high:g}")
+            raise ScpiError(-222, f"{_shown(text)}, it may be {low:g} to {high:g}")
         return value
 
     def whole(self, at: int, low: int, high: int) -> int:
         """An argument that is a whole number from ``low`` to ``high``."""
         value = self.number(at, low, high)
         if value != int(value):
-            raise ScpiError(-104, f"Data type error: {_shown(self._argument(at))} is no whole number")
+            raise ScpiError(-104, f"{_shown(self._argument(at))} is no whole number")
         return int(value)
+
+    def switch(self, at: int) -> bool:
+        """An argument that is ON or OFF, or 1 or 0."""
+        return self.word(at, ("ON", "OFF", "1", "0")) in ("ON", "1")
 
     def expect(self, count: int) -> None:
         """That there are no more arguments than that."""
         if len(self.arguments) > count:
-            raise ScpiError(-108, f"Parameter not allowed: {_shown(self.arguments[count])}")
+            raise ScpiError(-108, _shown(self.arguments[count]))
 
     def _argument(self, at: int) -> str:
         if at >= len(self.arguments):
-            raise ScpiError(-109, "Missing parameter")
+            raise ScpiError(-109)
         return self.arguments[at]
 
 
-Response = str | bytes | None
+@dataclass(frozen=True)
+class Broken:
+    """A response of which the first half is sent, and then nothing any more: DropOut."""
+
+    response: str | bytes
+    hangs_up: bool
+
+
+Response = str | bytes | Broken | None
 """What a query answers: a text, or a block of bytes as IEEE 488.2 has them; None for a command."""
 
 Command = Callable[[Call], Response]
@@ -100,64 +133,68 @@ Command = Callable[[Call], Response]
 class Interpreter:
     """Takes lines, calls commands, keeps the errors of one connection."""
 
-    def __init__(self, commands: Mapping[str, Command]) -> None:
-        """``commands``: pattern to what it does."""
-        own: dict[str, Command] = {
-            "*CLS": self._clear,
-            "SYSTem:ERRor[:NEXT]?": self._next_error,
-            "SYSTem:ERRor:COUNt?": lambda _: str(len(self._errors)),
+    def __init__(self, commands: Mapping[str, tuple[int, Command]]) -> None:
+        """``commands``: by pattern the number of arguments it takes at most, and what it does."""
+        own: dict[str, tuple[int, Command]] = {
+            "*CLS": (0, lambda _: self._errors.clear()),
+            "SYSTem:ERRor[:NEXT]?": (0, lambda _: self._next_error()),
+            "SYSTem:ERRor:COUNt?": (0, lambda _: str(len(self._errors))),
         }
-        self._commands = [(_expression(pattern), command) for pattern, command in (*commands.items(), *own.items())]
+        self._commands = [
+            (_expression(pattern), most, command) for pattern, (most, command) in (*commands.items(), *own.items())
+        ]
         self._errors: deque[ScpiError] = deque()
 
-    def enter(self, line: bytes) -> bytes:
-        """One line without its end; what is to be sent back, its ends included."""
+    def enter(self, line: bytes) -> Iterator[bytes]:
+        """One line without its end; yields what is to be sent back, in a part for each command, perhaps empty.
+
+        :raises DropOut: the instrument is no longer there.
+        """
         try:
             text = line.decode("ascii")
         except UnicodeDecodeError:
-            self.refuse(ScpiError(-101, "Invalid character"))
-            return b""
-        return b"".join(self._response(part) for part in text.split(";"))
+            self.refuse(ScpiError(-101))
+            return
+        separator, path = b"", ""
+        for unit in text.split(";"):
+            try:
+                response, path = self._execute(unit.strip(), path)
+            except ScpiError as error:
+                self.refuse(error)
+                response = None
+            yield b"" if response is None else separator + _as_sent(response)
+            if isinstance(response, Broken):
+                raise DropOut(hangs_up=response.hangs_up)
+            separator = separator if response is None else b";"
+        yield END if separator else b""
 
     def refuse(self, error: ScpiError) -> None:
         """Remember what was wrong."""
         if len(self._errors) < MOST_ERRORS:
             self._errors.append(error)
         else:
-            self._errors[-1] = ScpiError(-350, "Queue overflow")
+            self._errors[-1] = ScpiError(-350)
 
-    def _response(self, text: str) -> bytes:
-        text = text.strip()
-        if not text:
-            return b""
-        try:
-            response = self._execute(text)
-        except ScpiError as error:
-            self.refuse(error)
-            return b""
-        if response is None:
-            return b""
-        return (response.encode("ascii") if isinstance(response, str) else block(response)) + b"\r\n"
-
-    def _execute(self, text: str) -> Response:
-        header, _, rest = text.partition(" ")
+    def _execute(self, unit: str, path: str) -> tuple[Response, str]:
+        """Response of a command, and where the next header may begin."""
+        if not unit:
+            return None, path
+        header, *rest = unit.split(maxsplit=1)
         if not _HEADER.fullmatch(header):
-            raise ScpiError(-102, f"Syntax error: {_shown(header)}")
-        arguments = tuple(part.strip() for part in rest.split(",")) if rest.strip() else ()
+            raise ScpiError(-102, _shown(header))
+        arguments = tuple(part.strip() for part in rest[0].split(",")) if rest else ()
         if len(arguments) > MOST_ARGUMENTS:
-            raise ScpiError(-108, "Parameter not allowed: too many")
-        for expression, command in self._commands:
-            if found := expression.fullmatch(header.removeprefix(":")):
-                return command(Call(tuple(int(number) for number in found.groups()), arguments))
-        raise undefined_header(header)
+            raise ScpiError(-108, f"more than {MOST_ARGUMENTS}")
+        for full in (path + header, header.removeprefix(":")):
+            for expression, most, command in self._commands:
+                if found := expression.fullmatch(full):
+                    call = Call(tuple(int(number or 1) for number in found.groups()), arguments)
+                    call.expect(most)
+                    return command(call), path if header.startswith("*") else full[: full.rfind(":") + 1]
+        raise ScpiError(-113, _shown(header))
 
-    def _clear(self, call: Call) -> None:
-        call.expect(0)
-        self._errors.clear()
-
-    def _next_error(self, call: Call) -> str:
-        call.expect(0)
-        return str(self._errors.popleft()) if self._errors else '0,"No error"'
+    def _next_error(self) -> str:
+        return str(self._errors.popleft() if self._errors else ScpiError(0))
 
 
 def block(content: bytes) -> bytes:
@@ -166,28 +203,29 @@ def block(content: bytes) -> bytes:
     return f"#{len(length)}{length}".encode("ascii") + content
 
 
+def _as_sent(response: str | bytes | Broken) -> bytes:
+    """As it goes out; of a broken one the first half."""
+    if isinstance(response, Broken):
+        whole = _as_sent(response.response)
+        return whole[: len(whole) // 2]
+    return response.encode("ascii") if isinstance(response, str) else block(response)
+
+
+_PARTS = {"[": "(?:", "]": ")?", "#": r"(\d{0,4})", "?": r"\?", "*": r"\*", ":": ":"}
+
+
 def _expression(pattern: str) -> re.Pattern[str]:
     """What a header of the pattern may look like."""
-    parts = re.split(r"([:\[\]#?*]|\w+)", pattern)
-    out = []
-    for part in filter(None, parts):
-        match part:
-            case "[":
-                out.append("(?:")
-            case "]":
-                out.append(")?")
-            case "#":
-                out.append(r"([1-9]\d?)")
-            case "?" | "*":
-                out.append(re.escape(part))
-            case ":":
-                out.append(":")
-            case _:
-                short = "".join(itertools.takewhile(lambda c: not c.islower(), part))
-                out.append(f"(?:{short}|{part})")
-    return re.compile("".join(out), re.IGNORECASE)
+    return re.compile("".join(map(_part, re.findall(r"\w+|.", pattern))), re.IGNORECASE)
+
+
+def _part(part: str) -> str:
+    if part in _PARTS:
+        return _PARTS[part]
+    short = "".join(itertools.takewhile(lambda letter: not letter.islower(), part))
+    return f"(?:{part}|{short})"
 
 
 def _shown(text: str) -> str:
     """Of what a client sent, what an error may repeat."""
-    return text.replace('"', "'")[:40]
+    return "".join(letter if letter.isprintable() and letter != '"' else "'" for letter in text[:40])
