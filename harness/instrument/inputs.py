@@ -18,7 +18,8 @@ LOOKS_PER_SAMPLE = 8
 """So often the leads are looked at while the instrument averages over one of its samples."""
 
 MOST_SKEW_S = 1e-3
-MOST_NOISE_V = 100.0
+MOST_INPUT_V = 100.0
+MOST_GAIN_ERROR = 0.5
 CHANNELS_N = 2
 
 Volts = NDArray[np.float64]
@@ -31,13 +32,22 @@ class InputFaults:
 
     noise_v: tuple[float, float] = (0.0, 0.0)
     """rms, on IN1 and IN2, before quantisation."""
+    gain_error: tuple[float, float] = (0.0, 0.0)
+    """A fraction."""
+    offset_v: tuple[float, float] = (0.0, 0.0)
     skew_s: float = 0.0
     """By so much IN2 is taken later than IN1; earlier, if it is negative."""
 
     def __post_init__(self) -> None:
         for noise_v in self.noise_v:
-            if not 0.0 <= noise_v <= MOST_NOISE_V:
-                raise ValueError(f"noise_v must be 0 to {MOST_NOISE_V:g}, not {noise_v:g}")
+            if not 0.0 <= noise_v <= MOST_INPUT_V:
+                raise ValueError(f"noise_v must be 0 to {MOST_INPUT_V:g}, not {noise_v:g}")
+        for gain_error in self.gain_error:
+            if not abs(gain_error) <= MOST_GAIN_ERROR:
+                raise ValueError(f"gain_error must be within +-{MOST_GAIN_ERROR:g}, not {gain_error:g}")
+        for offset_v in self.offset_v:
+            if not abs(offset_v) <= MOST_INPUT_V:
+                raise ValueError(f"offset_v must be within +-{MOST_INPUT_V:g}, not {offset_v:g}")
         if not abs(self.skew_s) <= MOST_SKEW_S:
             raise ValueError(f"skew_s must be within +-{MOST_SKEW_S:g}, not {self.skew_s:g}")
 
@@ -79,11 +89,15 @@ class Inputs:
 
     def codes(self, volts: Volts, switches: Sequence[str]) -> Codes:
         """What the converters make of samples: (n, 2), 0 for 0 V. ``switches``: the range of each channel."""
-        ranges_v = tuple((-RANGES_V[switch], RANGES_V[switch]) for switch in switches)
-        noise_lsb = tuple(
-            noise_v / lsb_v(switch) for noise_v, switch in zip(self._faults.noise_v, switches, strict=True)
+        lsbs_v = np.array([lsb_v(switch) for switch in switches])
+        card = Card(
+            bits=BITS,
+            ranges_v=tuple((-RANGES_V[switch], RANGES_V[switch]) for switch in switches),
+            noise_lsb=tuple((self._faults.noise_v / lsbs_v).tolist()),
+            gain_error=self._faults.gain_error,
+            offset_lsb=tuple((self._faults.offset_v / lsbs_v).tolist()),
         )
-        codes, _ = Sampler(Card(bits=BITS, ranges_v=ranges_v, noise_lsb=noise_lsb), self._rng).sample(volts)
+        codes, _ = Sampler(card, self._rng).sample(volts)
         return (codes.astype(np.int32) - (1 << (BITS - 1))).astype(np.int16)
 
 
