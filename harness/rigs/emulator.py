@@ -70,6 +70,20 @@ class ComputerDescription:
         graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
         return dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
 
+    def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+        """The machine that the seed gives, wired as a program, its pots as that has them.
+
+        :raises EmulatorError: it cannot be.
+        """
+        return SuspensionComputer(
+            program,
+            opamp=preset(self.op_amp),
+            rng=Stream.COMPONENTS.generator(seed),
+            offset_v=self.offset_v,
+            components=self.fitted(seed),
+            sample_rate_hz=sample_rate_hz,
+        )
+
     def __post_init__(self) -> None:
         if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
             raise ValueError(f"offset_v must be 0 to {MOST_OFFSET_V:g}, not {self.offset_v:g}")
@@ -164,7 +178,7 @@ class EmulatorRig:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
         self._card = description.card.card()
-        self._amplifier = preset(description.computer.op_amp)
+        preset(description.computer.op_amp)  # refused here, and not when it is first played
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
@@ -209,15 +223,8 @@ class EmulatorRig:
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
-        drawn = self._description.computer
-        computer = SuspensionComputer(
-            scenario.plant.set,
-            opamp=self._amplifier,
-            rng=Stream.COMPONENTS.generator(seed),
-            offset_v=drawn.offset_v,
-            components=drawn.fitted(seed),
-            sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
-        )
+        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
+        computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
         computer.set(**settings_of(computer, scenario.plant.given()))
         return computer
 
