@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from harness.instrument.inputs import LOOKS_PER_SAMPLE, RANGES_V, Codes, InputFaults, Inputs, Volts
+from harness.instrument.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
 from harness.instrument.scpi import ScpiError
 from harness.instrument.table import Table
 
@@ -22,8 +22,8 @@ MIDDLE_N = BUFFER_N // 2
 LEAST_DECIMATION, MOST_DECIMATION = 125, 65_536
 """A real one goes down to 1; the computer's slowest amplifier needs no more than a sample a microsecond."""
 LEAST_DELAY_N, MOST_DELAY_N = -MIDDLE_N, BUFFER_N
-PAUSE_N = 2000
-"""Samples that go by, unseen, between the end of a record and the next ACQ:START."""
+PAUSE_S = 0.02
+"""That goes by, unseen, before each ACQ:START: time in which a computer that is no longer excited comes to rest."""
 TRIGGERS = ("DISABLED", "NOW", "CH1_PE", "CH1_NE", "CH2_PE", "CH2_NE", "AWG_PE")
 _LOST = slice(3 * BUFFER_N // 8, 5 * BUFFER_N // 8)
 """Of a record in the middle of which the samples are lost."""
@@ -107,11 +107,13 @@ class Acquisition:
         self.settings = Settings()
         self.record: Record | None = None
         self._table = table
+        self._input_faults = inputs[0]
         self._inputs = Inputs(*inputs)
         self._faults = faults
         self._wait: _Wait | None = None
         self._records = 0
         self._dropped_out = False
+        self._tune(self.settings.decimation)
 
     # ---- settings
 
@@ -121,8 +123,7 @@ class Acquisition:
         :raises EmulatorError: the generator is too fast for the rate; then nothing changes.
         """
         if settings.decimation != self.settings.decimation:
-            self._table.look_at(look_rate_hz(settings.decimation, self._faults))
-            self._inputs.forget()
+            self._tune(settings.decimation)
         self.settings = settings
         if self._wait is not None:
             self._arm(self._wait.trigger)
@@ -156,8 +157,8 @@ class Acquisition:
 
     def start(self) -> None:
         """Forget the record, and be ready for a trigger."""
-        if self.record is not None:
-            self._samples(PAUSE_N)
+        self._table.look(round(PAUSE_S * self._table.rate_hz))
+        self._inputs.forget()
         self.record, self._wait = None, _Wait()
 
     def stop(self) -> None:
@@ -174,14 +175,10 @@ class Acquisition:
         self._arm(trigger)
         self.wait()
 
-    @property
-    def awaits_generator(self) -> bool:
-        """Whether the start of the generator would be the trigger."""
-        return self._wait is not None and self._wait.trigger == "AWG_PE"
-
-    def take_now(self) -> None:
-        """The trigger has come, at this instant."""
-        if self._wait is not None:
+    def generator_started(self) -> None:
+        """At this instant, which may be the trigger."""
+        self._inputs.forget()
+        if self._wait is not None and self._wait.trigger == "AWG_PE":
             self._take(self._wait.seen, len(self._wait.seen))
 
     def wait(self) -> None:
@@ -189,9 +186,9 @@ class Acquisition:
         if self._wait is None:
             return
         if self._wait.trigger == "NOW":
-            self.take_now()
+            self._take(self._wait.seen, len(self._wait.seen))
         elif self._wait.trigger == "AWG_PE":
-            self._wait_for_edge()
+            self._wait_for_edge(self._wait)
         elif self._wait.trigger.startswith("CH"):
             self._wait_for_level(self._wait)
 
@@ -199,17 +196,17 @@ class Acquisition:
         seen = self._samples(0 if trigger == "DISABLED" else self.settings.before_n + 1)
         self._wait = _Wait(trigger, seen)
 
-    def _wait_for_edge(self) -> None:
+    def _wait_for_edge(self, wait: _Wait) -> None:
         left = self._table.until_edge_n()
         if left is None:
             return
-        left_n = left // LOOKS_PER_SAMPLE
-        self._see(min(left_n, BUFFER_N))
+        left_n = self._inputs.until(left)
+        self._see(wait, min(left_n, BUFFER_N))
         if left_n <= BUFFER_N:
-            self.take_now()
+            self._take(wait.seen, len(wait.seen))
 
     def _wait_for_level(self, wait: _Wait) -> None:
-        self._see(BUFFER_N)
+        self._see(wait, BUFFER_N)
         channel, sign = int(wait.trigger[2]) - 1, 1.0 if wait.trigger.endswith("PE") else -1.0
         above = sign * wait.seen[:, channel] >= sign * self.settings.level_v
         crossed = np.flatnonzero(above[1:] & ~above[:-1]) + 1
@@ -217,11 +214,10 @@ class Acquisition:
         if crossed.size:
             self._take(wait.seen, int(crossed[0]))
 
-    def _see(self, count: int) -> None:
+    def _see(self, wait: _Wait, count: int) -> None:
         """Wait on, without forgetting what a record may begin with."""
-        if self._wait is not None:
-            kept = self._wait.seen[-(self.settings.before_n + 1) :]
-            self._wait.seen = np.concatenate((kept, self._samples(count)))
+        kept = wait.seen[-(self.settings.before_n + 1) :]
+        wait.seen = np.concatenate((kept, self._samples(count)))
 
     def _take(self, seen: Volts, trigger_at: int) -> None:
         """The record of a trigger at that sample of those that were seen."""
@@ -236,14 +232,14 @@ class Acquisition:
         self.record, self._wait = Record(codes, self.settings.switches), None
 
     def _samples(self, count: int) -> Volts:
-        rate_hz = self._table.rate_hz
-        looks = self._table.look(count * LOOKS_PER_SAMPLE)
-        return self._inputs.samples(looks, rate_hz, averages=self.settings.averages)
+        return self._inputs.samples(self._table.look, count, averages=self.settings.averages)
 
-
-def look_rate_hz(decimation: int, faults: AcquisitionFaults) -> float:
-    """How often the leads are looked at, in true time."""
-    return LOOKS_PER_SAMPLE * CLOCK_HZ / decimation * (1.0 + 1e-6 * faults.clock_ppm)
+    def _tune(self, decimation: int) -> None:
+        """:raises EmulatorError: the generator is too fast for the rate; then nothing changes."""
+        true_rate_hz = CLOCK_HZ / decimation * (1.0 + 1e-6 * self._faults.clock_ppm)
+        looks_n = looks_per_sample(self._input_faults, true_rate_hz)
+        self._table.look_at(looks_n * true_rate_hz)
+        self._inputs.tune(looks_n, true_rate_hz)
 
 
 def with_switch(settings: Settings, channel: int, switch: str) -> Settings:

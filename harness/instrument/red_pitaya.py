@@ -40,7 +40,6 @@ from harness.instrument.acquisition import (
     TRIGGERS,
     Acquisition,
     Settings,
-    look_rate_hz,
     with_switch,
 )
 from harness.instrument.description import InstrumentDescription
@@ -68,8 +67,7 @@ class RedPitaya:
         :raises EmulatorError: the computer cannot be made.
         """
         described = description or InstrumentDescription()
-        rate_hz = look_rate_hz(Settings().decimation, described.acquisition)
-        self._table = Table(computer, described.wiring, rate_hz)
+        self._table = Table(computer, described.wiring)
         self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition)
         self._generator = Generator()
         self._pots = tuple(self._table.dials)
@@ -143,8 +141,7 @@ class RedPitaya:
     def _trigger_generator(self, call: Call) -> None:
         self._table.generate(self._out(call).waveform())
         self._table.schedule(self._scheduled)
-        if self._acquisition.awaits_generator:
-            self._acquisition.take_now()
+        self._acquisition.generator_started()
 
     def _reset_generator(self) -> None:
         self._generator = Generator()
