@@ -244,13 +244,10 @@ class RealRig:
                 f"{where}the force of {excitation.low_v:g} V to {excitation.high_v:g} V exceeds limits.force_v,"
                 f" {low_v:g} V to {high_v:g} V"
             )
-        at_generator = self._at_generator(excitation)
-        least_v, most_v = self._kind.output_v
-        if at_generator.low_v < least_v - 1e-9 or at_generator.high_v > most_v + 1e-9:
-            raise ConfigurationError(
-                f"{where}the generator would have to give {at_generator.low_v:g} V to {at_generator.high_v:g} V, and"
-                f" has {least_v:g} V to {most_v:g} V"
-            )
+        try:
+            self._kind.check(self._at_generator(excitation))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}{error}") from error
 
     def _at_generator(self, excitation: Excitation) -> Excitation:
         """The waveform at the instrument that is ``excitation`` at the computer."""
