@@ -34,6 +34,11 @@ LEAD_N = 500
 
 SELF_TEST_SEED = 0
 
+_AFTER_N = 0.05
+"""A pot that jumps at a sample does so this part of a sample after it."""
+
+_MOST_CODE = 0xFFFF
+
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
 _log = logging.getLogger(__name__)
@@ -63,11 +68,16 @@ class Input:
     """In the instrument's own words."""
     gain: float = 1.0
     offset_v: float = 0.0
+    least_v: float = -1.0
+    """At the computer; what is below counts as clipped. Codes count from here: the larger the code of 0 V, the larger
+    the offset that the estimator has to learn."""
     noise_lsb: float = 1.0
     """rms before quantisation, as far as it is known; the self-test measures it."""
 
     def __post_init__(self) -> None:
         Stage(self.gain, self.offset_v)
+        if not abs(self.least_v) <= _MOST_VOLTS:
+            raise ValueError(f"least_v must be within +-{_MOST_VOLTS:g} V, not {self.least_v:g}")
         if not 0.0 <= self.noise_lsb <= 1e5:
             raise ValueError(f"noise_lsb must be 0 to 1e5, not {self.noise_lsb:g}")
 
@@ -276,7 +286,7 @@ class RealRig:
             wired = self._description.inputs[name]
             ends_v = sorted((end - wired.offset_v) / wired.gain for end in self._kind.ranges_v[wired.range])
             out[name] = Channel(
-                low_v=ends_v[0],
+                low_v=max(ends_v[0], wired.least_v),
                 lsb_v=(ends_v[1] - ends_v[0]) / (1 << self._kind.bits),
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
@@ -337,7 +347,9 @@ class RealRig:
         """Right after a sample: between it and the next one."""
         rate_hz = self._kind.rate_hz
         return [
-            Turn((sample - start + 0.5) / rate_hz, pot, dial) for sample, dials in tweaks for pot, dial in dials.items()
+            Turn((sample - start + _AFTER_N) / rate_hz, pot, dial)
+            for sample, dials in tweaks
+            for pot, dial in dials.items()
         ]
 
     def _cut(self, taken: Recorded, start: int, record: int, computer: SuspensionComputer) -> Iterator[Block]:
@@ -350,15 +362,16 @@ class RealRig:
         self, taken: Recorded, channels: Mapping[str, Channel]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts at the computer, codes and clipping, (n, 4) each."""
-        n, most = len(taken.volts), (1 << self._kind.bits) - 1
+        n = len(taken.volts)
         volts = np.full((n, len(CHANNELS)), np.nan)
         codes = np.zeros((n, len(CHANNELS)), np.uint16)
         clipped = np.zeros((n, len(CHANNELS)), np.bool_)
         for column, name in enumerate(MEASURED):
             wired, channel, at = self._description.inputs[name], channels[name], CHANNELS.index(name)
             volts[:, at] = (taken.volts[:, column] - wired.offset_v) / wired.gain
-            codes[:, at] = np.clip(np.rint((volts[:, at] - channel.low_v) / channel.lsb_v), 0, most)
-            clipped[:, at] = taken.clipped[:, column]
+            exact = np.rint((volts[:, at] - channel.low_v) / channel.lsb_v)
+            codes[:, at] = np.clip(exact, 0.0, _MOST_CODE)
+            clipped[:, at] = taken.clipped[:, column] | (exact < 0.0) | (exact > _MOST_CODE)
         return volts, codes, clipped
 
     def _opened(self) -> Instrument:
