@@ -31,9 +31,9 @@ _POLL_S = 0.01
 _ROUNDING_V = 1e-9
 _MOST_ANSWER_BYTES = 1 << 20
 _ZEROS_N = BUFFER_N // 10
-"""A buffer that ends with so many zeros on all inputs was not filled to its end."""
+"""So many zeros in a row on all inputs are no measurement."""
 
-_EARLY_N = 1e-3
+_EARLY_N = 1e-4
 """Edges come this part of a sample before the sample that shows them, so that no rounding makes them come after it."""
 
 
@@ -266,10 +266,15 @@ class RedPitaya(Instrument):
         return volts
 
     def _check_filled(self, volts: NDArray[np.float64]) -> None:
+        """:raises RecordIncomplete: a stretch of it was never written."""
         measured = np.flatnonzero((volts != 0.0).any(axis=1))
-        filled = int(measured[-1]) + 1 if len(measured) else 0
-        if BUFFER_N - filled >= _ZEROS_N:
-            raise RecordIncomplete(f"{self.name}: its buffer is filled up to sample {filled} of {BUFFER_N} only")
+        marks = np.concatenate(([-1], measured, [BUFFER_N]))
+        longest = int(np.argmax(np.diff(marks)))
+        start, end = int(marks[longest]) + 1, int(marks[longest + 1])
+        if end - start >= _ZEROS_N:
+            raise RecordIncomplete(
+                f"{self.name}: its buffer is not filled: nothing but zeros from sample {start} to {end - 1}"
+            )
 
     def _lsb_v(self, word: str) -> float:
         low_v, high_v = self.ranges_v[word]
