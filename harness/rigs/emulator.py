@@ -200,7 +200,7 @@ class EmulatorRig:
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = _settings(computer, tweak.given())
+                settings = settings_of(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
@@ -225,7 +225,7 @@ class EmulatorRig:
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
         computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
-        computer.set(**_settings(computer, scenario.plant.given()))
+        computer.set(**settings_of(computer, scenario.plant.given()))
         return computer
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
@@ -276,7 +276,7 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
-def _settings(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
     """The scenario's names of the parameters as the program has them."""
     names = {
         field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
