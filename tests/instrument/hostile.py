@@ -206,7 +206,7 @@ ATTACKS: tuple[Attack, ...] = (
 @contextlib.contextmanager
 def _gone_is_gone() -> Iterator[None]:
     """A server may hang up on clients like these, and turn them away."""
-    with contextlib.suppress(ConnectionError, TimeoutError):
+    with contextlib.suppress(OSError):
         yield
 
 
