@@ -55,6 +55,14 @@ VALUES = (
     *("ON", "OFF", "NOW", "AWG_PE", "CH1_PE", "CH2_NE", "DISABLED", "SQUARE", "PWM", "DC", "LV", "HV", "BIN", "ASCII"),
     *("RAW", "VOLTS", "'", '"', "(@1:16384)", "MAX", "1 V", "\x00", "\x7f", "%s%n", "../../etc/passwd", "{0}"),
 )
+RIGHT = (
+    *(*SEQUENCE, *SEQUENCE, "ACQ:START", "ACQ:START", "ACQ:TRig NOW", "ACQ:TRig CH1_PE", "ACQ:TRig CH2_NE"),
+    *("ACQ:DEC 125", "ACQ:DEC 65536", "ACQ:TRig:DLY 0", "ACQ:TRig:DLY -8192", "ACQ:TRig:DLY 1e6", "ACQ:AVG OFF"),
+    *("SOUR1:FREQ:FIX 1e-3", "SOUR1:FREQ:FIX 1e6", "SOUR1:FUNC PWM", "SOUR1:DCYC 0.001", "SOUR1:PHAS -1", "*RST"),
+    *("POT1:DIAL 0", "POT1:DIAL 1", "POT2:DIAL 0", "POT3:DIAL 1", "POT:SCH 2,1,0", "POT:SCH 3,0,1e-5", "ACQ:STOP"),
+    *("ACQ:DATA:FORMAT BIN", "ACQ:DATA:Units RAW", "ACQ:SOUR1:DATA?", "ACQ:SOUR2:DATA:STA:N? 5,7", "ACQ:TRig:STAT?"),
+)
+"""Commands that are understood, to the ends of what may be asked for."""
 
 
 def line(draw: random.Random) -> bytes:
@@ -63,6 +71,9 @@ def line(draw: random.Random) -> bytes:
         return draw.randbytes(draw.choice((1, 10, 100, 5000))) + b"\n"
     units = []
     for _ in range(draw.choice((1, 1, 1, 2, 5, 50))):
+        if draw.random() < 0.6:
+            units.append(f":{draw.choice(RIGHT)}")
+            continue
         value = draw.choice(VALUES) if draw.random() < 0.7 else f"{draw.uniform(-2.0, 2.0) * 10 ** draw.randint(-3, 5)}"
         units.append(f"{draw.choice(WORDS)} {value}" if draw.random() < 0.7 else draw.choice(WORDS))
     said = bytearray(";".join(units).encode())

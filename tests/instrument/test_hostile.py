@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.instrument.scpi import MOST_ERRORS
-from tests.instrument.hostile import ATTACKS, IDENTITY, VALUES, WORDS, Attack, survived, warm
+from tests.instrument.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
 from tests.instrument.serving import LONG_S, Served, ended, serving
 from tests.instrument.talk import SEQUENCE, asking, interpreter, record, say
 
@@ -20,9 +20,10 @@ ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')
 values = st.one_of(
     st.sampled_from(VALUES), st.floats().map(repr), st.integers().map(str), st.text(st.characters(codec="ascii"))
 )
-commands = st.builds(lambda word, value: f"{word} {value}".encode("latin-1"), st.sampled_from(WORDS), values)
+commands = st.builds(lambda word, value: f"{word} {value}".encode(), st.sampled_from(WORDS), values)
 """What the instrument understands, or nearly."""
-lines = st.one_of(st.binary(max_size=300), st.lists(commands, max_size=8).map(b";".join))
+right = st.sampled_from(RIGHT).map(lambda command: f":{command}".encode())
+lines = st.one_of(st.binary(max_size=300), right, st.lists(st.one_of(commands, right), max_size=8).map(b";".join))
 
 
 @settings(max_examples=60, deadline=None)
