@@ -105,6 +105,23 @@ def test_a_delay_beyond_the_buffer_skips_what_comes_first(ask: Ask) -> None:
     assert np.abs(record(ask) - played(BUFFER_N + 1808)[1808:]).max() < ROUNDED_V
 
 
+def test_a_long_delay_is_waited_for_by_asking_whether_the_buffer_is_full(ask: Ask) -> None:
+    """Five records beyond the first: 8192 + 81,920 samples are between trigger and the end."""
+    say(ask, [line.replace("DLY 8192", f"DLY {MIDDLE_N + 5 * BUFFER_N}") for line in POINT_SAMPLES])
+    assert ask("ACQ:TRig:STAT?") == "TD"
+    assert ask("ACQ:SOUR1:DATA?") == "" and error(ask) == -230
+    assert [ask("ACQ:TRig:FILL?") for _ in range(4)] == ["0", "0", "0", "1"]
+    assert np.abs(record(ask) - played(6 * BUFFER_N)[5 * BUFFER_N :]).max() < ROUNDED_V
+
+
+def test_a_record_that_is_being_taken_begins_anew_with_another_rate(ask: Ask) -> None:
+    say(ask, [line.replace("DLY 8192", "DLY 60000") for line in POINT_SAMPLES])
+    say(ask, ["ACQ:DEC 625"])
+    assert [ask("ACQ:TRig:STAT?") for _ in range(9)] == ["WAIT"] * 9
+    say(ask, ["ACQ:TRig:DLY 8192", "ACQ:TRig NOW"])
+    assert record(ask).shape == (BUFFER_N, 2)
+
+
 def test_a_generator_that_runs_triggers_with_its_next_period(ask: Ask) -> None:
     say(ask, POINT_SAMPLES)
     say(ask, ["ACQ:START", "ACQ:TRig AWG_PE"])
