@@ -16,7 +16,8 @@ from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
 from harness.links.wire import LIBRARY
-from harness.rig import Block, EmulatorRig, Performance, Rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.rig import Block, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 
@@ -102,20 +103,21 @@ class Trials:
         )
 
     def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        hindsight = performance.hindsight()
         return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
             sample_period_s=performance.sample_period_s,
             time_scale=performance.time_scale,
             channels=performance.channels,
-            segments=performance.segments,
+            segments=hindsight.segments,
             scenario=scenario.as_table(),
             rig=self._rig.description(),
             dut=self._device.as_table(),
             link="none",
             counters=self._estimator.counters,
             faults=scenario.caveats,
-            overloads=performance.lamps(),
+            overloads=hindsight.lamps,
         )
 
 
