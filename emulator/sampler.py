@@ -204,13 +204,20 @@ class Sampler:
             raise SamplerError(
                 f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
             )
-        noise = self._rng.standard_normal(volts.shape) * self._noise_lsb + self._offset_lsb
-        held_v = self._acquired(volts) * self._gain - self._droop_v
-        return np.asarray((held_v - self._low_v) / self._lsb_v + noise)
+        noise = self._rng.standard_normal(volts.shape)
+        noise *= self._noise_lsb
+        noise += self._offset_lsb
+        seen = self._acquired(volts) * self._gain
+        seen -= self._droop_v
+        seen -= self._low_v
+        seen /= self._lsb_v
+        seen += noise
+        return seen
 
     def converted(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Codes and clipping flags, as of sample, of what the converter sees."""
-        unlimited = np.floor(seen_lsb + 0.5)
+        unlimited = seen_lsb + 0.5
+        np.floor(unlimited, out=unlimited)
         limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
         codes = limited.astype(np.uint16) if self._levels is None else _approximated(seen_lsb, self._levels)
         codes = (codes | np.uint16(self.card.stuck_high)) & ~np.uint16(self.card.stuck_low)
