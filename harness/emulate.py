@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.bench import Progress
 from harness.errors import ConfigurationError
-from harness.rig import Block, Rig
+from harness.rigs.rig import Block, Rig
 from harness.run import CHANNELS
 from harness.scenario import Scenario
 from harness.storage import replacing
@@ -44,7 +44,7 @@ def write_signals(
     return {
         "samples": sum(len(block.codes) for block in blocks),
         "clipped": sum(int(block.clipped.any(axis=1).sum()) for block in blocks),
-        "overloads": dict(performance.lamps()),
+        "overloads": dict(performance.hindsight().lamps),
     }
 
 

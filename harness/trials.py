@@ -17,7 +17,8 @@ from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
 from harness.links.wire import LIBRARY
-from harness.rig import Block, EmulatorRig, Performance, Rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.rig import Block, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 
@@ -109,20 +110,21 @@ class Trials:
         if self._scenario_table[0] is not scenario:
             self._scenario_table = scenario, scenario.as_table()
         rig, dut = self._tables
+        hindsight = performance.hindsight()
         return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
             sample_period_s=performance.sample_period_s,
             time_scale=performance.time_scale,
             channels=performance.channels,
-            segments=performance.segments,
+            segments=hindsight.segments,
             scenario=self._scenario_table[1],
             rig=rig,
             dut=dut,
             link="none",
             counters=self._estimator.counters,
             faults=scenario.caveats,
-            overloads=performance.lamps(),
+            overloads=hindsight.lamps,
         )
 
 
