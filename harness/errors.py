@@ -4,6 +4,7 @@ AnalogrigError
 ├── ConfigurationError          a file, key, value or command-line argument is wrong
 ├── RecordingError              a recording cannot be read or written
 ├── RigError                    the rig failed
+│   └── SelfTestError           its self-test could not be made
 ├── WorkerError                 the workers of a campaign cannot be had or kept
 ├── LinkError                   the link failed
 │   ├── LinkTimeout             nothing came in time
@@ -32,6 +33,10 @@ class RecordingError(AnalogrigError):
 
 class RigError(AnalogrigError):
     """The rig failed."""
+
+
+class SelfTestError(RigError):
+    """The self-test of the rig could not be made: nothing is known about it."""
 
 
 class WorkerError(AnalogrigError):
