@@ -21,8 +21,10 @@ from harness.self_test.timing import Edges, Line
 _EDGES_FELT = 2
 """So many edges back is the response settled: the rest is below 1e-5 for a half period of 100 samples."""
 
-_LATEST_N, _SCAN_N = 40.0, 1.0
+_LATEST_N, _SCAN_N = 40.0, 2.0
 """Within so many samples of the force's edges are those of the displacement looked for, in such steps."""
+_SCANNED_N = 2000
+"""... among so many samples."""
 
 _MASS, _DAMPING, _PERIOD, _RISING, _FALLING = range(5)
 
@@ -118,7 +120,7 @@ class Answer:
         first = np.array(
             [np.log(nominal.mass_n2), np.log(nominal.damping_n), line.period_n, line.rising_n, line.falling_n]
         )
-        few = np.flatnonzero(self.used)[:4096]
+        few = np.flatnonzero(self.used)[:_SCANNED_N]
         later = np.array([0.0, 0.0, 0.0, 1.0, 1.0])
         shifts = np.arange(-_LATEST_N, _LATEST_N + 1.0, _SCAN_N)
         sums = [np.square(self._residual(first + shift * later, few)).sum() for shift in shifts]
