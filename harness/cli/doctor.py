@@ -24,7 +24,9 @@ def add(commands: Any) -> None:
         help="shipped name or .toml file (default: $ANALOGRIG_RIG or emulator)",
     )
     command.add_argument(
-        "--program", choices=("front", "shock"), default="front", help="what is wired on the computer (%(default)s)"
+        "--program",
+        choices=("front", "shock"),
+        help="what is wired on the computer (default: what the rig says, or front)",
     )
     command.add_argument("--seed", type=seed, default=0, metavar="N", help="of all that is random (%(default)d)")
     command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
@@ -34,11 +36,13 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from harness.errors import RigError
     from harness.rigs.description import open_rig
+    from harness.rigs.real import RealRig
     from harness.self_test.conduct import self_test
 
     with open_rig(arguments.rig) as rig:
+        program = arguments.program or str(rig.description().get("plant", "front"))
         try:
-            findings = self_test(rig, arguments.seed, arguments.program)
+            findings = self_test(rig.bare() if isinstance(rig, RealRig) else rig, arguments.seed, program)
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
     show(json.dumps(_as_json(findings, arguments.seed)) if arguments.json else _text(findings))

@@ -66,6 +66,8 @@ class Record:
         clipped = np.concatenate([block.clipped for block in blocks])
         if len(codes) < SAMPLES:
             raise SelfTestError(f"the rig gave {len(codes)} of {SAMPLES} samples")
+        if len({block.record for block in blocks}) > 1:
+            raise SelfTestError(f"the rig does not take {SAMPLES} samples without a gap")
         column = {name: CHANNELS.index(name) for name in ("force", "displacement")}
         return cls(
             program,
