@@ -383,6 +383,7 @@ class EmulatorRig:
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=1.0 / computer.scales.volts(name),
                 noise_lsb=self._card.noise_lsb[i],
+                codes=1 << self._card.bits,
             )
             for i, name in enumerate(CHANNELS)
         }

@@ -291,6 +291,7 @@ class RealRig:
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
                 noise_lsb=wired.noise_lsb,
+                codes=1 << self._kind.bits,
             )
         return out
 
