@@ -315,6 +315,34 @@ def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pyte
         open_rig("bench")
 
 
+# ---- the self-test comes before any verdict
+
+
+SICK = {
+    "inputs.skew_s=2e-5": "skew",
+    "wiring.swapped=true": "identity",
+    "inputs.gain_error=[0.0, 0.12]": "gain of displacement",
+    "inputs.offset_v=[0.0, 0.15]": "offset of displacement",
+    "wiring.displacement.gain=-1.0": "polarity of displacement",
+    "acquisition.clock_ppm=120.0": "clock ratio",
+    "inputs.noise_v=[0.0, 0.02]": "noise of displacement",
+}
+
+
+@pytest.mark.parametrize("defect", SICK)
+def test_run_on_a_rig_that_is_not_well_is_inconclusive_and_says_why(defect: str, tmp_path: Path) -> None:
+    with served("--defect", defect) as instrument:
+        verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
+
+
+def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) -> None:
+    with served("--rig", "emulator-real") as instrument:
+        run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
+    assert judge(run).outcome == "passed", judge(run).reasons
+
+
 # ---- the shipped tests
 
 
