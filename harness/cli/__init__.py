@@ -14,6 +14,7 @@ from harness.cli import (
     campaign,
     certify,
     compare,
+    compare_rigs,
     doctor,
     effects,
     emulate,
@@ -26,7 +27,21 @@ from harness.cli import (
 )
 from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
 
-_COMMANDS = (run, replay, judge, campaign, certify, compare, thesis, doctor, emulate, serve, effects, netlist)
+_COMMANDS = (
+    run,
+    replay,
+    judge,
+    campaign,
+    certify,
+    compare,
+    thesis,
+    doctor,
+    compare_rigs,
+    emulate,
+    serve,
+    effects,
+    netlist,
+)
 """Each has ``add(commands)``; in the order of ``--help``."""
 
 

@@ -132,10 +132,10 @@ class _Seen:
     def _skew(self) -> Check:
         record, response = self._record, self._response
         room_n = 3.0 * response.period_error_n * float(np.abs(self._edges.turn).max())
-        late = lateness(self._codes, self._levels, self._edges, response.line, room_n)
+        late_n, late_error_n = lateness(self._codes, self._levels, self._edges, response.line, room_n)
         lag_n, lag_error_n = (lag_s / record.sample_period_s for lag_s in checks.AMPLIFIERS_S)
-        error_n = math.hypot(late.error_n, response.instant_error_n, lag_error_n)
-        return checks.skew(late.late_n + lag_n, error_n, record.sample_period_s)
+        error_n = math.hypot(late_error_n, response.instant_error_n, lag_error_n)
+        return checks.skew(late_n + lag_n, error_n, record.sample_period_s)
 
     def _clock_ratio(self) -> Check:
         line, error_n = self._response.line, self._response.period_error_n
@@ -153,7 +153,7 @@ class _Seen:
     def _response(self) -> Response:
         """Of the displacement, in volts, to the force as measured, or as commanded where that was clipped."""
         levels = (LOW_V, HIGH_V) if self._clipped else (self._low_v, self._high_v)
-        averaged = averaged_n(self._codes, self._levels, self._edges)
+        averaged = averaged_n(self._edges)
         answer = Answer(self._record.volts("displacement"), self._used, self._edges, levels, averaged)
         return answer.fitted(self._nominal)
 

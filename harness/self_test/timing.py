@@ -113,52 +113,24 @@ class Line:
         return np.asarray(edges.turn * self.period_n + np.where(edges.rising, self.rising_n, self.falling_n))
 
 
-@dataclass(frozen=True)
-class Lateness:
-    """By how much the edges that one channel shows come later than a line says."""
-
-    late_n: float
-    error_n: float
-    """Standard error."""
-    jitter_n: float
-    """By so much edges are beside the line at least (all of them), or rms (where the instrument averages)."""
+def averaged_n(edges: Edges) -> float:
+    """Over so much of a sample period the instrument averages, 0 for one that does not: it sees that part of all edges
+    on the way."""
+    seen = len(edges.on_the_way()[0])
+    return seen / len(edges.rising) / (1.0 - 2.0 * SETTLED_PART) if seen >= _AVERAGES_FROM else 0.0
 
 
-def averaged_n(codes: NDArray[np.uint16], levels: Levels, edges: Edges) -> float:
-    """Over so much of a sample period the instrument averages: 0 for one that does not."""
+def lateness(codes: NDArray[np.uint16], levels: Levels, edges: Edges, line: Line, room_n: float) -> tuple[float, float]:
+    """By how many samples the edges of these codes are later than the line says, and its standard error.
+
+    :param room_n: by so much the line may be off at the ends of the record.
+    """
     samples, edge = edges.on_the_way()
-    if len(samples) < _AVERAGES_FROM:
-        return 0.0
-    return _regressed(_new_parts(codes, levels, edges, samples, edge), samples - edges.line().instants(edges)[edge])[0]
-
-
-def lateness(codes: NDArray[np.uint16], levels: Levels, edges: Edges, line: Line, room_n: float) -> Lateness:
-    """By how much the edges of these codes are later than the line says, which may be off by ``room_n`` at its ends."""
-    samples, edge = edges.on_the_way()
-    instants = line.instants(edges)
-    if len(samples) >= _AVERAGES_FROM:
-        parts = _new_parts(codes, levels, edges, samples, edge)
-        _, late, rms = _regressed(parts, samples - instants[edge])
-        return Lateness(late, float(np.hypot(rms / np.sqrt(len(samples)), room_n)), rms)
+    instants, averaged = line.instants(edges), averaged_n(edges)
+    if averaged:
+        upper = (codes[samples] - levels.low) / (levels.high - levels.low)
+        new = np.where(edges.rising[edge], upper, 1.0 - upper)
+        late = samples - averaged * (new - 0.5) - instants[edge]
+        return float(late.mean()), float(np.hypot(late.std() / np.sqrt(len(late)), room_n))
     least, most = float((edges.before - instants).max()), float((edges.after - instants).min())
-    jitter = max(0.5 * (least - most), 0.0)
-    return Lateness(0.5 * (least + most), (abs(most - least) + 2.0 * room_n) / np.sqrt(12.0), jitter)
-
-
-def _new_parts(
-    codes: NDArray[np.uint16],
-    levels: Levels,
-    edges: Edges,
-    samples: NDArray[np.int64],
-    edge: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """How much of each of these samples is at the new level, less a half."""
-    upper = (codes[samples] - levels.low) / (levels.high - levels.low)
-    return np.asarray(np.where(edges.rising[edge], upper, 1.0 - upper) - 0.5)
-
-
-def _regressed(parts: NDArray[np.float64], samples: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Of samples = late + averaged parts: averaged, late, and the rms of what is left."""
-    design = np.stack([parts, np.ones_like(parts)], axis=1)
-    (averaged, late), *_ = np.linalg.lstsq(design, samples, rcond=None)
-    return float(averaged), float(late), float(np.std(samples - design @ (averaged, late)))
+    return 0.5 * (least + most), float((abs(most - least) + 2.0 * room_n) / np.sqrt(12.0))
