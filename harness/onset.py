@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Self
@@ -59,6 +60,13 @@ _LONGEST_MOVE = 0.3
 _LEAST_FIT_N = 30
 """Fewer samples tell nothing of a plant."""
 
+_LEAST_DOUBT = 2.0
+"""With it the intervals hold the instants of machines of real components as often as they say."""
+_SETTLING_N = 20
+"""Innovations after which a filter that began with any state has come to rest."""
+_LAGS_N = 30
+"""Samples over which what wanders slowly is summed."""
+
 _CHANCE = 2.0 * math.log(20.0)
 """By so much, in twice the logarithm of the likelihood, must a change explain the samples better than none; beyond
 what the best of so many instants does by chance."""
@@ -101,10 +109,9 @@ def onset(
     if profile.unexplained > _TOO_NARROW and guess.edges != ANYWHERE:
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
         guess, profile = min((guess, profile), other, key=lambda each: float(each[1].cost.min()))
-    reason = problem.objection(profile, guess)
-    if reason:
-        return NoOnset(reason)
-    return interval(profile.cost / max(1.0, profile.unexplained), np.arange(search.start, search.stop), confidence)
+    cost = profile.cost / doubt(guess, profile.unexplained)
+    reason = problem.objection(float(profile.cost.min()), profile.unexplained, guess) or problem.beyond(cost)
+    return NoOnset(reason) if reason else interval(cost, np.arange(search.start, search.stop), confidence)
 
 
 def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Onset:
@@ -116,6 +123,11 @@ def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Onse
     inside[best_first[: int(np.searchsorted(held, confidence)) + 1]] = True
     low, high = samples[np.flatnonzero(inside)[[0, -1]]].tolist()
     return Onset(int(samples[best_first[0]]), low, high)
+
+
+def doubt(guess: Guess, unexplained: float) -> float:
+    """By what twice the logarithm of a likelihood ratio is divided, since a rig is not quite what it is taken for."""
+    return max(_LEAST_DOUBT, guess.colour, unexplained)
 
 
 _COMMON, _OWN = 2, 4
@@ -143,6 +155,8 @@ class Guess:
     """(4,): the same of the plant after the change."""
     sample: int
     """Of the change, in the window."""
+    colour: float = 1.0
+    """How many times as far as white noise the innovations go astray in the long run, as a variance."""
 
     @property
     def edges(self) -> Edges:
@@ -225,13 +239,13 @@ class Problem:
             self.record.part(self.candidates.stop, len(self.record)),
         )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        guess, cost = _settled(earlier, self.before, guess, known)
-        locked, cost_locked = _settled(earlier, self.before, dataclasses.replace(guess, half_width=_LOCKED), known)
-        if cost_locked < cost:
-            guess = locked
+        guess, cost, innovation = _settled(earlier, self.before, guess, known)
+        locked = _settled(earlier, self.before, dataclasses.replace(guess, half_width=_LOCKED), known)
+        if locked[1] < cost:
+            guess, _, innovation = locked
         known = np.array([_HELD, _HELD, *np.hypot(self.moves, known[_COMMON:])])
-        after, _ = _settled(later, self.after, guess, known)
-        return dataclasses.replace(guess, new=after.old)
+        after, _, innovation_after = _settled(later, self.after, guess, known)
+        return dataclasses.replace(guess, new=after.old, colour=colour([innovation, innovation_after]))
 
     def filters(self, guess: Guess) -> tuple[Forwards, Backwards]:
         """Of the plant as it was, and of the plant as it then is."""
@@ -249,8 +263,8 @@ class Problem:
     def models(self, guess: Guess) -> tuple[Model, Model]:
         """Of the plant as it was, and as it then is."""
         return (
-            Model.of(_beside(self.before, guess.old), guess.edges, self.record),
-            Model.of(_beside(self.after, guess.new), guess.edges, self.record),
+            Model.of(beside(self.before, guess.old), guess.edges, self.record),
+            Model.of(beside(self.after, guess.new), guess.edges, self.record),
         )
 
     def profile(self, guess: Guess) -> Profile:
@@ -280,23 +294,30 @@ class Problem:
                 break
         return guess, profile
 
-    def objection(self, profile: Profile, guess: Guess) -> str:
-        """Why the likeliest instant is none; empty if it is one."""
-        if profile.unexplained > _MOST_UNEXPLAINED:
+    def objection(self, cost: float, unexplained: float, guess: Guess) -> str:
+        """Why the likeliest instant, of that cost, is none; empty if it is one."""
+        if unexplained > _MOST_UNEXPLAINED:
             return (
-                f"what a plant that changes once leaves of the samples has {profile.unexplained:.3g} times the"
-                " variance of their noise"
+                f"what a plant that changes once leaves of the samples has {unexplained:.3g} times the variance of"
+                " their noise"
             )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        _, none = _settled(self.record, self.before, guess, known)
+        _, none, _ = _settled(self.record, self.before, guess, known)
         chance = _CHANCE + 2.0 * math.log(len(self.search))
-        searched = f"{self.search.start} to {self.search.stop - 1}"
-        if none - profile.cost.min() < chance * max(1.0, profile.unexplained):
-            return f"nothing in the samples {searched} shows that the plant has changed"
-        likelihood = np.exp(-0.5 * (profile.cost - profile.cost.min()))
-        if len(likelihood) > 1 and max(likelihood[0], likelihood[-1]) > 0.5 * likelihood.sum():
-            return f"the plant seems to have changed before or after the samples {searched}"
+        if none - cost < chance * doubt(guess, unexplained):
+            return f"nothing in the samples {self._searched} shows that the plant has changed"
         return ""
+
+    def beyond(self, cost: Array) -> str:
+        """Why the likeliest of the instants that have these costs is none: it is at an end of the range."""
+        likelihood = np.exp(-0.5 * (cost - cost.min()))
+        if len(likelihood) > 1 and max(likelihood[0], likelihood[-1]) > 0.5 * likelihood.sum():
+            return f"the plant seems to have changed before or after the samples {self._searched}"
+        return ""
+
+    @property
+    def _searched(self) -> str:
+        return f"{self.search.start} to {self.search.stop - 1}"
 
     def _known(self, guess: Guess) -> Array:
         """(11, 11): what is known beforehand, as a quadratic form."""
@@ -311,16 +332,29 @@ class Problem:
         return rows.T @ rows
 
 
-def _settled(record: Record, plant: Plant, guess: Guess, known: Array) -> tuple[Guess, float]:
-    """The guess with its offset, place and ``old`` moved to what these samples of one plant say, and twice the negative
-    logarithm of their likelihood.
+def colour(innovations: Sequence[Array]) -> float:
+    """Of stretches of innovations the long-run variance, at least 1: what wanders slowly, as by dielectric absorption,
+    weighs more than noise of its size. By Bartlett's window (Newey and West 1987)."""
+    stretches = [each[_SETTLING_N:] for each in innovations if len(each) > _SETTLING_N + _LAGS_N]
+    count = sum(map(len, stretches))
+    if not count:
+        return 1.0
+    variance = sum(float(each @ each) for each in stretches) / count
+    for lag in range(1, _LAGS_N):
+        variance += 2.0 * (1.0 - lag / _LAGS_N) * sum(float(each[lag:] @ each[:-lag]) for each in stretches) / count
+    return max(1.0, variance)
+
+
+def _settled(record: Record, plant: Plant, guess: Guess, known: Array) -> tuple[Guess, float, Array]:
+    """The guess with its offset, place and ``old`` moved to what these samples of one plant say, twice the negative
+    logarithm of their likelihood, and the innovations.
 
     :param known: (6,) standard deviations of what is known beforehand: the guess.
     """
-    cost = 0.0
+    cost, innovation = 0.0, np.zeros(0)
     first = guess
     for _ in range(_ROUNDS if len(record) >= _LEAST_FIT_N else 0):
-        model = Model.of(_beside(plant, guess.old), guess.edges, record)
+        model = Model.of(beside(plant, guess.old), guess.edges, record)
         transitions = np.broadcast_to(model.transition, (len(record), 2, 2))
         course = _course(transitions, model.inputs(record, guess.old[0]))
         filtered = Forwards.of(model, record, Columns.of(model, record, course, (guess.offset, guess.old[0])))
@@ -330,10 +364,11 @@ def _settled(record: Record, plant: Plant, guess: Guess, known: Array) -> tuple[
         rows /= known[:, None]
         unknowns, fit = _minimum((filtered.misfit[-1] + rows.T @ rows)[None])
         cost = float(fit[0] + filtered.log[-1])
+        innovation = filtered.innovation @ np.append(1.0, unknowns[0])
         last, guess = guess, guess.moved(Move(np.append(unknowns[0], np.zeros(_OWN)), guess.sample))
         if guess.near(last):
             break
-    return guess, cost
+    return guess, cost, innovation
 
 
 def _minimum(form: Array) -> tuple[Array, Array]:
@@ -347,7 +382,7 @@ def _course(transitions: Array, inputs: Array) -> Array:
     return np.concatenate([np.zeros((1, 2)), scan(transitions[:-1], inputs[:-1, :, None])[:, :, 0]])
 
 
-def _beside(plant: Plant, own: Array) -> Plant:
+def beside(plant: Plant, own: Array) -> Plant:
     """The plant whose M, B, K are beside those asked for by the logarithms in ``own`` (4,)."""
     for name, log in zip(PARAMETERS, own[1:].tolist(), strict=True):
         plant = plant.scaled(name, math.exp(log))

@@ -209,6 +209,8 @@ class Forwards:
     """(n, c, c): the quadratic form of what is left of the samples, in their noise."""
     log: Array
     """(n,): sum of the logarithms of the innovations' variances."""
+    innovation: Array
+    """(n, c): in their standard deviation; 0 for a sample that is none."""
 
     @classmethod
     def of(cls, model: Model, record: Record, columns: Columns) -> Self:
@@ -222,8 +224,9 @@ class Forwards:
         state = scan(kept @ model.transition, kept @ entering + taken)
         predicted = _after_first(model.transition @ state[:-1]) + entering
         innovation = columns.measured - predicted[:, 0, :]
-        squares = (weight / size)[:, None, None] * innovation[:, :, None] * innovation[:, None, :]
-        return cls(state, covariance, np.cumsum(squares, axis=0), np.cumsum(np.log(size)))
+        innovation *= np.sqrt(weight / size)[:, None]
+        misfit = np.cumsum(innovation[:, :, None] * innovation[:, None, :], axis=0)
+        return cls(state, covariance, misfit, np.cumsum(np.log(size)), innovation)
 
 
 @dataclass(frozen=True, eq=False)
