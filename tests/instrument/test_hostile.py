@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from harness.instrument.scpi import MOST_ERRORS
@@ -26,7 +26,7 @@ right = st.sampled_from(RIGHT).map(lambda command: f":{command}".encode())
 lines = st.one_of(st.binary(max_size=300), right, st.lists(st.one_of(commands, right), max_size=8).map(b";".join))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(lines, max_size=12))
 def test_whatever_is_said_is_answered_with_whole_lines_or_an_error_and_the_next_record_is_right(
     said: list[bytes],

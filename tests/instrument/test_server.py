@@ -304,6 +304,25 @@ def test_a_newcomer_gets_the_place_of_who_has_been_silent_for_longest_but_not_of
     in_time(course)
 
 
+def test_a_client_whose_machine_vanishes_is_asked_whether_it_lives() -> None:
+    """Within half a minute: 15 s of silence, three questions of 5 s."""
+
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            client = await served.client()
+            assert await client.ask("COUNT?") == "0"
+            (accepted,) = served.server._clients.values()
+            connection = accepted.writer.get_extra_info("socket")
+            assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+            idle_s, every_s, times = (
+                connection.getsockopt(socket.IPPROTO_TCP, option)
+                for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+            )
+            assert idle_s + every_s * times <= 30
+
+    in_time(course)
+
+
 # ---- lines
 
 
