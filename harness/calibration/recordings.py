@@ -62,8 +62,10 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> Recording:
     """
     performance = rig.perform(scenario, seed)
     blocks = list(performance.blocks)
-    if lamps := performance.lamps():
+    if lamps := performance.hindsight().lamps:
         raise RigError(f"scenario {scenario.name}: overload lamps of {', '.join(lamps)} are lit: nothing can be fitted")
+    if len({block.record for block in blocks}) != 1:
+        raise RigError(f"scenario {scenario.name}: was not recorded without a gap: nothing can be fitted")
     columns = [CHANNELS.index(name) for name in MEASURED]
     return Recording(
         scenario,
