@@ -28,8 +28,10 @@ from harness.rigs.emulator import CardDescription, ComputerDescription, Emulator
 from harness.run import CHANNELS
 
 Stock = Literal["nominal", "polyester", "polypropylene"]
+Pots = Literal["coefficient", "dial"]
 
 STOCKS: tuple[Stock, ...] = ("polypropylene", "polyester", "nominal")
+POTS: tuple[Pots, ...] = ("coefficient", "dial")
 
 _UNMEASURED_RANGE_V = (-12.5, 12.5)
 
@@ -63,8 +65,8 @@ class Calibration:
     """Of those of the estimates that were fitted to the displacement together, which come first."""
     residual_lsb: float
     """rms between the averages of the recordings and of the twin."""
-    chi_squares: Mapping[Stock, float]
-    """Of each of the components that were tried; the twin is of those with the least."""
+    chi_squares: Mapping[tuple[Stock, Pots], float]
+    """Of the kinds of machine that were tried."""
     freedom: int
     """Its expectation."""
 
@@ -74,7 +76,8 @@ class Calibration:
 
     @property
     def chi_square(self) -> float:
-        return min(self.chi_squares.values())
+        """Of the kind that the twin is of."""
+        return self.chi_squares[self.twin.computer.components, self.twin.computer.pots]
 
     @property
     def alike(self) -> list[tuple[str, str, float]]:
@@ -91,22 +94,30 @@ class Calibration:
 
 
 def calibrate(
-    recordings: Sequence[Recording], *, op_amp: str = "tl07x", stocks: Sequence[Stock] = STOCKS
+    recordings: Sequence[Recording],
+    *,
+    op_amp: str = "tl07x",
+    stocks: Sequence[Stock] = STOCKS,
+    pots: Sequence[Pots] = POTS,
 ) -> Calibration:
-    """The twin of the rig that made the recordings, of the components that explain them best.
+    """The twin of the rig that made the recordings, of the kind that explains them best.
 
-    :param recordings: one or more of the ``scenarios`` of one program.
+    :param recordings: those of ``plan.scenarios`` of one program.
     :param op_amp: what the rig's amplifiers are.
     :param stocks: what its other components may be; one or more.
+    :param pots: what its pots may be set by; one or both.
     :raises RigError: no emulator is like it: the fit does not settle, or the displacement comes before the force.
     :raises ConfigurationError: half a period is no whole number of samples.
     """
     noise_lsb, noise_error = noise_of(recordings, DISPLACEMENT)
-    fits: dict[Stock, _Fit] = {}
-    for stock in stocks:
-        model = Model(recordings, ComputerDescription(op_amp=op_amp, components=stock), noise_lsb)
-        fits[stock] = _fitted(model, next(iter(fits.values())).x if fits else None)
-    best = min(fits.values(), key=lambda fit: fit.chi_square)
+    fits: dict[tuple[Stock, Pots], _Fit] = {}
+    for set_by in pots:
+        start: Vector | None = None
+        for stock in stocks:
+            machine = ComputerDescription(op_amp=op_amp, components=stock, pots=set_by)
+            fits[stock, set_by] = _fitted(Model(recordings, machine, noise_lsb), start)
+            start = fits[stock, set_by].x
+    best = _likeliest(fits)
     noise = Estimate("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
     estimates = (*best.estimates(), noise, *_force_channel(recordings))
     computer = best.model.computer(best.model.by_name(best.x))
@@ -115,9 +126,23 @@ def calibrate(
         estimates,
         best.covariance,
         float(np.sqrt(np.mean(best.model.misses(best.x) ** 2))),
-        {stock: fit.chi_square for stock, fit in fits.items()},
+        {kind: fit.chi_square for kind, fit in fits.items()},
         best.freedom,
     )
+
+
+def _likeliest(fits: Mapping[tuple[Stock, Pots], _Fit]) -> _Fit:
+    """The one with the least chi-square; but pots are set by coefficients unless that is out of the question, for
+    tracks that are unknowns too explain a bit more of anything."""
+    kinds = sorted(fits, key=lambda kind: fits[kind].chi_square)
+    least = fits[kinds[0]]
+    simple = next((fits[kind] for kind in kinds if kind[1] == "coefficient"), least)
+    excess = (simple.chi_square - least.chi_square) / max(1.0, least.chi_square / least.freedom)
+    return least if excess > _OUT_OF_THE_QUESTION else simple
+
+
+_OUT_OF_THE_QUESTION = 30.0
+"""Three unknowns more gain this by chance with a probability of 1e-6."""
 
 
 # ---- Gauss-Newton

@@ -54,13 +54,15 @@ class Unknown:
     """Its standard deviation beforehand, around 0."""
 
 
+_TRACKS_KNOWN_TO = 0.05 / math.sqrt(3.0)
+
 _GAINS = ("RF", "C1", "C2")
 """The first unknowns: g_F = 1 / (RF C1 C2), g_B = 1 / C1, g_K = 1 / (C1 C2) of their nominal values."""
 
 SKEW, OFFSET = "skew", "displacement offset"
 
 
-def _unknowns(op_amp: str) -> tuple[Unknown, ...]:
+def _unknowns(computer: ComputerDescription) -> tuple[Unknown, ...]:
     gains = {
         "RF": "RF R5 / (RK R5FB), over the gain of the displacement's channel",
         "C1": "R1 C1 RB R4 / (RFB R4FB)",
@@ -70,7 +72,8 @@ def _unknowns(op_amp: str) -> tuple[Unknown, ...]:
     return (
         *(Unknown(name, "", 1e-4, what, "deviation", name) for name, what in gains.items()),
         *(Unknown(f"{name} offset", "V", 1e-3, what, "offset_v", name) for name, what in offsets.items()),
-        *_rates(op_amp),
+        *_rates(computer.op_amp),
+        *_tracks(computer),
         Unknown(SKEW, "s", 2e-7, "displacement after force, less the delay of U5"),
         Unknown(OFFSET, "LSB", 1.0, "offset of the displacement's channel, and of U5"),
     )
@@ -86,6 +89,14 @@ def _rates(op_amp: str) -> list[Unknown]:
         Unknown(f"U{i} bandwidth", "", 0.02, "its bandwidth", "bandwidth", f"U{i}", bandwidth) for i in range(1, 5)
     ]
     return [*within, Unknown("U1 slew", "", 0.02, "its slew rate", "slew", "U1", slew)]
+
+
+def _tracks(computer: ComputerDescription) -> list[Unknown]:
+    """They matter where pots are set by their dials."""
+    if computer.pots == "coefficient":
+        return []
+    what = "its track over its load"
+    return [Unknown(f"{pot} track", "", 1e-3, what, "deviation", pot, _TRACKS_KNOWN_TO) for pot in "MBK"]
 
 
 @dataclass(frozen=True)
@@ -121,8 +132,8 @@ class Model:
 
     def __init__(self, recordings: Sequence[Recording], computer: ComputerDescription, noise_lsb: float) -> None:
         self.recordings = recordings
-        self.unknowns = _unknowns(computer.op_amp)
-        self._computer = computer
+        self.unknowns = _unknowns(computer)
+        self._nominal = computer
         self._averages = [averaged(recording, DISPLACEMENT, noise_lsb) for recording in recordings]
         self._settings = tuple(dict.fromkeys(setting for each in recordings for setting in self._settings_of(each)))
         self.known_to = np.array([each.known_to for each in self.unknowns] + [each.known_to for each in self._settings])
@@ -179,7 +190,7 @@ class Model:
         for gain, factor in (missed or {}).items():
             tables["deviation"][gain] = (1.0 + tables["deviation"][gain]) * factor - 1.0
         try:
-            return dataclasses.replace(self._computer, values=MeasuredValues(**tables))
+            return dataclasses.replace(self._nominal, values=MeasuredValues(**tables))
         except ValueError as error:
             raise RigError(f"the emulator does not become like the recordings: {error}") from error
 

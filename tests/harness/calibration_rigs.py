@@ -20,7 +20,7 @@ import numpy as np
 
 from emulator import PROGRAMS, Capacitor, Components, OpAmp, Resistor, SuspensionComputer
 from harness.calibration.check import seen_lsb
-from harness.calibration.fit import Calibration, Stock, calibrate
+from harness.calibration.fit import Calibration, Pots, Stock, calibrate
 from harness.calibration.plan import Program, scenarios
 from harness.calibration.recordings import DISPLACEMENT, record
 from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
@@ -61,11 +61,13 @@ def drawn(number: int) -> DrawnRig:
     return DrawnRig(EmulatorDescription(card=card, computer=computer), "shock" if number % 5 == 4 else "front")
 
 
-def calibrated(rig: DrawnRig, number: int, stocks: tuple[Stock, ...]) -> Calibration:
+def calibrated(
+    rig: DrawnRig, number: int, stocks: tuple[Stock, ...], pots: tuple[Pots, ...] = ("coefficient",)
+) -> Calibration:
     """From recordings whose noise differs from one to the next."""
     with EmulatorRig(rig.description) as there:
         recordings = [record(there, each, 1000 * number + i) for i, each in enumerate(scenarios(rig.program))]
-    return calibrate(recordings, stocks=stocks)
+    return calibrate(recordings, stocks=stocks, pots=pots)
 
 
 def truth(rig: DrawnRig) -> dict[str, float]:
