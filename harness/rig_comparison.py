@@ -184,7 +184,7 @@ def _compared(pairs: Sequence[_Pair], invalid: tuple[str, ...], scenario: str, c
 
 
 def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence: float) -> SignalDifference:
-    """Of one channel, in all plays, which are two at least; clipped samples and those at edges of the force left out."""
+    """Of one channel, in all plays, two at least; clipped samples and those at edges of the force are left out."""
     differences, compared, apart = zip(*(_difference(a, b, channel) for a, b in runs), strict=True)
     noise = math.sqrt(float(np.mean([_noise_variance(each) for each in differences])))
     squares = np.array([np.mean(np.square(each[use])) for each, use in zip(differences, compared, strict=True)])

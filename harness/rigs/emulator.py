@@ -106,6 +106,9 @@ class ComputerDescription:
     """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
     specimen: int | None = None
     """The seed from which the machine is drawn, whatever that of a run: all runs are of the same machine then."""
+    pots: Literal["coefficient", "dial"] = "coefficient"
+    """To what they are set: to the coefficient, read under the real load (pot-set mode), or to the dial at which those
+    of a nominal machine would pass it (digital pots)."""
     values: MeasuredValues | None = None
     """What was measured of the machine; then nothing of it is drawn."""
     temperature_c: float = 25.0
@@ -132,7 +135,7 @@ class ComputerDescription:
         return stock if self.values is None else self.values.put_in(stock)
 
     def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
-        """The machine that the seed gives, wired as a program, its pots as that has them.
+        """The machine that the seed of a run gives, wired as a program, its pots as that has them.
 
         :raises EmulatorError: it cannot be.
         """
@@ -296,7 +299,7 @@ class EmulatorRig:
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = settings_of(computer, tweak.given())
+                settings = self._settings(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
@@ -367,8 +370,19 @@ class EmulatorRig:
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
         computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
-        computer.set(**settings_of(computer, scenario.plant.given()))
+        start = settings_of(computer, scenario.plant.given())
+        computer.set(**self._turned({**computer.program.values, **start}, scenario.plant.set))
         return computer
+
+    def _settings(self, computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+        return self._turned(settings_of(computer, given), computer.program.name)
+
+    def _turned(self, settings: dict[str, float], program: str) -> dict[str, float]:
+        """What an operator turns the pots to who wants those settings."""
+        if self._description.computer.pots == "coefficient":
+            return settings
+        dials = _nominal(program).dials_for(**settings)
+        return {f"{pot}_dial": dial for pot, dial in dials.items()}
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
         drawn = self._description.computer
@@ -416,6 +430,12 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         yield
     except EmulatorError as error:
         raise as_error(f"{prefix}{error}") from error
+
+
+@functools.cache
+def _nominal(program: str) -> SuspensionComputer:
+    """To be asked for dials, and never played."""
+    return SuspensionComputer(program, opamp="ideal")
 
 
 def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:

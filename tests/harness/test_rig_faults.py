@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from harness.errors import ConfigurationError
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorRig
 from harness.run import CHANNELS
-from harness.scenario import Scenario
+from harness.scenario import Scenario, Tweak
 
 NEEDED = "[card.range_v]"
 
@@ -147,3 +148,19 @@ def test_noise_can_be_given_channel_by_channel(tmp_path: Path) -> None:
 def test_wrong_measured_values_are_refused_by_name(tmp_path: Path, computer: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=f"own.toml: computer.*{message}"):
         open_rig(own(tmp_path, computer))
+
+
+@pytest.mark.parametrize(("pots", "at_start", "after"), [("coefficient", 0.83, 0.6098), ("dial", 0.8199, 0.5966)])
+def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
+    tmp_path: Path, pots: str, at_start: float, after: float
+) -> None:
+    """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
+    into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
+    rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
+    scenario = replace(Scenario.load("healthy"), tweaks=(Tweak(100, stiffness_n_per_m=18000.0),))
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        computer, _, tweaks = opened.set_up(scenario, 1)
+    assert computer.coefficients["K"] == pytest.approx(at_start, abs=1e-4)
+    computer.set(**tweaks[0][1])
+    assert computer.coefficients["K"] == pytest.approx(after, abs=1e-4)
