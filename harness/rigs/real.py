@@ -448,7 +448,7 @@ class RealRig:
 
         try:
             findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
-        except SelfTestError as error:
+        except (SelfTestError, ConfigurationError) as error:
             return (f"the rig's self-test could not be made: {error}",)
         return tuple(f"the rig's self-test: {check.sentence}" for check in findings.having("wrong"))
 
