@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from harness.cli import (
+    calibrate,
     campaign,
     certify,
     compare,
@@ -35,10 +36,11 @@ _COMMANDS = (
     certify,
     compare,
     thesis,
-    doctor,
-    compare_rigs,
     emulate,
     serve,
+    doctor,
+    calibrate,
+    compare_rigs,
     effects,
     netlist,
 )
