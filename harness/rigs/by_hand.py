@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from harness.links.wire import Clock
-from harness.onset import NoOnset, onset
+from harness.onset import NoOnset, Onset, onset
 from harness.plant import Plant
 from harness.rigs.pots import Pots
 from harness.run import Segment
+from harness.turn import turn
 from harness.two_filter import Record
 
 BEFORE_S, AFTER_S = 0.02, 0.05
@@ -85,10 +86,21 @@ def _dated(record: Record, tweak: Tweak, search: range) -> Segment:
     if len(search) < LEAST_SEARCH_N:
         start = min(search.start, len(record) - 1)
         return Segment(start, tweak.after, unseen="the pot was turned when the record was over, or nearly so")
-    found = onset(record, tweak.before, tweak.after, search)
-    if isinstance(found, NoOnset):
-        return Segment(search.start, tweak.after, ramp_n=len(search), unseen=found.reason)
-    return Segment(found.sample, tweak.after, start_low=found.low, start_high=found.high)
+    jump = onset(record, tweak.before, tweak.after, search)
+    if isinstance(jump, Onset):
+        return Segment(jump.sample, tweak.after, start_low=jump.low, start_high=jump.high)
+    way = turn(record, tweak.before, tweak.after, search)
+    if isinstance(way, NoOnset):
+        return Segment(search.start, tweak.after, ramp_n=len(search), unseen=way.reason)
+    return Segment(
+        way.begin.sample,
+        tweak.after,
+        ramp_n=way.end.sample - way.begin.sample,
+        start_low=way.begin.low,
+        start_high=way.begin.high,
+        end_low=way.end.low,
+        end_high=way.end.high,
+    )
 
 
 def _moved(segment: Segment, by: int) -> Segment:
