@@ -15,6 +15,8 @@ from harness.cli import (
     campaign,
     certify,
     compare,
+    compare_rigs,
+    doctor,
     effects,
     emulate,
     judge,
@@ -26,7 +28,22 @@ from harness.cli import (
 )
 from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
 
-_COMMANDS = (run, replay, judge, campaign, certify, compare, thesis, emulate, serve, calibrate, effects, netlist)
+_COMMANDS = (
+    run,
+    replay,
+    judge,
+    campaign,
+    certify,
+    compare,
+    thesis,
+    emulate,
+    serve,
+    doctor,
+    calibrate,
+    compare_rigs,
+    effects,
+    netlist,
+)
 """Each has ``add(commands)``; in the order of ``--help``."""
 
 

@@ -29,17 +29,20 @@ from emulator import (
     OpAmpGrade,
     Pot,
     RampedTweak,
+    RepeatedPlay,
     Resistor,
     Sampler,
     SuspensionComputer,
     acquired,
+    drawn_offsets_v,
+    is_repeatable,
     probes_per_sample,
 )
 from emulator.opamp import preset
 from harness.errors import AnalogrigError, ConfigurationError, RigError
 from harness.plant import Plant
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
-from harness.run import CHANNELS, Channel
+from harness.run import CHANNELS, Channel, Segment
 from harness.scenario import Scenario
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
@@ -245,6 +248,25 @@ class SetUp(NamedTuple):
     tweaks: tuple[RampedTweak, ...]
 
 
+class _Stage(NamedTuple):
+    """What the plays of one scenario share, whatever the seed."""
+
+    scenario: Scenario
+    computer: SuspensionComputer
+    play: RepeatedPlay | None
+    """None where more than offsets and phase depends on the seed."""
+    channels: Mapping[str, Channel]
+    segments: tuple[Segment, ...]
+
+    def serves(self, scenario: Scenario) -> bool:
+        """Whether another scenario differs in nothing that was worked out."""
+        own = self.scenario
+        return scenario is own or (
+            (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
+            == (own.samples, own.plant, own.tweaks, own.excitation)
+        )
+
+
 class EmulatorRig:
     """The emulated analogue computer and its card."""
 
@@ -254,7 +276,8 @@ class EmulatorRig:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
         self._card = description.card.card()
-        preset(description.computer.op_amp)  # refused here, and not when it is first played
+        self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
+        self._last_stage: _Stage | None = None
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
@@ -282,7 +305,14 @@ class EmulatorRig:
         return SetUp(computer, excitation, tuple(tweaks))
 
     def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
-        """As Rig.perform; the length of the blocks changes nothing but speed."""
+        """As Rig.perform; the length of the blocks changes nothing but speed.
+
+        What a scenario that fits in one block needs is prepared once for all seeds.
+        """
+        if scenario.samples <= block_samples:
+            stage = self._stage(scenario, seed)
+            if stage.play is not None:
+                return self._repeated(stage, stage.play, scenario, seed)
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
@@ -295,7 +325,46 @@ class EmulatorRig:
             time_scale=computer.scales.time,
             channels=self._channels(computer),
             blocks=_sampled(volts, Sampler(self._card, Stream.CARD.generator(seed))),
-            hindsight=lambda: Hindsight(scenario.segments(), _lit(computer, probes_per_sample(self._card))),
+            hindsight=lambda: Hindsight(
+                scenario.segments(), _lit(computer.machine.lamps, probes_per_sample(self._card))
+            ),
+        )
+
+    def _stage(self, scenario: Scenario, seed: int) -> _Stage:
+        """The last one, if it serves."""
+        if self._last_stage is None or not self._last_stage.serves(scenario):
+            computer, excitation, tweaks = self.set_up(scenario, seed)
+            with emulator_errors(f"scenario {scenario.name}: "):
+                excitation.edges(0, 1, computer.sample_rate_hz)
+                able = self._draws_offsets_alone and is_repeatable(computer, tweaks)
+                play = RepeatedPlay(computer, scenario.samples, tweaks) if able else None
+            self._last_stage = _Stage(scenario, computer, play, self._channels(computer), scenario.segments())
+        return self._last_stage
+
+    @property
+    def _draws_offsets_alone(self) -> bool:
+        drawn, card = self._description.computer, self._card
+        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
+        is_nominal &= drawn.specimen is None and drawn.values is None
+        return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
+
+    def _repeated(self, stage: _Stage, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
+        count, offset_v = stage.computer.program.amplifiers, self._description.computer.offset_v
+        offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
+        excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+        lit: dict[str, int] = {}
+
+        def volts() -> Iterator[NDArray[np.float64]]:
+            repeat = play.play(excitation, offsets_v)
+            lit.update(_lit(repeat.lamps, 1))
+            yield repeat.volts
+
+        return Performance(
+            sample_period_s=1.0 / self._card.rate_hz,
+            time_scale=stage.computer.scales.time,
+            channels=stage.channels,
+            blocks=_sampled(volts(), Sampler(self._card, Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight(stage.segments, lit),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
@@ -328,6 +397,7 @@ class EmulatorRig:
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=1.0 / computer.scales.volts(name),
                 noise_lsb=self._card.noise_lsb[i],
+                codes=1 << self._card.bits,
             )
             for i, name in enumerate(CHANNELS)
         }
@@ -339,10 +409,9 @@ class EmulatorRig:
         pass
 
 
-def _lit(computer: SuspensionComputer, probes: int) -> dict[str, int]:
+def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
     """Lamps that are lit, with the card's sample; the machine takes `probes` for each of those."""
-    lamps = computer.machine.lamps.items()
-    return {amplifier: -(-probe // probes) for amplifier, probe in lamps if probe is not None}
+    return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
 
 
 def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:

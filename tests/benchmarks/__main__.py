@@ -1,6 +1,7 @@
 """All benchmarks, or those named: prints one table and writes build/bench.json.
 
 python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [calibration]
+python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [self-test]
 
 bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
 """
@@ -19,6 +20,7 @@ from . import (
     bench_engine,
     bench_isolation,
     bench_link,
+    bench_self_test,
     bench_statistics,
     bench_trials,
 )
@@ -34,6 +36,7 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "isolation": bench_isolation.figures,
     "trials": bench_trials.figures,
     "calibration": bench_calibration.figures,
+    "self-test": bench_self_test.figures,
 }
 
 
