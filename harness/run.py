@@ -70,6 +70,8 @@ class Channel:
     unit_per_v: float
     noise_lsb: float
     """rms of the noise before quantisation, as far as the rig knows it."""
+    codes: int = 4096
+    """How many there are, from 0 on."""
 
     def physical(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
         """Codes of any shape to ``unit`` (float64, same shape)."""

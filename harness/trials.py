@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,9 @@ class Trials:
         self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
         library = device.library_path if isinstance(device, InprocDevice) else LIBRARY
         self._estimator = Estimator(self._device.estimator, library=library)
+        # Runs share their tables: to write them anew for each takes as long as to play a thousand samples.
+        self._tables = rig.description(), self._device.as_table()
+        self._scenario_table: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
         """The samples with an alarm, (a,), and nothing else: the fastest way.
@@ -103,6 +107,9 @@ class Trials:
         )
 
     def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        if self._scenario_table[0] is not scenario:
+            self._scenario_table = scenario, scenario.as_table()
+        rig, dut = self._tables
         hindsight = performance.hindsight()
         return Conditions(
             seed=seed,
@@ -111,9 +118,9 @@ class Trials:
             time_scale=performance.time_scale,
             channels=performance.channels,
             segments=hindsight.segments,
-            scenario=scenario.as_table(),
-            rig=self._rig.description(),
-            dut=self._device.as_table(),
+            scenario=self._scenario_table[1],
+            rig=rig,
+            dut=dut,
             link="none",
             counters=self._estimator.counters,
             faults=scenario.caveats,
