@@ -225,11 +225,17 @@ def _inverse(normal: Vector) -> Vector:
 
     :raises RigError: there is none.
     """
-    scale = 1.0 / np.sqrt(np.diag(normal))
+    own, untold = np.diag(normal), "the recordings do not tell what is to be fitted: are there enough, and of a signal?"
+    if not (own > 0.0).all():
+        raise RigError(untold)
+    units = np.sqrt(np.outer(own, own))
     try:
-        return np.asarray(np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale))
+        inverse = np.linalg.inv(normal / units) / units
     except np.linalg.LinAlgError as error:
-        raise RigError("the recordings do not tell what is to be fitted: do they hold a signal?") from error
+        raise RigError(untold) from error
+    if not (np.diag(inverse) > 0.0).all():
+        raise RigError(untold)
+    return np.asarray(inverse)
 
 
 # ---- the card

@@ -1,6 +1,6 @@
 """All benchmarks, or those named: prints one table and writes build/bench.json.
 
-python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [onset] [self-test]
+python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [self-test] [onset]
 
 bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
 """
@@ -34,8 +34,8 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "statistics": bench_statistics.figures,
     "isolation": bench_isolation.figures,
     "trials": bench_trials.figures,
-    "onset": bench_onset.figures,
     "self-test": bench_self_test.figures,
+    "onset": bench_onset.figures,
 }
 
 
