@@ -1,6 +1,6 @@
 """All benchmarks, or those named: prints one table and writes build/bench.json.
 
-python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [self-test] [onset] [calibration]
+python -m tests.benchmarks [NAME ...]
 
 bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
 """
