@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from harness.dut import Dut, Replies, Stretch
 from harness.errors import DeviceError, LinkError, RigError
 from harness.pace import Pace
-from harness.rig import Block, Performance, Rig
+from harness.rigs.rig import Block, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 

@@ -33,7 +33,7 @@ from harness.scenario import Scenario
 if TYPE_CHECKING:
     import can
 
-    from harness.rig import Rig
+    from harness.rigs.rig import Rig
 
 WRITTEN = ("log", "blf", "asc", "mf4")
 """Formats that a run can leave, by the suffix of the file."""

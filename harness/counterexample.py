@@ -80,7 +80,7 @@ def _is_scenario(name: str, run: Run) -> bool:
 
 def _is_rig(name: str, run: Run) -> bool:
     from harness.errors import AnalogrigError
-    from harness.rig import open_rig
+    from harness.rigs.description import open_rig
 
     try:
         with open_rig(name) as opened:

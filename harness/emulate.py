@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.bench import Progress
 from harness.errors import ConfigurationError
-from harness.rig import Block, Rig
+from harness.rigs.rig import Block, Rig
 from harness.run import CHANNELS
 from harness.scenario import Scenario
 from harness.storage import replacing

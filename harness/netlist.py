@@ -5,7 +5,8 @@ from __future__ import annotations
 from emulator import TICKS_PER_SAMPLE, Deck
 from emulator.suspension import SOURCE
 from harness.errors import ConfigurationError
-from harness.rig import EmulatorRig, Rig, SetUp
+from harness.rigs.emulator import EmulatorRig, SetUp
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from harness.bench import Bench
     from harness.dut import Dut
     from harness.played import Played
-    from harness.rig import Rig
+    from harness.rigs.rig import Rig
     from harness.scenario import Scenario
 
 PROFILES = ("ci", "nightly", "soak")
@@ -202,7 +202,7 @@ def hil_profile(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     """The rig of --rig, opened; the test is skipped if it lacks what the mark ``needs`` asks."""
-    from harness.rig import open_rig
+    from harness.rigs.description import open_rig
 
     name = _chosen(request, "rig")
     with _in_one_line():
@@ -369,7 +369,7 @@ class ScenarioItem(pytest.Item):
 
     def runtest(self) -> None:
         from harness.bench import Bench
-        from harness.rig import open_rig
+        from harness.rigs.description import open_rig
         from harness.scenario import Scenario
 
         scenario = Scenario.load(str(self.path))

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from emulator.excitation import Excitation
 from emulator.suspension import PROGRAMS
 from harness.plant import PARAMETERS, Plant
-from harness.rig import CardDescription, ComputerDescription, EmulatorDescription
+from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from harness.scenario import PLANTS, PlantChoice, Scenario, Tweak
 from harness.verdict import Expectations
 

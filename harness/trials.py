@@ -16,7 +16,8 @@ from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
 from harness.links.wire import LIBRARY
-from harness.rig import Block, EmulatorRig, Performance, Rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.rig import Block, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 

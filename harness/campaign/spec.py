@@ -19,7 +19,10 @@ import numpy as np
 from harness import config
 from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import ConfigurationError
-from harness.rig import EmulatorDescription, EmulatorRig, RecordingRig, Rig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorDescription, EmulatorRig
+from harness.rigs.recording import RecordingRig
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario, Tweak
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000

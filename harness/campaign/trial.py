@@ -14,7 +14,8 @@ from harness.bench import INTERRUPTED_BY_USER, Bench
 from harness.campaign.spec import Case, Chunk, Plan, device_of, open_table
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
-from harness.rig import EmulatorRig, Rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.rig import Rig
 from harness.run import Run
 from harness.trials import Trials, are_possible
 from harness.verdict import Verdict, judge

@@ -19,7 +19,7 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.rig import RecordingRig
+    from harness.rigs.recording import RecordingRig
 
     run = recorded(arguments)
     prepare(arguments.out, RecordingRig.of(run, arguments.file))

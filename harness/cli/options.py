@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from harness.rig import Rig
+    from harness.rigs.rig import Rig
     from harness.run import Run
     from harness.scenario import Scenario
 
@@ -137,7 +137,8 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
     """The rig, the scenario and the seed that were asked for; what was not, as the scenario or the recording has it."""
     from dataclasses import replace
 
-    from harness.rig import DEFAULT_RIG, RecordingRig, open_rig
+    from harness.rigs.description import DEFAULT_RIG, open_rig
+    from harness.rigs.recording import RecordingRig
     from harness.scenario import DEFAULT_SEED, Scenario
 
     asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
@@ -184,7 +185,7 @@ def recorded(arguments: argparse.Namespace) -> Run:
     """
     from harness.can_log import captured_run, retold
     from harness.errors import ConfigurationError
-    from harness.rig import open_rig
+    from harness.rigs.description import open_rig
     from harness.run import Run
     from harness.scenario import Scenario
 

@@ -13,7 +13,7 @@ from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, pr
 if TYPE_CHECKING:
     from harness.can_log import CanLog
     from harness.dut import Dut
-    from harness.rig import Rig
+    from harness.rigs.rig import Rig
     from harness.run import Run
     from harness.scenario import Scenario
     from harness.verdict import Verdict
@@ -27,7 +27,7 @@ def prepare(out: Path, rig: Rig) -> None:
     :raises ConfigurationError: the folder cannot be made, or holds the recording that is being played.
     """
     from harness.errors import ConfigurationError
-    from harness.rig import RecordingRig
+    from harness.rigs.recording import RecordingRig
 
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -46,7 +46,7 @@ def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
     """
     from harness.can_log import WRITTEN, CanLog
     from harness.errors import ConfigurationError
-    from harness.rig import RecordingRig
+    from harness.rigs.recording import RecordingRig
 
     if isinstance(rig, RecordingRig) and rig.path.resolve() in {path.resolve() for path in _can_logs(arguments.out)}:
         raise ConfigurationError(

@@ -23,7 +23,7 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from harness.dut import open_dut, reopen_dut
     from harness.errors import ConfigurationError
-    from harness.rig import RecordingRig
+    from harness.rigs.recording import RecordingRig
 
     named = arguments.dut
     if named is None and is_capture(arguments.file):

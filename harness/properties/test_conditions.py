@@ -15,7 +15,8 @@ from harness.dut import Dut, open_dut
 from harness.errors import AnalogrigError
 from harness.properties import Play, with_some_seed
 from harness.properties.test_detection import SURELY, passes, stays_quiet
-from harness.rig import EmulatorRig, Rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario
 from harness.statistics import Design, lower_rate
 from harness.strategies import link_faults, profile, random_suspensions, seeds

@@ -13,7 +13,7 @@ from harness.bench import Bench
 from harness.dut import Dut
 from harness.played import Finding, Played
 from harness.properties import Play, with_some_seed
-from harness.rig import EmulatorDescription, EmulatorRig
+from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.scenario import Scenario
 from harness.strategies import profile, rigs, scenarios, seeds
 from harness.verdict import judge

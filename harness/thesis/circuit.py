@@ -13,7 +13,7 @@ from harness.devices import HostDevice
 from harness.dut import connect
 from harness.estimator_config import EstimatorConfig
 from harness.plant import Plant, physical_parameters
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.run import Run, Segment
 from harness.scenario import PlantChoice, Scenario, Tweak
 from harness.thesis.chapter4 import ERROR_CEILING, UNITS_PER_M, WARM_UP_N

@@ -16,7 +16,7 @@ from harness.bench import Bench
 from harness.devices import FIRMWARE, CanDevice, DeviceDescription, HostDevice, InprocDevice, QemuM4
 from harness.dut import connect
 from harness.pace import Pace
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.scenario import Scenario
 from tests.can_guest.__main__ import throughput_in_guest
 

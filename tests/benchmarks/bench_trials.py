@@ -16,7 +16,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from harness.devices import describe
-from harness.rig import EmulatorRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
 from harness.trials import Trials
 

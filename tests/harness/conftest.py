@@ -8,7 +8,7 @@ import pytest
 
 from harness.bench import Bench
 from harness.dut import open_dut
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.scenario import Scenario
 
 

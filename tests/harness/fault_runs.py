@@ -39,7 +39,7 @@ from harness.links.faulty_wire import FaultyWire
 from harness.links.link import FramedLink, Link
 from harness.links.wire import MemoryWire, Wire
 from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
-from harness.rig import Block, Performance
+from harness.rigs.rig import Block, Performance
 from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge

@@ -25,7 +25,8 @@ from harness.cli import main
 from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
-from harness.rig import EmulatorRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario, Tweak
 from harness.verdict import judge
 

@@ -20,7 +20,7 @@ from harness.cli import main
 from harness.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
 from harness.dut import Dut, connect, open_dut, reopen_dut
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.run import Run
 from harness.scenario import Scenario
 from harness.verdict import judge

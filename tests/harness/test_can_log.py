@@ -23,7 +23,8 @@ from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
 from harness.estimator_config import EstimatorConfig
-from harness.rig import RecordingRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.recording import RecordingRig
 from harness.run import LOST, Run
 from harness.scenario import Scenario
 from harness.summary import summary

@@ -23,7 +23,7 @@ from harness.cli import main
 from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.scenario import Scenario
 
 # -------------------------------------------------------------------------------------------------------- certificates

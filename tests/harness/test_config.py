@@ -11,7 +11,7 @@ import pytest
 
 from harness import config
 from harness.errors import ConfigurationError
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.scenario import Scenario
 
 SCENARIO = """

@@ -13,7 +13,8 @@ from harness.advice import advice
 from harness.bench import Bench
 from harness.dut import open_dut
 from harness.report import render
-from harness.rig import RecordingRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.recording import RecordingRig
 from harness.run import Run
 from harness.scenario import Scenario
 from harness.summary import summary

@@ -18,7 +18,9 @@ from harness.dut import open_dut
 from harness.errors import ConfigurationError
 from harness.netlist import netlist
 from harness.plant import Plant, SampledPlant
-from harness.rig import EmulatorRig, RecordingRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.recording import RecordingRig
 from harness.run import Run, Segment
 from harness.scenario import PlantChoice, Scenario, Tweak
 from harness.verdict import as_json, judge

@@ -28,7 +28,7 @@ from harness.devices import (
 )
 from harness.dut import Dut, connect, reopen_dut
 from harness.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.run import Run
 from harness.scenario import Scenario
 from tests.harness.firmware import CORES, FOLDER, needs_firmware

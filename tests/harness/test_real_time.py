@@ -15,7 +15,7 @@ from harness.errors import ConfigurationError
 from harness.links.line import SerialLine
 from harness.links.link import FramedLink
 from harness.links.wire import MemoryWire, VirtualClock
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.run import UNREPORTED, Run
 from harness.scenario import Scenario
 from harness.verdict import judge

@@ -10,7 +10,9 @@ import pytest
 
 from harness import config
 from harness.errors import ConfigurationError
-from harness.rig import Block, RecordingRig, Rig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.recording import RecordingRig
+from harness.rigs.rig import Block, Rig
 from harness.run import CHANNELS
 from harness.scenario import Scenario, Tweak
 

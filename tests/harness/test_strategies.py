@@ -16,7 +16,8 @@ from harness import config
 from harness.devices import InprocDevice
 from harness.information import detectable, predicted_bounds
 from harness.played import Played
-from harness.rig import EmulatorDescription, EmulatorRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.scenario import PLANTS, PlantChoice, Scenario, Tweak
 from harness.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
 from harness.trials import Trials

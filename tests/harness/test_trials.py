@@ -10,7 +10,8 @@ import pytest
 from harness.bench import Bench
 from harness.devices import describe
 from harness.dut import open_dut
-from harness.rig import EmulatorRig, open_rig
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
 from harness.trials import BLOCK_SAMPLES, Trials, are_possible
 from harness.verdict import judge

@@ -12,7 +12,7 @@ from harness.bench import Bench
 from harness.devices import DeviceDescription, InprocDevice
 from harness.dut import connect, open_dut
 from harness.plant import PARAMETERS
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.scenario import Scenario
 from harness.verdict import SegmentEstimate, Verdict, judge
 

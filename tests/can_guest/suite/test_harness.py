@@ -13,7 +13,7 @@ from harness.bench import Bench
 from harness.catalogue import LAYOUTS, Sample, unpack
 from harness.dut import open_dut
 from harness.errors import LinkError, LinkTimeout
-from harness.rig import open_rig
+from harness.rigs.description import open_rig
 from harness.run import Run
 from harness.scenario import Scenario
 

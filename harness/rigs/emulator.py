@@ -1,19 +1,13 @@
-"""Rigs: what plays a scenario and yields samples. The emulated analogue computer, and a recording of a run.
-
-A rig is opened by name, performs scenarios, and is closed. Whatever else a bench instrument will be, it is another
-class with these methods; nothing behind this module asks which one it has.
-"""
+"""The emulated analogue computer and its card, as a rig; its description."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import enum
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,90 +29,14 @@ from emulator import (
     probes_per_sample,
 )
 from emulator.opamp import preset
-from harness import config
-from harness.errors import AnalogrigError, ConfigurationError, RecordingError, RigError
+from harness.errors import AnalogrigError, ConfigurationError, RigError
 from harness.plant import Plant
-from harness.run import CHANNELS, Channel, Run, Segment
+from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Performance
+from harness.run import CHANNELS, Channel
 from harness.scenario import Scenario
-
-DEFAULT_RIG = "emulator"
-"""When neither the user nor the scenario says another."""
-
-BLOCK_SAMPLES = 256
-"""Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
-
-CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Consecutive samples, each taken on all channels at the same instant; columns as ``CHANNELS``."""
-
-    first: int
-    """Index of the first sample."""
-    volts: NDArray[np.float64]
-    """(n, 4): at the computer's outputs."""
-    codes: NDArray[np.uint16]
-    """(n, 4)"""
-    clipped: NDArray[np.bool_]
-    """(n, 4): the code is the end of the range, not a measurement."""
-
-
-@dataclass(frozen=True, eq=False)
-class Performance:
-    """A scenario being played: what is known beforehand, and the samples as they come."""
-
-    sample_period_s: float
-    time_scale: float
-    channels: Mapping[str, Channel]
-    segments: tuple[Segment, ...]
-    """The truth; empty if the rig does not know it."""
-    blocks: Iterator[Block]
-    lamps: Callable[[], Mapping[str, int]] = dict
-    """Asked when the blocks have been taken: of each amplifier whose overload lamp is lit, the first sample that was
-    taken with it lit. None for a rig that has no lamps."""
-
-
-class Rig(Protocol):
-    """Something that can play a scenario."""
-
-    capabilities: frozenset[str]
-    """What it can do beyond sampling: ``tweak``, ``excite``."""
-
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
-        """Begin to play; the blocks are produced as they are asked for.
-
-        :raises ConfigurationError: the scenario cannot be played on this rig.
-        :raises RigError: the rig failed; also while the blocks are taken.
-        """
-
-    def description(self) -> Mapping[str, Any]:
-        """Its name and settings in plain values, for the record."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Leave it safe: outputs off, connections closed."""
-
-
-def open_rig(name: str) -> Rig:
-    """The rig of a shipped or own description, or ``recording:FILE``.
-
-    :raises ConfigurationError: there is none, or its description is wrong.
-    :raises RecordingError: the recording cannot be read.
-    """
-    kind, _, rest = name.partition(":")
-    if kind == "recording" and rest:
-        return RecordingRig.open(Path(rest))
-    path = config.locate("rigs", name)
-    description = config.build(EmulatorDescription, {"name": path.stem, **config.read_toml(path)}, str(path))
-    with _emulator_errors(f"{path}: "):
-        return EmulatorRig(description)
 
 
 @dataclass(frozen=True)
@@ -262,12 +180,12 @@ class EmulatorRig:
 
         :raises ConfigurationError: the scenario cannot be played on this rig.
         """
-        with _emulator_errors(f"scenario {scenario.name}: "):
+        with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
-            with _emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
+            with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
                 settings = _settings(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
@@ -276,7 +194,7 @@ class EmulatorRig:
     def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
         """As Rig.perform; the length of the blocks changes nothing but speed."""
         computer, excitation, tweaks = self.set_up(scenario, seed)
-        with _emulator_errors(f"scenario {scenario.name}: "):
+        with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
             jitter = _Stream.APERTURE.generator(seed)
             volts = acquired(
@@ -330,66 +248,6 @@ class EmulatorRig:
         pass
 
 
-class RecordingRig:
-    """A recorded run, played again; it knows one scenario, its own."""
-
-    capabilities: frozenset[str] = frozenset()
-
-    def __init__(self, run: Run, path: Path) -> None:
-        self.run = run
-        self.path = path
-        self._name = f"recording:{path}"
-
-    @classmethod
-    def open(cls, path: Path) -> RecordingRig:
-        """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
-        return cls.of(Run.load(path), path)
-
-    @classmethod
-    def of(cls, run: Run, path: Path) -> RecordingRig:
-        """As ``open``, of what was read from ``path``."""
-        if run.samples == 0:
-            raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
-        return cls(run, path)
-
-    def description(self) -> Mapping[str, Any]:
-        return {**self.run.conditions.rig, "name": self._name}
-
-    def scenario(self) -> Scenario:
-        """The scenario that was recorded. If the recording ended before its time, so does what is played of it: its run
-        is then not valid either."""
-        scenario = Scenario.from_table(self.run.conditions.scenario, self._name)
-        return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked)
-
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
-        conditions = self.run.conditions
-        if scenario != self.scenario():
-            raise ConfigurationError(f"{self._name}: holds the scenario {self.scenario().name!r} and can play no other")
-        if seed != conditions.seed:
-            raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}")
-        return Performance(
-            conditions.sample_period_s,
-            conditions.time_scale,
-            conditions.channels,
-            conditions.segments,
-            self._blocks(),
-            lamps=lambda: conditions.overloads,
-        )
-
-    def _blocks(self) -> Iterator[Block]:
-        channels = [self.run.conditions.channels[name] for name in CHANNELS]
-        for first in range(0, self.run.samples, BLOCK_SAMPLES):
-            codes = self.run.codes[first : first + BLOCK_SAMPLES]
-            volts = np.stack([channel.volts(codes[:, i]) for i, channel in enumerate(channels)], axis=1)
-            yield Block(first, volts, codes, self.run.clipped[first : first + BLOCK_SAMPLES])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def _lit(computer: SuspensionComputer, probes: int) -> dict[str, int]:
     """Lamps that are lit, with the card's sample; the machine takes `probes` for each of those."""
     lamps = computer.machine.lamps.items()
@@ -398,7 +256,7 @@ def _lit(computer: SuspensionComputer, probes: int) -> dict[str, int]:
 
 def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
     first = 0
-    with _emulator_errors(as_error=RigError):
+    with emulator_errors(as_error=RigError):
         for block in volts:
             codes, clipped = sampler.sample(block)
             yield Block(first, block, codes, clipped)
@@ -406,7 +264,7 @@ def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator
 
 
 @contextlib.contextmanager
-def _emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = ConfigurationError) -> Iterator[None]:
+def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = ConfigurationError) -> Iterator[None]:
     """What the emulator raises becomes an error of the harness, here and nowhere else."""
     try:
         yield

@@ -1,0 +1,1 @@
+"""Rigs: what plays a scenario and yields samples."""

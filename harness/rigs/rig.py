@@ -1,0 +1,76 @@
+"""What a rig is to everything behind it: it performs a scenario and yields blocks of samples.
+
+A rig is opened by name, performs scenarios, and is closed. The emulated computer, a recording and a real one are
+classes with these methods; nothing behind this module asks which one it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.run import Channel, Segment
+from harness.scenario import Scenario
+
+BLOCK_SAMPLES = 256
+"""Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
+
+CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Consecutive samples, each taken on all channels at the same instant; columns as ``CHANNELS``."""
+
+    first: int
+    """Index of the first sample."""
+    volts: NDArray[np.float64]
+    """(n, 4): at the computer's outputs."""
+    codes: NDArray[np.uint16]
+    """(n, 4)"""
+    clipped: NDArray[np.bool_]
+    """(n, 4): the code is the end of the range, not a measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Performance:
+    """A scenario being played: what is known beforehand, and the samples as they come."""
+
+    sample_period_s: float
+    time_scale: float
+    channels: Mapping[str, Channel]
+    segments: tuple[Segment, ...]
+    """The truth; empty if the rig does not know it."""
+    blocks: Iterator[Block]
+    lamps: Callable[[], Mapping[str, int]] = dict
+    """Asked when the blocks have been taken: of each amplifier whose overload lamp is lit, the first sample that was
+    taken with it lit. None for a rig that has no lamps."""
+
+
+class Rig(Protocol):
+    """Something that can play a scenario."""
+
+    capabilities: frozenset[str]
+    """What it can do beyond sampling: ``tweak``, ``excite``."""
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        """Begin to play; the blocks are produced as they are asked for.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        :raises RigError: the rig failed; also while the blocks are taken.
+        """
+
+    def description(self) -> Mapping[str, Any]:
+        """Its name and settings in plain values, for the record."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave it safe: outputs off, connections closed."""
