@@ -120,6 +120,7 @@ class Bench:
             rig=self.rig.description(),
             dut=self.dut.description(),
             link=self.dut.link_name,
+            line=self.dut.line,
             faults=scenario.caveats,
             real_time=self._real_time or 0.0,
         )

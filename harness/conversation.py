@@ -85,8 +85,8 @@ class Conversation:
             if (self._expected - message.seq) % _SEQ > LATEST:
                 lost = (message.seq - self._expected) % _SEQ
                 raise LinkError(
-                    f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
-                    f" ({self.link.counters['frames_dropped']} frames were damaged)"
+                    f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}, or"
+                    f" somebody else speaks as the device ({self.link.counters['frames_dropped']} frames were damaged)"
                 )
             before = self._heard.get(message.seq)
             if before is not None and pack(before) != pack(message):
