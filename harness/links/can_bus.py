@@ -16,14 +16,10 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
-import can
-from can.interfaces import BACKENDS
-from can.interfaces.slcan import slcanBus
-from can.typechecking import BitTimingDict, BitTimingFdDict
-
 from harness.errors import ConfigurationError, LinkClosed, LinkError
 from harness.links.child import Child
 from harness.links.line import CanLine
+from harness.links.python_can import BACKENDS, BitTimingDict, BitTimingFdDict, can, slcanBus
 from harness.links.wire import WRITE_TIMEOUT_S, Clock
 
 RECEIVED_AHEAD_N = 200
