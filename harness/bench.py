@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import gc
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import itertools
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -38,12 +39,24 @@ class _Collected:
     clipped: list[NDArray[np.bool_]] = field(default_factory=list)
     replies: list[Replies] = field(default_factory=list)
     samples: int = 0
+    records: list[int] = field(default_factory=list)
+    """Their first samples."""
+    counters: Counter[str] = field(default_factory=Counter)
+    """The device's, of all records."""
+    line_s: float = 0.0
+
+    def begin_record(self) -> None:
+        self.records.append(self.samples)
 
     def add(self, block: Block, reply: Replies) -> None:
         self.codes.append(block.codes)
         self.clipped.append(block.clipped)
-        self.replies.append(reply)
+        self.replies.append(_since(self.records[-1], reply))
         self.samples += len(block.codes)
+
+    def end_record(self, line_s: float, counters: Mapping[str, int]) -> None:
+        self.line_s += line_s
+        self.counters.update(counters)
 
     def run(self, conditions: Conditions, parameters: int) -> Run:
         alarms = [alarm for reply in self.replies for alarm in reply.alarms]
@@ -64,6 +77,19 @@ class _Collected:
             diagnosis_onset=np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
             diagnosis_extent=np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
         )
+
+
+def _since(first: int, reply: Replies) -> Replies:
+    """What the device said of a record that begins with the sample ``first``, which is 0 to the device."""
+    if not first:
+        return reply
+    return dataclasses.replace(
+        reply,
+        alarms=tuple(dataclasses.replace(alarm, index=first + alarm.index) for alarm in reply.alarms),
+        diagnoses=tuple(
+            dataclasses.replace(each, index=first + each.index, onset=first + each.onset) for each in reply.diagnoses
+        ),
+    )
 
 
 def _stacked(parts: Sequence[NDArray[T]], empty_shape: tuple[int, ...], dtype: type[T]) -> NDArray[T]:
@@ -109,35 +135,44 @@ class Bench:
         pace, blocks = self._paced(performance)
         self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
-        conditions = Conditions(
+        begun = Conditions(
             seed=seed,
             samples_asked=scenario.samples,
             sample_period_s=performance.sample_period_s,
             time_scale=performance.time_scale,
             channels=performance.channels,
-            segments=performance.segments,
+            segments=(),
             scenario=scenario.as_table(),
             rig=self.rig.description(),
             dut=self.dut.description(),
             link=self.dut.link_name,
             line=self.dut.line,
-            faults=scenario.caveats,
             real_time=self._real_time or 0.0,
         )
         collected = _Collected()
+        faults = list(scenario.caveats)
         try:
             with _undisturbed(pace):
-                self._exchange(blocks, scenario.samples, collected)
-            conditions = dataclasses.replace(conditions, line_s=self.dut.line_s, counters=self.dut.stop())
+                self._exchange(blocks, pace, scenario.samples, collected)
         except (DeviceError, LinkError, RigError) as error:
-            conditions = dataclasses.replace(conditions, faults=(*conditions.faults, str(error)))
+            faults.append(str(error))
         except KeyboardInterrupt:
-            conditions = dataclasses.replace(conditions, faults=(*conditions.faults, INTERRUPTED_BY_USER))
+            faults.append(INTERRUPTED_BY_USER)
         if pace is not None and pace.overruns:
-            late = f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"
-            conditions = dataclasses.replace(conditions, faults=(*conditions.faults, late))
-        lit = {amplifier: sample for amplifier, sample in performance.lamps().items() if sample < collected.samples}
-        conditions = dataclasses.replace(conditions, overloads=lit, link_counters=self.dut.link_counters)
+            faults.append(
+                f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"
+            )
+        known = performance.hindsight()
+        conditions = dataclasses.replace(
+            begun,
+            segments=known.segments,
+            faults=(*faults, *known.caveats),
+            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < collected.samples},
+            records=tuple(collected.records) or (0,),
+            line_s=collected.line_s,
+            counters=collected.counters,
+            link_counters=self.dut.link_counters,
+        )
         return collected.run(conditions, self.dut.parameters)
 
     def _paced(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
@@ -151,14 +186,25 @@ class Bench:
         """Of a run in real time; counts its overruns."""
         return self.dut.pace(period_s)
 
-    def _exchange(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
+    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected) -> None:
+        """One record after the other; to the device each is a run of its own, the first of which has begun."""
+        for record, its_blocks in itertools.groupby(blocks, key=lambda block: block.record):
+            if record:
+                self.dut.start(pace)
+            collected.begin_record()
+            self._exchange_record(its_blocks, samples, collected)
+            line_s = self.dut.line_s
+            collected.end_record(line_s, self.dut.stop())
+
+    def _exchange_record(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
         sent: deque[Block] = deque()
+        start = collected.records[-1]
 
         def stretches() -> Iterator[Stretch]:
             for block in blocks:
                 sent.append(block)
                 yield (
-                    block.first,
+                    block.first - start,
                     block.codes[:, _FORCE],
                     block.codes[:, _DISPLACEMENT],
                     missing_to_device(block.clipped),

@@ -203,6 +203,8 @@ class Dut:
 
         :raises DeviceRefused: the device cannot.
         """
+        if pace is not None:
+            pace.restart()
         self._counted = self.status()
         self._run = (self._run + 1) % RUNS
         self._control(Command.START, self._run)

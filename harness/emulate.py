@@ -44,7 +44,7 @@ def write_signals(
     return {
         "samples": sum(len(block.codes) for block in blocks),
         "clipped": sum(int(block.clipped.any(axis=1).sum()) for block in blocks),
-        "overloads": dict(performance.lamps()),
+        "overloads": dict(performance.hindsight().lamps),
     }
 
 

@@ -140,7 +140,9 @@ def _changes(run: Run) -> Iterator[_Change]:
     variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
     weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
-    return _courses_of(run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s)
+    return _courses_of(
+        run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s, records=conditions.records
+    )
 
 
 def _courses_of(
@@ -149,12 +151,15 @@ def _courses_of(
     force_n: Sequence[float],
     weight: NDArray[np.float64],
     period_s: float,
+    records: Sequence[int] = (0,),
 ) -> Iterator[_Change]:
-    """The changes between stretches (start, end, plant) under a force."""
+    """The changes between stretches (start, end, plant) under a force; with each of the records it begins at rest."""
     state = AT_REST
     before: Plant | None = None
     for start, end, plant in stretches:
-        steps = _steps(before or plant, plant, ramps_n[start], end - start, period_s)
+        if start in records:
+            state = AT_REST
+        steps = _steps(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
         if before is not None:
             yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
         if end < len(force_n):

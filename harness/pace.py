@@ -23,6 +23,10 @@ class Pace:
         self.overruns = 0
         """Messages that found the window full when they were due, or went out later than a window of samples lasts."""
 
+    def restart(self) -> None:
+        """The next sample is the first of a record."""
+        self._start_s = None
+
     def due_s(self, samples: int) -> float:
         """When so many samples exist, on the clock."""
         if self._start_s is None:

@@ -7,6 +7,7 @@ ever executed (``allow_pickle=False``); a verdict can be computed from it alone,
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import zipfile
 from collections.abc import Mapping
@@ -133,6 +134,8 @@ class Conditions:
     """By how much the machine's time was stretched to be that of the clock on the wall; 0: lock-step, in no time."""
     link_counters: Mapping[str, int] = field(default_factory=dict)
     """What was on the line since it was opened that was no message of the device: damaged frames, those of others..."""
+    records: tuple[int, ...] = (0,)
+    """First samples of the gap-free records, each of which the device began afresh and from rest."""
     line_s: float = 0.0
     """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
     line: Mapping[str, int] = field(default_factory=dict)
@@ -194,10 +197,24 @@ class Run:
 
     @property
     def segments(self) -> tuple[tuple[int, int, Plant], ...]:
-        """The stretches (start, end, plant) of the samples start <= k < end that were played, in order."""
-        played = [s for s in self.conditions.segments if s.start < self.samples]
-        ends = [*(s.start for s in played[1:]), self.samples]
-        return tuple((s.start, end, s.plant) for s, end in zip(played, ends[: len(played)], strict=True))
+        """The stretches (start, end, plant) of the samples start <= k < end that were played, in order.
+
+        Each begins with a change of the plant or with a record.
+        """
+        plants = {segment.start: segment.plant for segment in self.conditions.segments if segment.start < self.samples}
+        if not plants:
+            return ()
+        starts = sorted({*plants, *(start for start, _ in self.records)})
+        out: list[tuple[int, int, Plant]] = []
+        for start, end in itertools.pairwise([*starts, self.samples]):
+            out.append((start, end, plants[start] if start in plants else out[-1][2]))
+        return tuple(out)
+
+    @property
+    def records(self) -> tuple[tuple[int, int], ...]:
+        """The gap-free records (start, end) of the samples start <= k < end that were played, in order."""
+        starts = [start for start in self.conditions.records if start < self.samples]
+        return tuple(itertools.pairwise([*starts, self.samples]))
 
     def theta_hash(self) -> str:
         """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
@@ -247,7 +264,7 @@ class Run:
             )
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
             and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
-            "channels": set(conditions.channels) == set(CHANNELS)
+            "channels": {"force", "displacement"} <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
             "sample times": all(0.0 < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale)),
             "number of samples": n <= conditions.samples_asked,
@@ -256,6 +273,7 @@ class Run:
                 for channel in conditions.channels.values()
             ),
             "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
+            "records": conditions.records[:1] == (0,) and list(conditions.records) == sorted(set(conditions.records)),
             "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
             "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())

@@ -103,20 +103,21 @@ class Trials:
         )
 
     def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        hindsight = performance.hindsight()
         return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
             sample_period_s=performance.sample_period_s,
             time_scale=performance.time_scale,
             channels=performance.channels,
-            segments=performance.segments,
+            segments=hindsight.segments,
             scenario=scenario.as_table(),
             rig=self._rig.description(),
             dut=self._device.as_table(),
             link="none",
             counters=self._estimator.counters,
             faults=scenario.caveats,
-            overloads=performance.lamps(),
+            overloads=hindsight.lamps,
         )
 
 

@@ -239,6 +239,8 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
         run.segments, run.segments[1:], information.changes(run), isolation_bounds, strict=False
     ):
+        if start in run.conditions.records:
+            continue  # the device began afresh, and has seen no other plant before
         # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
         mine = [index for index in alarms if start < index <= end]
         detection = mine[0] if mine else None

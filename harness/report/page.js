@@ -339,7 +339,8 @@
     place.replaceChildren();
     plots = [
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
-      pair(signals, ink, "Velocity and net force", "velocity", "net_force"),
+      ...(signals.velocity && signals.net_force
+        ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
       estimate(signals, ink, "M", "Mass: estimate and truth", "kg"),
       estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
       estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),

@@ -62,7 +62,7 @@ def _truth(run: Run) -> Iterator[tuple[int, int, Plant]]:
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
     before: Plant | None = None
     for start, end, plant in run.segments:
-        there = min(start + ramps_n[start], end) if before is not None else start
+        there = min(start + ramps_n.get(start, 0), end) if before is not None else start
         for k in range(start, there):
             yield k, k + 1, (before or plant).on_the_way(plant, (k - start) / ramps_n[start])
         if there < end:
@@ -93,9 +93,10 @@ def direction(tweak: TweakVerdict) -> str:
 
 def _columns(run: Run) -> Sequence[Column]:
     estimates = trajectory(run).astype(np.float32)
+    measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
     return [
-        *(_channel(run, name) for name in CHANNELS),
-        Column("clipped", np.packbits(run.clipped, axis=1, bitorder="little")[:, 0]),
+        *(_channel(run, CHANNELS[i]) for i in measured),
+        Column("clipped", np.packbits(run.clipped[:, measured], axis=1, bitorder="little")[:, 0]),
         Column("missing", run.missing.astype(np.uint8)),
         *(Column(name, estimates[:, i]) for i, name in enumerate(PARAMETERS)),
         Column("statistic", run.statistic),

@@ -31,7 +31,7 @@ from emulator import (
 from emulator.opamp import preset
 from harness.errors import AnalogrigError, ConfigurationError, RigError
 from harness.plant import Plant
-from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Performance
+from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
 from harness.run import CHANNELS, Channel
 from harness.scenario import Scenario
 
@@ -69,6 +69,20 @@ class ComputerDescription:
             )
         graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
         return dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
+
+    def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+        """The machine that the seed gives, wired as a program, its pots as that has them.
+
+        :raises EmulatorError: it cannot be.
+        """
+        return SuspensionComputer(
+            program,
+            opamp=preset(self.op_amp),
+            rng=Stream.COMPONENTS.generator(seed),
+            offset_v=self.offset_v,
+            components=self.fitted(seed),
+            sample_rate_hz=sample_rate_hz,
+        )
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
@@ -134,7 +148,7 @@ class EmulatorDescription:
     name: str = ""
 
 
-class _Stream(enum.IntEnum):
+class Stream(enum.IntEnum):
     """Independent streams of random numbers that one seed gives: to draw more of one changes none of the others."""
 
     EXCITATION = 0
@@ -164,7 +178,7 @@ class EmulatorRig:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
         self._card = description.card.card()
-        self._amplifier = preset(description.computer.op_amp)
+        preset(description.computer.op_amp)  # refused here, and not when it is first played
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
@@ -182,11 +196,11 @@ class EmulatorRig:
         """
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
-            excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
+            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = _settings(computer, tweak.given())
+                settings = settings_of(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
@@ -196,7 +210,7 @@ class EmulatorRig:
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
-            jitter = _Stream.APERTURE.generator(seed)
+            jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
             )
@@ -204,30 +218,20 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            segments=scenario.segments(),
-            blocks=_sampled(volts, Sampler(self._card, _Stream.CARD.generator(seed))),
-            lamps=lambda: _lit(computer, probes_per_sample(self._card)),
+            blocks=_sampled(volts, Sampler(self._card, Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight(scenario.segments(), _lit(computer, probes_per_sample(self._card))),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
-        drawn = self._description.computer
-        computer = SuspensionComputer(
-            scenario.plant.set,
-            opamp=self._amplifier,
-            rng=_Stream.COMPONENTS.generator(seed),
-            offset_v=drawn.offset_v,
-            components=drawn.fitted(seed),
-            sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
-        )
-        computer.set(**_settings(computer, scenario.plant.given()))
+        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
+        computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
+        computer.set(**settings_of(computer, scenario.plant.given()))
         return computer
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
         drawn = self._description.computer
         grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
-        return NoisySuspension(
-            computer, _Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c
-        )
+        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c)
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {
@@ -272,7 +276,7 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
-def _settings(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
     """The scenario's names of the parameters as the program has them."""
     names = {
         field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from harness.errors import ConfigurationError, RecordingError
-from harness.rigs.rig import BLOCK_SAMPLES, Block, Performance
+from harness.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
 from harness.run import CHANNELS, Run
 from harness.scenario import Scenario
 
@@ -56,17 +57,25 @@ class RecordingRig:
             conditions.sample_period_s,
             conditions.time_scale,
             conditions.channels,
-            conditions.segments,
             self._blocks(),
-            lamps=lambda: conditions.overloads,
+            hindsight=lambda: Hindsight(conditions.segments, conditions.overloads),
         )
 
     def _blocks(self) -> Iterator[Block]:
-        channels = [self.run.conditions.channels[name] for name in CHANNELS]
-        for first in range(0, self.run.samples, BLOCK_SAMPLES):
-            codes = self.run.codes[first : first + BLOCK_SAMPLES]
-            volts = np.stack([channel.volts(codes[:, i]) for i, channel in enumerate(channels)], axis=1)
-            yield Block(first, volts, codes, self.run.clipped[first : first + BLOCK_SAMPLES])
+        for record, (start, end) in enumerate(self.run.records):
+            for first in range(start, end, BLOCK_SAMPLES):
+                samples = slice(first, min(first + BLOCK_SAMPLES, end))
+                codes = self.run.codes[samples]
+                yield Block(first, self._volts(codes), codes, self.run.clipped[samples], record)
+
+    def _volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """(n, 4), of codes of that shape."""
+        channels = self.run.conditions.channels
+        unmeasured = np.full(len(codes), np.nan)
+        volts = [
+            channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(CHANNELS)
+        ]
+        return np.stack(volts, axis=1)
 
     def __enter__(self) -> Self:
         return self

@@ -7,7 +7,7 @@ classes with these methods; nothing behind this module asks which one it has.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -30,11 +30,25 @@ class Block:
     first: int
     """Index of the first sample."""
     volts: NDArray[np.float64]
-    """(n, 4): at the computer's outputs."""
+    """(n, 4): at the computer's outputs; NaN in channels that are not measured, whose codes are 0."""
     codes: NDArray[np.uint16]
     """(n, 4)"""
     clipped: NDArray[np.bool_]
     """(n, 4): the code is the end of the range, not a measurement."""
+    record: int = 0
+    """Number of the gap-free record that it is of: between two of them there was time in which nobody looked."""
+
+
+@dataclass(frozen=True)
+class Hindsight:
+    """What is known of a performance when its blocks have been taken."""
+
+    segments: tuple[Segment, ...]
+    """The truth; empty if the rig does not know it."""
+    lamps: Mapping[str, int] = field(default_factory=dict)
+    """Of each amplifier whose overload lamp is lit, the first sample that was taken with it lit."""
+    caveats: tuple[str, ...] = ()
+    """Why what was played cannot be judged; none if it can."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +58,10 @@ class Performance:
     sample_period_s: float
     time_scale: float
     channels: Mapping[str, Channel]
-    segments: tuple[Segment, ...]
-    """The truth; empty if the rig does not know it."""
+    """Those that are measured: force and displacement at least."""
     blocks: Iterator[Block]
-    lamps: Callable[[], Mapping[str, int]] = dict
-    """Asked when the blocks have been taken: of each amplifier whose overload lamp is lit, the first sample that was
-    taken with it lit. None for a rig that has no lamps."""
+    hindsight: Callable[[], Hindsight]
+    """Asked when the blocks have been taken, or no more of them come."""
 
 
 class Rig(Protocol):

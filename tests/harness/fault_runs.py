@@ -39,7 +39,7 @@ from harness.links.faulty_wire import FaultyWire
 from harness.links.link import FramedLink, Link
 from harness.links.wire import MemoryWire, Wire
 from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
-from harness.rigs.rig import Block, Performance
+from harness.rigs.rig import Block, Hindsight, Performance
 from harness.run import CHANNELS, Channel, Run
 from harness.scenario import Scenario
 from harness.verdict import judge
@@ -106,7 +106,7 @@ class SignalsRig:
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:  # noqa: ARG002
         channels = {name: Channel(0.0, 1.0, "code", 1.0, 1.0) for name in CHANNELS}
-        return Performance(5e-5, 200.0, channels, (), self._blocks(scenario.samples))
+        return Performance(5e-5, 200.0, channels, self._blocks(scenario.samples), lambda: Hindsight(()))
 
     def _blocks(self, n: int) -> Iterator[Block]:
         for first in range(0, n, RIG_BLOCK):

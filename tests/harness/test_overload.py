@@ -75,9 +75,9 @@ def test_lamp_counts_the_samples_of_the_card_when_the_machine_runs_faster(scenar
     (tmp_path / "skewed.toml").write_text(rig_file)
     with open_rig(str(tmp_path / "skewed.toml")) as rig:
         performance = rig.perform(Scenario.load(str(scenario_file)), 1)
-        assert not performance.lamps()
+        assert not performance.hindsight().lamps
         list(performance.blocks)
-        assert performance.lamps() == {"U1": 51}
+        assert performance.hindsight().lamps == {"U1": 51}
 
 
 def test_healthy_run_says_nothing_of_lamps(recorded_thesis: Path) -> None:

@@ -72,7 +72,7 @@ def test_undershoot_clips_on_the_unipolar_range_and_not_on_the_wide_one() -> Non
 
 def test_segments_tell_the_truth_after_each_tweak() -> None:
     with open_rig("emulator") as rig:
-        segments = rig.perform(Scenario.load("thesis"), 1).segments
+        segments = rig.perform(Scenario.load("thesis"), 1).hindsight().segments
     assert [segment.start for segment in segments] == [0, 1200, 1400, 1500, 1600]
     assert list(segments[-1].plant.parameters().values()) == [30.0, 2123.0, 20000.0]
 

@@ -1,0 +1,116 @@
+"""Records that are not gap-free one after the other: the device begins each afresh, and the verdict knows it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, Self
+
+import numpy as np
+import pytest
+
+from harness.bench import Bench
+from harness.dut import open_dut
+from harness.rigs.description import open_rig
+from harness.rigs.recording import RecordingRig
+from harness.rigs.rig import Block, Hindsight, Performance, Rig
+from harness.run import Run, Segment
+from harness.scenario import Scenario, Tweak
+from harness.verdict import judge
+
+RECORD_N = 700
+
+
+class Recorder:
+    """Plays a scenario of the emulated computer once for each record, from rest every time."""
+
+    capabilities = frozenset({"tweak"})
+
+    def __init__(self, rig: Rig, records: int) -> None:
+        self._rig = rig
+        self._records = records
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        whole = self._rig.perform(dataclasses.replace(scenario, samples=RECORD_N), seed)
+        segments = tuple(
+            Segment(record * RECORD_N + segment.start, segment.plant)
+            for record in range(self._records)
+            for segment in whole.hindsight().segments
+        )
+        return dataclasses.replace(whole, blocks=self._blocks(scenario), hindsight=lambda: Hindsight(segments))
+
+    def _blocks(self, scenario: Scenario) -> Iterator[Block]:
+        for record in range(self._records):
+            once = self._rig.perform(dataclasses.replace(scenario, samples=RECORD_N), record)
+            for block in once.blocks:
+                yield dataclasses.replace(block, first=record * RECORD_N + block.first, record=record)
+
+    def description(self) -> Mapping[str, Any]:
+        return self._rig.description()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+SCENARIO = dataclasses.replace(
+    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(Tweak(sample=400, stiffness_n_per_m=16000.0),)
+)
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        return Bench(Recorder(rig, 2), dut).play(SCENARIO, 0)
+
+
+def single(seed: int) -> Run:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        return Bench(rig, dut).play(dataclasses.replace(SCENARIO, samples=RECORD_N), seed)
+
+
+def test_device_begins_each_record_afresh(run: Run) -> None:
+    first, second = single(0), single(1)
+    assert run.conditions.records == (0, RECORD_N)
+    np.testing.assert_array_equal(run.theta, np.concatenate((first.theta, second.theta)))
+    assert run.alarm_index.tolist() == [*first.alarm_index, *(RECORD_N + second.alarm_index)]
+    assert run.diagnosis_onset.tolist() == [*first.diagnosis_onset, *(RECORD_N + second.diagnosis_onset)]
+    for name, count in run.conditions.counters.items():
+        assert count == first.conditions.counters[name] + second.conditions.counters[name]
+
+
+def test_each_record_is_judged_as_a_run_of_its_own(run: Run) -> None:
+    whole, parts = judge(run), [judge(single(seed)) for seed in (0, 1)]
+    assert whole.outcome == "passed"
+    assert [tweak.sample for tweak in whole.tweaks] == [400, RECORD_N + 400]
+    for tweak, part in zip(whole.tweaks, parts, strict=True):
+        assert (tweak.latency_n, tweak.bound_n) == (part.tweaks[0].latency_n, part.tweaks[0].bound_n)
+    assert [(each.start, each.end) for each in whole.estimates] == [(0, 400), (400, 700), (700, 1100), (1100, 1400)]
+
+
+def test_alarm_of_the_next_record_detects_no_change_of_the_one_before(run: Run) -> None:
+    late = dataclasses.replace(run, alarm_index=np.array([RECORD_N + 5, RECORD_N + 405]))
+    verdict = judge(dataclasses.replace(late, alarm_kind=run.alarm_kind[:2], alarm_statistic=run.alarm_statistic[:2]))
+    assert verdict.tweaks[0].missed
+    assert verdict.false_alarms == (RECORD_N + 5,)
+
+
+def test_records_survive_the_file_and_are_played_again(run: Run, tmp_path: Any) -> None:
+    run.save(tmp_path / "run.npz")
+    with RecordingRig.open(tmp_path / "run.npz") as rig, open_dut("inproc") as dut:
+        again = Bench(rig, dut).play(rig.scenario(), 0)
+    assert again.conditions.records == (0, RECORD_N)
+    assert again.theta_hash() == run.theta_hash()
+
+
+def test_velocity_and_net_force_need_not_be_measured(run: Run, tmp_path: Any) -> None:
+    channels = {name: run.conditions.channels[name] for name in ("force", "displacement")}
+    poor = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, channels=channels))
+    poor.save(tmp_path / "run.npz")
+    with RecordingRig.open(tmp_path / "run.npz") as rig:
+        volts = np.concatenate([block.volts for block in rig.perform(rig.scenario(), 0).blocks])
+    assert np.isnan(volts[:, 2:]).all()
+    assert np.isfinite(volts[:, :2]).all()
+    assert judge(Run.load(tmp_path / "run.npz")).outcome == "passed"
