@@ -13,7 +13,7 @@ from harness.instrument.description import InstrumentDescription, left_out
 from harness.instrument.red_pitaya import RedPitaya
 from harness.rigs.emulator import EmulatorDescription, Stream, emulator_errors
 
-Table = dict[str, Any]
+Keys = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ServedDescription(EmulatorDescription):
         :raises ConfigurationError: there is none, or something in it is wrong.
         """
         path = config.locate("rigs", name)
-        table: Table = {"name": path.stem, **config.read_toml(path)}
+        table: Keys = {"name": path.stem, **config.read_toml(path)}
         for defect in defects:
             table = _merged(table, {"instrument": _parsed(defect)})
         return config.build(cls, table, str(path))
@@ -55,7 +55,7 @@ class ServedDescription(EmulatorDescription):
         return (*of_card, "computer.noise") if self.computer.noise else of_card
 
 
-def _parsed(defect: str) -> Table:
+def _parsed(defect: str) -> Keys:
     try:
         return tomllib.loads(defect)
     except (ValueError, RecursionError) as error:
@@ -64,7 +64,7 @@ def _parsed(defect: str) -> Table:
         ) from error
 
 
-def _merged(table: Table, more: Table) -> Table:
+def _merged(table: Keys, more: Keys) -> Keys:
     """Table with the keys of another, tables in it likewise."""
     out = dict(table)
     for key, value in more.items():
