@@ -47,6 +47,7 @@ from harness.instrument.generator import MOST_VOLTS, SHAPES, Generator
 from harness.instrument.inputs import RANGES_V, Codes, lsb_v
 from harness.instrument.scpi import Broken, Call, Command, Response, ScpiError
 from harness.instrument.table import Table, Turn
+from harness.links.wire import Clock
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
@@ -61,14 +62,17 @@ class RedPitaya:
         computer: Callable[[float], SuspensionComputer],
         rng: np.random.Generator,
         description: InstrumentDescription | None = None,
+        clock: Clock | None = None,
     ) -> None:
         """``computer`` makes the machine for a rate of looks in Hz; ``rng`` gives the noise of the inputs.
+
+        With a ``clock`` a record takes the time that it lasts, and a pot turns where in the record it was turned.
 
         :raises EmulatorError: the computer cannot be made.
         """
         described = description or InstrumentDescription()
         self._table = Table(computer, described.wiring)
-        self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition)
+        self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition, clock)
         self._generator = Generator()
         self._pots = tuple(self._table.dials)
         self._scheduled: list[Turn] = []
@@ -238,7 +242,7 @@ class RedPitaya:
     def _of_pots(self) -> dict[str, tuple[int, Command]]:
         return {
             "POT:CATalog?": (0, lambda _: ",".join(self._pots)),
-            "POT#:DIAL": (1, lambda call: self._table.turn(self._pot(call.numbers[0]), call.number(0, 0.0, 1.0))),
+            "POT#:DIAL": (1, self._turn),
             "POT#:DIAL?": (0, lambda call: _number(self._table.dials[self._pot(call.numbers[0])])),
             "POT:SCHedule": (3, self._schedule),
             "POT:SCHedule:CLEar": (0, lambda _: self._scheduled.clear()),
@@ -249,6 +253,13 @@ class RedPitaya:
         if not 1 <= number <= len(self._pots):
             raise ScpiError(-114, f"there are pots 1 to {len(self._pots)}")
         return self._pots[number - 1]
+
+    def _turn(self, call: Call) -> None:
+        """At this instant: what has been recorded by now was taken before."""
+        pot, dial = self._pot(call.numbers[0]), call.number(0, 0.0, 1.0)
+        if self._acquisition.triggered:
+            self._acquisition.wait()
+        self._table.turn(pot, dial)
 
     def _schedule(self, call: Call) -> None:
         if len(self._scheduled) == MOST_SCHEDULED:

@@ -11,6 +11,7 @@ from harness import config
 from harness.errors import ConfigurationError
 from harness.instrument.description import InstrumentDescription, left_out
 from harness.instrument.red_pitaya import RedPitaya
+from harness.links.wire import Clock
 from harness.rigs.emulator import EmulatorDescription, Stream, emulator_errors
 
 Keys = dict[str, Any]
@@ -34,8 +35,10 @@ class ServedDescription(EmulatorDescription):
             table = _merged(table, {"instrument": _parsed(defect)})
         return config.build(cls, table, str(path))
 
-    def laid(self, program: str, seed: int) -> RedPitaya:
+    def laid(self, program: str, seed: int, clock: Clock | None = None) -> RedPitaya:
         """The instrument, and on its table the very computer that an EmulatorRig plays on with that seed.
+
+        With a ``clock`` its records take the time that they last.
 
         :raises ConfigurationError: the computer or the instrument cannot be.
         """
@@ -45,7 +48,10 @@ class ServedDescription(EmulatorDescription):
             except ValueError as error:
                 raise ConfigurationError(f"{self.name}: card and instrument together: {error}") from error
             return RedPitaya(
-                lambda rate_hz: self.computer.wired(program, seed, rate_hz), Stream.CARD.generator(seed), described
+                lambda rate_hz: self.computer.wired(program, seed, rate_hz),
+                Stream.CARD.generator(seed),
+                described,
+                clock,
             )
 
     @property

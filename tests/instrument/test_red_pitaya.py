@@ -14,8 +14,8 @@ from emulator.suspension import SuspensionComputer
 from harness.instrument.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
 from harness.instrument.description import InstrumentDescription
 from harness.instrument.inputs import InputFaults
-from harness.instrument.red_pitaya import MOST_SCHEDULED
-from harness.instrument.scpi import DropOut
+from harness.instrument.red_pitaya import MOST_SCHEDULED, RedPitaya
+from harness.instrument.scpi import DropOut, Interpreter
 from harness.instrument.table import Booster, Stage, Wiring
 from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
@@ -404,3 +404,33 @@ def test_an_instrument_drops_out_once_with_half_of_the_first_answer(drop_out: st
         next(parts)
     assert raised.value.hangs_up is (drop_out == "hang up")
     assert np.array_equal(record(ask), whole)
+
+
+# ---- in real time
+
+
+class Hands:
+    """A clock that goes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_record_in_real_time_is_full_when_its_time_is_over_and_a_pot_turns_where_it_was_turned() -> None:
+    hands = Hands()
+    instrument = RedPitaya(front, np.random.default_rng(0), clock=hands)
+    ask = asking(Interpreter(instrument.commands))
+    say(ask, POINT_SAMPLES)
+    assert ask("ACQ:TRig:STAT?") == "TD"
+    assert ask("ACQ:TRig:FILL?") == "0"
+    hands.now_s = 2000.5 / RATE_HZ
+    say(ask, ["POT3:DIAL 0.6"])
+    hands.now_s = (BUFFER_N - 1.5) / RATE_HZ
+    assert ask("ACQ:TRig:FILL?") == "0"
+    hands.now_s = (BUFFER_N + 0.5) / RATE_HZ
+    assert ask("ACQ:TRig:FILL?") == "1"
+    looks = played(tweaks=((8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
+    assert np.abs(record(ask) - looks[::8]).max() < ROUNDED_V
