@@ -68,6 +68,8 @@ class Settings:
     """The range of each input."""
     units: str = "VOLTS"
     form: str = "ASCII"
+    order: str = "BEND"
+    """Of the bytes of a number in a block: the highest first, or LEND."""
 
     @property
     def before_n(self) -> int:

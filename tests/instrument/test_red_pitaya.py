@@ -82,7 +82,9 @@ def test_ascii_and_binary_raw_and_volts_are_the_same_record() -> None:
         assert answer[:7] == b"#532768" and len(answer) == 7 + 32768 + 2
         codes = np.frombuffer(answer[7:-2], ">i2")
         assert np.array_equal(np.float32(codes * LSB_V), floats)
-        say(asking(speaking), ["ACQ:DATA:FORMAT ASCII"])
+        say(asking(speaking), ["ACQ:DATA:BYTE:ORDER LEND"])
+        assert np.array_equal(np.frombuffer(binary("RAW", channel)[7:-2], "<i2"), codes)
+        say(asking(speaking), ["ACQ:DATA:BYTE:ORDER BEND", "ACQ:DATA:FORMAT ASCII"])
         assert np.array_equal(numbers(asking(speaking)(f"ACQ:SOUR{channel}:DATA?")), codes)
 
 
@@ -90,6 +92,8 @@ def test_part_of_a_record_can_be_asked_for(ask: Ask) -> None:
     say(ask, SEQUENCE)
     whole = record(ask)
     assert np.array_equal(numbers(ask("ACQ:SOUR2:DATA:STA:N? 16000,384")), whole[16000:, 1])
+    assert np.array_equal(numbers(ask("ACQ:SOUR2:DATA:LATest:N? 100")), whole[-100:, 1])
+    assert np.array_equal(numbers(ask("ACQ:SOUR1:DATA:Old:N? 100")), whole[:100, 0])
     assert ask("ACQ:SOUR2:DATA:STArt:N? 16000,385") == "" and error(ask) == -222
 
 
@@ -223,6 +227,11 @@ def test_an_output_that_is_off_drives_nothing(ask: Ask) -> None:
 def test_settings_of_a_generator_that_runs_take_effect(ask: Ask) -> None:
     say(ask, [*SEQUENCE, "SOUR1:VOLT 0.25", "ACQ:START", "ACQ:TRig NOW"])
     assert sorted(set(np.round(record(ask)[100:, 0], 1))) == [2.5, 7.5]
+
+
+def test_volts_and_hertz_may_have_a_suffix(ask: Ask) -> None:
+    say(ask, ["SOUR1:VOLT 250 mV", "SOUR1:FREQ:FIX 0.2 kHz", "ACQ:TRig:LEV 125 mV"])
+    assert (ask("SOUR1:VOLT?"), ask("SOUR1:FREQ?"), ask("ACQ:TRig:LEV?")) == ("0.25", "200", "0.125")
 
 
 @pytest.mark.parametrize("line", ["SOUR1:VOLT 0.6", "SOUR1:VOLT:OFFS -0.6"])
