@@ -1,7 +1,6 @@
 """All benchmarks, or those named: prints one table and writes build/bench.json.
 
-python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [calibration]
-python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials] [self-test]
+python -m tests.benchmarks [NAME ...]
 
 bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
 """
@@ -20,6 +19,7 @@ from . import (
     bench_engine,
     bench_isolation,
     bench_link,
+    bench_onset,
     bench_self_test,
     bench_statistics,
     bench_trials,
@@ -37,6 +37,7 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "trials": bench_trials.figures,
     "calibration": bench_calibration.figures,
     "self-test": bench_self_test.figures,
+    "onset": bench_onset.figures,
 }
 
 
