@@ -227,8 +227,17 @@ def test_an_inverted_signal_on_a_range_of_one_sign_is_off_scale() -> None:
     assert wrong(rig) == ["clipping of displacement"]
 
 
-def test_swapped_leads_of_an_overdamped_machine_are_found() -> None:
-    assert wrong(Altered(emulated(), swapped), "shock") == ["identity"]
+def test_swapped_leads_are_told_from_one_signal_on_both() -> None:
+    def both(codes: Codes) -> Codes:
+        return codes[:, [0, 0, 2, 3]]
+
+    found = {}
+    for alter in (swapped, both):
+        (check,) = self_test(Altered(emulated(), alter), 1, "shock").having("wrong")
+        assert check.title == "identity"
+        found[alter] = check.advice
+    assert "swapped" in found[swapped]
+    assert "wrong jack" in found[both]
 
 
 def test_several_faults_are_all_found() -> None:
