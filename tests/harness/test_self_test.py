@@ -500,6 +500,16 @@ def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().err.startswith("analogrig: INCONCLUSIVE: the self-test could not be made: no signal on")
 
 
+def test_doctor_that_cannot_tell_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At 100 kHz a tenth of a sample is 1 us, and the computer's own amplifiers are known to half of one."""
+    path = tmp_path / "fast.toml"
+    path.write_text(RIG_FILE.format(faults="").replace("noise_lsb", "rate_hz = 100000.0\nnoise_lsb", 1))
+    assert main(["doctor", "--rig", str(path)]) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("self-test of fast, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.017" in said
+
+
 def test_doctor_of_no_rig_is_a_matter_of_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--rig", "nowhere"]) == 2
     assert "no rig is called" in capsys.readouterr().err
