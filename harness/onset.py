@@ -60,6 +60,8 @@ _LONGEST_MOVE = 0.3
 _LEAST_FIT_N = 30
 """Fewer samples tell nothing of a plant."""
 
+_RISING = 0.5
+"""Twice the logarithm of the likelihood ratio of two neighbours, above which they are no part of a still stretch."""
 _LEAST_DOUBT = 2.0
 """With it the intervals hold the instants of machines of real components as often as they say."""
 _SETTLING_N = 20
@@ -318,9 +320,10 @@ class Problem:
         return ""
 
     def beyond(self, cost: Array) -> str:
-        """Why the likeliest of the instants that have these costs is none: it is at an end of the range."""
-        likelihood = np.exp(-0.5 * (cost - cost.min()))
-        if len(likelihood) > 1 and max(likelihood[0], likelihood[-1]) > 0.5 * likelihood.sum():
+        """Why the likeliest of the instants that have these costs is none: towards an end of the range they fall."""
+        best = int(cost.argmin())
+        inwards = {0: 1, len(cost) - 1: len(cost) - 2}.get(best)
+        if inwards is not None and len(cost) > 1 and cost[inwards] - cost[best] > _RISING:
             return f"the plant seems to have changed before or after the samples {self._searched}"
         return ""
 
