@@ -28,9 +28,10 @@ from .opamp import IDEAL, OpAmpModel
 from .pot import PotModel
 from .program import CHANNELS, ForceLaw, Mass, Parameter, Program, Quantity, Scales
 from .quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts, SuspensionProgram
+from .repeated import Repeat, RepeatedPlay, is_repeatable
 from .sampler import CARDS, Card, Sampler, drawn_levels
 from .spice import to_spice
-from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak
+from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, drawn_offsets_v
 from .two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
@@ -85,6 +86,8 @@ __all__ = [
     "Program",
     "Quantity",
     "RampedTweak",
+    "Repeat",
+    "RepeatedPlay",
     "Resistor",
     "Sampler",
     "SamplerError",
@@ -100,6 +103,8 @@ __all__ = [
     "VoltageSource",
     "acquired",
     "drawn_levels",
+    "drawn_offsets_v",
+    "is_repeatable",
     "piecewise_linear",
     "probes_per_sample",
     "read_deck",

@@ -1205,10 +1205,22 @@ engine *engine_new(int states, int inputs, int kinks, int outputs, double sample
     self->columns = states + inputs + 1;
     self->tick_s = sample_period_s / (double)ENGINE_TICKS_PER_SAMPLE;
     self->events_per_sample = events_per_sample;
+    engine_restart(self);
+    return self;
+}
+
+void engine_restart(engine *self)
+{
+    self->has_system = false;
+    self->now = 0;
+    self->elapsed = 0;
+    self->counts = (struct engine_counts){0};
+    self->quiet = false;
     self->here = &self->points[0];
     self->there = &self->points[1];
     self->middle = &self->points[2];
     self->before = &self->points[3];
+    memset(self->points, 0, sizeof self->points);
     for (int i = 0; i < 4; i++) {
         self->points[i].z[self->columns - 1] = 1.0;
     }
@@ -1216,7 +1228,6 @@ engine *engine_new(int states, int inputs, int kinks, int outputs, double sample
         self->outside[k] = NEVER;
     }
     engine_watch(self, ENGINE_TICKS_PER_SAMPLE);
-    return self;
 }
 
 void engine_free(engine *self)
@@ -1495,6 +1506,26 @@ enum engine_status engine_run(
         status = ENGINE_EDGE;
     }
     return status == ENGINE_OK && !is_finite(self) ? ENGINE_NOT_FINITE : status;
+}
+
+enum engine_status engine_play(
+    engine *self, int64_t turns, const struct engine_system *circuit, const int64_t *until, int64_t edges,
+    const int64_t *tick, const int32_t *input, const double *level, double *y)
+{
+    enum engine_status status = ENGINE_OK;
+    int64_t taken = 0;
+    for (int64_t turn = 0; status == ENGINE_OK && turn < turns; turn++) {
+        const int64_t first = taken, recorded = self->counts.samples;
+        while (taken < edges && tick[taken] <= until[turn]) {
+            taken++;
+        }
+        status = engine_set_system(self, &circuit[turn]);
+        if (status == ENGINE_OK && recorded * ENGINE_TICKS_PER_SAMPLE <= until[turn]) {
+            status = engine_run(self, until[turn], taken - first, &tick[first], &input[first], &level[first], y);
+            y += (self->counts.samples - recorded) * self->outputs;
+        }
+    }
+    return status == ENGINE_OK && taken < edges ? ENGINE_EDGE : status;
 }
 
 void engine_watch(engine *self, int64_t patience)

@@ -75,6 +75,9 @@ engine *engine_new(int states, int inputs, int kinks, int outputs, double sample
 /* Frees the engine; NULL is allowed. */
 void engine_free(engine *self);
 
+/* As new, without a circuit; the memory of its ladders is kept. */
+void engine_restart(engine *self);
+
 /* Sets or replaces the circuit. x and u stay as they are; a circuit equal to the one before, bit for bit, changes
  * nothing at all. Cost: a copy, then a ladder for each mode that occurs (about 30 n^2 (n + m + 1) multiplications), and,
  * for each combination of pieces of the kinks that feed a w, a determinant; of more than 4096 combinations only those
@@ -93,6 +96,12 @@ enum engine_status engine_set_state(engine *self, const double *x);
 enum engine_status engine_run(
     engine *self, int64_t until, int64_t edges, const int64_t *tick, const int32_t *input, const double *level,
     double *y);
+
+/* engine_set_system and engine_run by turns: circuit[i] to tick until[i], which must not decrease. A circuit whose tick
+ * has been reached is set, and not run. All edges of all turns, as of engine_run. */
+enum engine_status engine_play(
+    engine *self, int64_t turns, const struct engine_system *circuit, const int64_t *until, int64_t edges,
+    const int64_t *tick, const int32_t *input, const double *level, double *y);
 
 /* Watches, from here on, for kinks that stay outside their middle piece for `patience` ticks without a break (one
  * sample period when never called). Costs nothing where no mode changes. */

@@ -18,7 +18,7 @@ from .errors import EngineError
 from .excitation import TICKS_PER_SAMPLE, Edges
 from .nodal import Kink, PiecewiseLinear
 
-__all__ = ["Engine", "EngineCounts"]
+__all__ = ["Engine", "EngineCounts", "Turns"]
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
 """Ticks, inputs and levels of all edges, in order of time."""
@@ -119,13 +119,9 @@ class Engine:
             raise EngineError(
                 f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
             )
-        rows = system.rows(self._outputs)
-        arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
-        # One block of memory, with the arrays in the order of the structure's fields.
-        parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
-        block = np.concatenate(parts)
-        starts = itertools.accumulate((part.nbytes for part in parts[:-1]), initial=block.ctypes.data)
-        self._check(self._library.engine_set_system(self._handle, ctypes.byref(library.System(*starts))))
+        block, starts = _laid_out(system, self._outputs)
+        circuit = library.System(*(block.ctypes.data + start for start in starts))
+        self._check(self._library.engine_set_system(self._handle, ctypes.byref(circuit)))
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
         """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
@@ -188,6 +184,23 @@ class Engine:
         self._note(samples)
         return volts
 
+    def play(self, turns: Turns, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
+        """A whole play from rest, as that of a new engine: float64 (turns.samples, outputs), V.
+
+        As set_system() and run() by turns, at a fraction of their cost; the clock and what watch() saw begin anew.
+        Raises EngineError.
+        """
+        self._library.engine_restart(self._handle)
+        self._library.engine_watch(self._handle, turns.patience_ticks)
+        self._recorded, self._now_tick = 0, -1
+        volts = self._room(turns.samples)
+        trains = self._merge(edges)
+        addresses = [array.ctypes.data for array in (*trains, volts)]
+        turned = (len(turns.circuits), turns.circuits, turns.until_ticks.ctypes.data)
+        self._check(self._library.engine_play(self._handle, *turned, trains[0].size, *addresses))
+        self._note(turns.samples)
+        return volts
+
     def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
         """Goes to an instant before the next sample's and records nothing; it takes the edges up to it.
 
@@ -239,6 +252,47 @@ class Engine:
     def _check(self, status: int) -> None:
         if status:
             raise EngineError(f"after {self.counts.samples} samples: {_REASONS.get(status, f'status {status}')}")
+
+
+class Turns:
+    """The circuits that a play goes through, laid out as the engine takes them, so that it can be played repeatedly.
+
+    systems: of the same states, inputs and kinks; last_samples: for each the last sample that it shows, in order of
+    time, that of the last one being the last of the play; patience_ticks: as of Engine.watch.
+
+    blocks: (turns, numbers); the numbers of a circuit in one row, to be changed at abc_places and cde_places: where in
+    a row the last columns of abc and of cde stand, (n,) and (q,).
+    """
+
+    def __init__(
+        self,
+        systems: Sequence[PiecewiseLinear],
+        outputs: Sequence[str],
+        last_samples: Sequence[int],
+        patience_ticks: int,
+    ) -> None:
+        laid_out = [_laid_out(system, outputs) for system in systems]
+        starts = laid_out[0][1]
+        self.blocks = np.stack([block for block, _ in laid_out])
+        self.circuits = (library.System * len(systems))(
+            *(library.System(*(row.ctypes.data + start for start in starts)) for row in self.blocks)
+        )
+        self.samples = last_samples[-1] + 1
+        self.until_ticks = np.array(last_samples, np.int64) * TICKS_PER_SAMPLE
+        self.patience_ticks = patience_ticks
+        width = systems[0].abc.shape[1]
+        self.abc_places, self.cde_places = (
+            starts[field] // self.blocks.itemsize + np.arange(1, rows + 1) * width - 1
+            for field, rows in ((0, len(systems[0].states)), (2, len(systems[0].kinks)))
+        )
+
+
+def _laid_out(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[np.float64], list[int]]:
+    """One block of memory with the arrays of struct engine_system, and where each begins in it, in bytes."""
+    rows = system.rows(outputs)
+    arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
+    parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
+    return np.concatenate(parts), list(itertools.accumulate((part.nbytes for part in parts[:-1]), initial=0))
 
 
 @functools.lru_cache(maxsize=64)

@@ -37,10 +37,12 @@ class System(ctypes.Structure):
 _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
     ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
     ("engine_free", None, (c_void_p,)),
+    ("engine_restart", None, (c_void_p,)),
     ("engine_set_system", c_int, (c_void_p, POINTER(System))),
     ("engine_get_state", None, (c_void_p, c_void_p)),
     ("engine_set_state", c_int, (c_void_p, c_void_p)),
     ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
+    ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
     ("engine_watch", None, (c_void_p, c_int64)),
     ("engine_get_overdue", None, (c_void_p, c_void_p)),
     ("engine_get_counts", None, (c_void_p, POINTER(Counts))),

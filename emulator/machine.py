@@ -30,11 +30,11 @@ from .components import NOMINAL, Components, contact_of, is_part_of
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from .excitation import TICKS_PER_SAMPLE, Edges
-from .nodal import Nodal, PiecewiseLinear
+from .nodal import Kink, Nodal, PiecewiseLinear
 from .patching import Patch, patches
 from .pot import END_FRACTION, checked_dial, checked_ramp
 
-__all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch"]
+__all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch", "lit"]
 
 REFERENCE_V = 10.0
 """The machine's reference, on which a pot's top lies while its coefficient is read."""
@@ -164,12 +164,13 @@ class AnalogComputer:
     @property
     def lamps(self) -> dict[str, int | None]:
         """For each amplifier the first sample that was taken with its overload lamp lit, None while it is dark."""
-        lit: dict[str, int | None] = {amp.name: None for amp in self._patched.of(OpAmp)}
-        for kink, tick in zip(self._system.kinks, self._engine.overdue_ticks.tolist(), strict=True):
-            if tick >= 0 and kink.element in lit:
-                sample, before = -(-tick // TICKS_PER_SAMPLE), lit[kink.element]
-                lit[kink.element] = sample if before is None else min(sample, before)
-        return lit
+        amplifiers = [amp.name for amp in self._patched.of(OpAmp)]
+        return lit(amplifiers, self._system.kinks, self._engine.overdue_ticks)
+
+    @property
+    def lamp_delay_ticks(self) -> int:
+        """lamp_delay_s in ticks."""
+        return self._lamp_delay_ticks
 
     def clear_lamps(self) -> None:
         """Puts the lamps out. One whose amplifier is still overloaded lights again after its delay."""
@@ -548,6 +549,16 @@ class AnalogComputer:
         system = nodal.at(self._dials | {pot: dial}, self._closed)
         levels_v = np.array([self._levels_v[name] for name in system.inputs])
         return system.rest(levels_v).volts[self._terminal(pot, "wiper")] / REFERENCE_V
+
+
+def lit(amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray[np.int64]) -> dict[str, int | None]:
+    """AnalogComputer.lamps, from what the engine saw of each kink."""
+    lamps: dict[str, int | None] = dict.fromkeys(amplifiers)
+    for kink, tick in zip(kinks, overdue_ticks.tolist(), strict=True):
+        if tick >= 0 and kink.element in lamps:
+            sample, before = -(-tick // TICKS_PER_SAMPLE), lamps[kink.element]
+            lamps[kink.element] = sample if before is None else min(sample, before)
+    return lamps
 
 
 @dataclass(frozen=True)

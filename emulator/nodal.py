@@ -45,7 +45,7 @@ from .errors import CircuitError
 from .opamp import CLAMP_RATE
 from .pot import checked_dial, legs_ohm
 
-__all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "piecewise_linear"]
+__all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "Trim", "piecewise_linear"]
 
 Matrix = NDArray[np.float64]
 
@@ -238,9 +238,7 @@ class Nodal:
 
         Raises PotError for a dial off its track, CircuitError for a singular circuit.
         """
-        left = self._left.copy()
-        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, closed or {}), _STAMP).ravel())
-        solution = self._solve(left, self._right)
+        solution = self._solved(dials, closed or {})
         abc, g, cde, w_phi = self._flow(solution)
         voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(
@@ -256,15 +254,30 @@ class Nodal:
             v_phi=self._spread(voltages),
         )
 
+    def trimmed(self, dials: Mapping[str, float]) -> tuple[PiecewiseLinear, Trim]:
+        """As at(), and how the offsets of the op-amps enter it.
+
+        Raises as at(), and CircuitError for an op-amp without a pole.
+        """
+        if len(self._poles) != sum(isinstance(element, OpAmp) for element in self._elements):
+            raise CircuitError("the offset of an op-amp without a pole enters every node: it cannot be trimmed")
+        laws, solution = self._laws, self._solved(dials, {})
+        apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
+        slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
+        return self.at(dials), Trim(
+            amps=tuple(amp.name for amp in self._poles),
+            apart_v=apart_v,
+            gain_rate=laws.gain[laws.poles, 0],
+            rows=tuple((pole, slew_kinks.get(pole)) for pole in laws.poles.tolist()),
+        )
+
     def disturbances(self, dials: Mapping[str, float]) -> dict[str, Matrix]:
         """What small sources add to dx/dt while nothing limits, each (n,), with the pots named in dials set so.
 
         By node: a current of 1 A into it; by op-amp: 1 V in series with its + input; for ground, 0. Raises as at().
         """
         size = len(self._unknowns)
-        left = self._left.copy()
-        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, {}), _STAMP).ravel())
-        slopes = self._laws.slopes(self._solve(left, np.eye(size + 1)))[: len(self._state)]
+        slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))[: len(self._state)]
         columns = {node: slopes[:, row] if node != GROUND else np.zeros(len(slopes)) for node, row in self._row.items()}
         amps = {amp.name: amp for amp in self._poles}
         own = np.eye(len(self._state))
@@ -320,6 +333,12 @@ class Nodal:
         left[i, j] -= siemens
         left[j, i] -= siemens
 
+    def _set(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
+        """The left-hand side with pots and switches entered."""
+        left = self._left.copy()
+        np.add.at(left.reshape(-1), self._leg_places, np.outer(self._leg_siemens(dials, closed), _STAMP).ravel())
+        return left
+
     def _leg_siemens(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> list[float]:
         """Conductances of the switches, then of both legs of every pot."""
         ohms = [switch.ohm(closed=closed.get(switch.name, switch.closed)) for switch in self._switches]
@@ -366,6 +385,9 @@ class Nodal:
 
     # ---- reading the solution
 
+    def _solved(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
+        return self._solve(self._set(dials, closed), self._right)
+
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
         """Every unknown as a function of what the columns of right stand for, and a last row for ground, of zeros."""
         size = len(self._unknowns)
@@ -400,6 +422,20 @@ class Nodal:
         spread = np.zeros((solution.shape[0], len(self._kinks)))
         spread[:, len(self._kinks) - len(self._limiters) :] = solution[:, self._columns :]
         return spread
+
+
+@dataclass(frozen=True)
+class Trim:
+    """How the offsets of op-amps enter a state space: (apart_v + offset) gain_rate is the constant of each one's drive.
+
+    apart_v: (amps,) V between their inputs at x = 0, u = 0; gain_rate: (amps,) 1/s. rows: of each the row of abc, and
+    that of cde in which the drive stands instead if the amplifier slews.
+    """
+
+    amps: tuple[str, ...]
+    apart_v: Matrix
+    gain_rate: Matrix
+    rows: tuple[tuple[int, int | None], ...]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ A channel's way to its code, each step exact where its fault is left at its defa
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -88,11 +89,20 @@ class Card:
         """How many channels there are."""
         return len(self.ranges_v)
 
-    @property
+    @functools.cached_property
     def lsb_v(self) -> NDArray[np.float64]:
-        """Volts per code of each channel, (channels,)."""
+        """Volts per code of each channel, (channels,); not to be written to."""
         low, high = np.array(self.ranges_v).T
-        return np.asarray((high - low) / (1 << self.bits))
+        lsb_v = np.asarray((high - low) / (1 << self.bits))
+        lsb_v.setflags(write=False)
+        return lsb_v
+
+    @functools.cached_property
+    def low_v(self) -> NDArray[np.float64]:
+        """The volts of code 0 of each channel, (channels,); not to be written to."""
+        low_v = np.array(self.ranges_v)[:, 0]
+        low_v.setflags(write=False)
+        return low_v
 
     @property
     def true_rate_hz(self) -> float:
@@ -105,8 +115,7 @@ class Card:
 
     def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
         """The voltages at the centres of the codes: (n, channels)."""
-        low = np.array(self.ranges_v)[:, 0]
-        return np.asarray(low + codes * self.lsb_v)
+        return np.asarray(self.low_v + codes * self.lsb_v)
 
     def levels(self) -> NDArray[np.float64] | None:
         """levels_lsb with level 0 before it and the missing codes left no width, (2^bits,); None for an ideal one."""
@@ -172,7 +181,7 @@ class Sampler:
     def __init__(self, card: Card, rng: np.random.Generator) -> None:
         self.card = card
         self._rng = rng
-        self._low_v = np.array(card.ranges_v)[:, 0]
+        self._low_v = card.low_v
         self._lsb_v = card.lsb_v
         self._noise_lsb = np.array(card.noise_lsb)
         self._gain = 1.0 + card.per_channel("gain_error")
@@ -182,16 +191,19 @@ class Sampler:
         self._held_v: NDArray[np.float64] | None = None
         self._levels = card.levels()
 
-    def sample(self, volts: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    def sample(
+        self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts (n, channels) to codes, uint16 (n, channels), and whether each was clipped, bool (n, channels).
 
         Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. Clipped says that what the
         converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
+        normals: the standard normal numbers of which the noise is made, (n, channels), instead of the rng's own.
         Raises SamplerError for a voltage that is not finite, or another shape.
         """
-        return self.converted(self.seen_lsb(volts))
+        return self.converted(self.seen_lsb(volts, normals))
 
-    def seen_lsb(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def seen_lsb(self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
 
         Raises SamplerError for a voltage that is not finite, or another shape.
@@ -204,13 +216,19 @@ class Sampler:
             raise SamplerError(
                 f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
             )
-        noise = self._rng.standard_normal(volts.shape) * self._noise_lsb + self._offset_lsb
-        held_v = self._acquired(volts) * self._gain - self._droop_v
-        return np.asarray((held_v - self._low_v) / self._lsb_v + noise)
+        noise = (self._rng.standard_normal(volts.shape) if normals is None else normals) * self._noise_lsb
+        noise += self._offset_lsb
+        seen = self._acquired(volts) * self._gain
+        seen -= self._droop_v
+        seen -= self._low_v
+        seen /= self._lsb_v
+        seen += noise
+        return seen
 
     def converted(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Codes and clipping flags, as of sample, of what the converter sees."""
-        unlimited = np.floor(seen_lsb + 0.5)
+        unlimited = seen_lsb + 0.5
+        np.floor(unlimited, out=unlimited)
         limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
         codes = limited.astype(np.uint16) if self._levels is None else _approximated(seen_lsb, self._levels)
         codes = (codes | np.uint16(self.card.stuck_high)) & ~np.uint16(self.card.stuck_low)

@@ -23,7 +23,17 @@ from .quarter_car import BUMP_STOP, FRONT, SHOCK
 from .two_mass import TWO_MASS
 from .whole import is_whole
 
-__all__ = ["CHANNELS", "PROGRAMS", "SOURCE", "PlannedTurn", "RampedTweak", "SuspensionComputer", "Tweak", "in_full"]
+__all__ = [
+    "CHANNELS",
+    "PROGRAMS",
+    "SOURCE",
+    "PlannedTurn",
+    "RampedTweak",
+    "SuspensionComputer",
+    "Tweak",
+    "drawn_offsets_v",
+    "in_full",
+]
 
 PROGRAMS: Mapping[str, Program] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
@@ -243,4 +253,9 @@ def _models(opamp: str | OpAmpModel, count: int, rng: np.random.Generator | None
     model = preset(opamp) if isinstance(opamp, str) else opamp
     if rng is None:
         return [model] * count
-    return [replace(model, vos_v=model.vos_v + rng.uniform(-offset_v, offset_v)) for _ in range(count)]
+    return [replace(model, vos_v=vos_v) for vos_v in drawn_offsets_v(model, count, rng, offset_v).tolist()]
+
+
+def drawn_offsets_v(model: OpAmpModel, count: int, rng: np.random.Generator, offset_v: float) -> NDArray[np.float64]:
+    """Input offsets of so many specimens, U1 first: the model's own and one uniform within +-offset_v; (count,) V."""
+    return np.asarray(model.vos_v + rng.uniform(-offset_v, offset_v, count))

@@ -7,7 +7,8 @@ AnalogrigError
 │   ├── RigTimeout              the instrument did not answer, or finish, in time
 │   ├── RigClosed               the instrument cannot be reached, or is gone
 │   ├── RigRefused              the instrument refused a command
-│   └── RecordIncomplete        the record that it gave is not whole
+│   ├── RecordIncomplete        the record that it gave is not whole
+│   └── SelfTestError           its self-test could not be made
 ├── WorkerError                 the workers of a campaign cannot be had or kept
 ├── LinkError                   the link failed
 │   ├── LinkTimeout             nothing came in time
@@ -52,6 +53,10 @@ class RigRefused(RigError):  # noqa: N818 - the word of the field
 
 class RecordIncomplete(RigError):  # noqa: N818 - the word of the field
     """The record that the instrument gave is not whole."""
+
+
+class SelfTestError(RigError):
+    """The self-test of the rig could not be made: nothing is known about it."""
 
 
 class WorkerError(AnalogrigError):

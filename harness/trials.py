@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,9 @@ class Trials:
         self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
         library = device.library_path if isinstance(device, InprocDevice) else LIBRARY
         self._estimator = Estimator(self._device.estimator, library=library)
+        # Runs share their tables: to write them anew for each takes as long as to play a thousand samples.
+        self._tables = rig.description(), self._device.as_table()
+        self._scenario_table: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
         """The samples with an alarm, (a,), and nothing else: the fastest way.
@@ -64,7 +68,7 @@ class Trials:
         """
         self._estimator.restart()
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
-        found = [block.first + self._estimator.alarms(*_entered(block)) for block in performance.blocks]
+        found = [block.first + self._estimator.alarms(*entered(block)) for block in performance.blocks]
         return np.concatenate(found)
 
     @property
@@ -80,7 +84,7 @@ class Trials:
         parts: list[Steps] = []
         for block in performance.blocks:
             blocks.append(block)
-            parts.append(self._estimator.run(*_entered(block)))
+            parts.append(self._estimator.run(*entered(block)))
         return self._run(scenario, seed, performance, blocks, parts)
 
     def _run(
@@ -103,6 +107,9 @@ class Trials:
         )
 
     def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        if self._scenario_table[0] is not scenario:
+            self._scenario_table = scenario, scenario.as_table()
+        rig, dut = self._tables
         hindsight = performance.hindsight()
         return Conditions(
             seed=seed,
@@ -111,9 +118,9 @@ class Trials:
             time_scale=performance.time_scale,
             channels=performance.channels,
             segments=hindsight.segments,
-            scenario=scenario.as_table(),
-            rig=self._rig.description(),
-            dut=self._device.as_table(),
+            scenario=self._scenario_table[1],
+            rig=rig,
+            dut=dut,
             link="none",
             counters=self._estimator.counters,
             faults=scenario.caveats,
@@ -121,5 +128,6 @@ class Trials:
         )
 
 
-def _entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
     return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from harness.instrument.inputs import LOOKS_PER_SAMPLE, RANGES_V, Codes, InputFaults, Inputs, Volts
+from harness.instrument.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
 from harness.instrument.scpi import ScpiError
 from harness.instrument.table import Table
 
@@ -21,9 +21,9 @@ BUFFER_N = 16_384
 MIDDLE_N = BUFFER_N // 2
 LEAST_DECIMATION, MOST_DECIMATION = 125, 65_536
 """A real one goes down to 1; the computer's slowest amplifier needs no more than a sample a microsecond."""
-LEAST_DELAY_N, MOST_DELAY_N = -MIDDLE_N, BUFFER_N
-PAUSE_N = 2000
-"""Samples that go by, unseen, between the end of a record and the next ACQ:START."""
+LEAST_DELAY_N, MOST_DELAY_N = -MIDDLE_N, 100 * BUFFER_N
+PAUSE_S = 0.02
+"""That goes by, unseen, before each ACQ:START: time in which a computer that is no longer excited comes to rest."""
 TRIGGERS = ("DISABLED", "NOW", "CH1_PE", "CH1_NE", "CH2_PE", "CH2_NE", "AWG_PE")
 _LOST = slice(3 * BUFFER_N // 8, 5 * BUFFER_N // 8)
 """Of a record in the middle of which the samples are lost."""
@@ -89,12 +89,22 @@ class Record:
 
 
 @dataclass
-class _Wait:
+class _Waiting:
     """For a trigger."""
 
     trigger: str = "DISABLED"
     seen: Volts = field(default_factory=lambda: np.empty((0, 2)))
     """The last samples; before_n + 1 at least, once a trigger is set."""
+
+
+@dataclass
+class _Filling:
+    """The buffer, after the trigger."""
+
+    seen: Volts
+    """The last samples, not more than the buffer holds."""
+    left_n: int
+    """Those that are still to come."""
 
 
 class Acquisition:
@@ -107,30 +117,41 @@ class Acquisition:
         self.settings = Settings()
         self.record: Record | None = None
         self._table = table
+        self._input_faults = inputs[0]
         self._inputs = Inputs(*inputs)
         self._faults = faults
-        self._wait: _Wait | None = None
+        self._doing: _Waiting | _Filling | None = None
         self._records = 0
         self._dropped_out = False
+        self._tune(self.settings.decimation)
 
     # ---- settings
 
     def change(self, settings: Settings) -> None:
-        """A wait for a trigger begins anew.
+        """What begins with another rate or delay begins anew: waiting for a trigger, and the record after it.
 
         :raises EmulatorError: the generator is too fast for the rate; then nothing changes.
         """
-        if settings.decimation != self.settings.decimation:
-            self._table.look_at(look_rate_hz(settings.decimation, self._faults))
-            self._inputs.forget()
+        before, doing = self.settings, self._doing
+        if settings.decimation != before.decimation:
+            self._tune(settings.decimation)
         self.settings = settings
-        if self._wait is not None:
-            self._arm(self._wait.trigger)
+        if (settings.decimation, settings.delay_n) == (before.decimation, before.delay_n):
+            return
+        if isinstance(doing, _Waiting):
+            self._doing = self._armed(doing.trigger)
+        elif doing is not None:
+            self._doing = _Waiting()
 
     def reset(self) -> None:
         """Stopped, with the settings of the beginning and without a record."""
-        self._wait = self.record = None
+        self._doing = self.record = None
         self.change(Settings())
+
+    @property
+    def triggered(self) -> bool:
+        """What ACQ:TRig:STAT? says."""
+        return self.record is not None or isinstance(self._doing, _Filling)
 
     @property
     def filled(self) -> bool:
@@ -156,94 +177,101 @@ class Acquisition:
 
     def start(self) -> None:
         """Forget the record, and be ready for a trigger."""
-        if self.record is not None:
-            self._samples(PAUSE_N)
-        self.record, self._wait = None, _Wait()
+        self._table.look(round(PAUSE_S * self._table.rate_hz))
+        self._inputs.forget()
+        self.record, self._doing = None, _Waiting()
 
     def stop(self) -> None:
         """Wait no more. A record that is there stays."""
-        self._wait = None
+        self._doing = None
 
     def arm(self, trigger: str) -> None:
         """Set the trigger, one of TRIGGERS, and wait for it.
 
-        :raises ScpiError: nothing has been started.
+        :raises ScpiError: nothing has been started, or the trigger has come.
         """
-        if self._wait is None:
+        if not isinstance(self._doing, _Waiting):
             raise ScpiError(-221, "ACQ:TRig before ACQ:START")
-        self._arm(trigger)
+        self._doing = self._armed(trigger)
         self.wait()
 
-    @property
-    def awaits_generator(self) -> bool:
-        """Whether the start of the generator would be the trigger."""
-        return self._wait is not None and self._wait.trigger == "AWG_PE"
-
-    def take_now(self) -> None:
-        """The trigger has come, at this instant."""
-        if self._wait is not None:
-            self._take(self._wait.seen, len(self._wait.seen))
+    def generator_started(self) -> None:
+        """At this instant, which may be the trigger."""
+        self._inputs.forget()
+        if isinstance(self._doing, _Waiting) and self._doing.trigger == "AWG_PE":
+            self._take(self._doing.seen, len(self._doing.seen))
 
     def wait(self) -> None:
-        """Let the time of a record pass, or less, in which a trigger may come."""
-        if self._wait is None:
-            return
-        if self._wait.trigger == "NOW":
-            self.take_now()
-        elif self._wait.trigger == "AWG_PE":
-            self._wait_for_edge()
-        elif self._wait.trigger.startswith("CH"):
-            self._wait_for_level(self._wait)
+        """Let the time of a record pass, or less, in which a trigger may come and the buffer be filled."""
+        doing = self._doing
+        if isinstance(doing, _Filling):
+            self._fill(doing)
+        elif doing is not None and doing.trigger == "NOW":
+            self._take(doing.seen, len(doing.seen))
+        elif doing is not None and doing.trigger == "AWG_PE":
+            self._wait_for_edge(doing)
+        elif doing is not None and doing.trigger.startswith("CH"):
+            self._wait_for_level(doing)
 
-    def _arm(self, trigger: str) -> None:
-        seen = self._samples(0 if trigger == "DISABLED" else self.settings.before_n + 1)
-        self._wait = _Wait(trigger, seen)
+    def _armed(self, trigger: str) -> _Waiting:
+        return _Waiting(trigger, self._samples(0 if trigger == "DISABLED" else self.settings.before_n + 1))
 
-    def _wait_for_edge(self) -> None:
+    def _wait_for_edge(self, waiting: _Waiting) -> None:
         left = self._table.until_edge_n()
         if left is None:
             return
-        left_n = left // LOOKS_PER_SAMPLE
-        self._see(min(left_n, BUFFER_N))
+        left_n = self._inputs.until(left)
+        self._see(waiting, min(left_n, BUFFER_N))
         if left_n <= BUFFER_N:
-            self.take_now()
+            self._take(waiting.seen, len(waiting.seen))
 
-    def _wait_for_level(self, wait: _Wait) -> None:
-        self._see(BUFFER_N)
-        channel, sign = int(wait.trigger[2]) - 1, 1.0 if wait.trigger.endswith("PE") else -1.0
-        above = sign * wait.seen[:, channel] >= sign * self.settings.level_v
+    def _wait_for_level(self, waiting: _Waiting) -> None:
+        self._see(waiting, BUFFER_N)
+        channel, sign = int(waiting.trigger[2]) - 1, 1.0 if waiting.trigger.endswith("PE") else -1.0
+        above = sign * waiting.seen[:, channel] >= sign * self.settings.level_v
         crossed = np.flatnonzero(above[1:] & ~above[:-1]) + 1
         crossed = crossed[crossed >= self.settings.before_n]
         if crossed.size:
-            self._take(wait.seen, int(crossed[0]))
+            self._take(waiting.seen, int(crossed[0]))
 
-    def _see(self, count: int) -> None:
+    def _see(self, waiting: _Waiting, count: int) -> None:
         """Wait on, without forgetting what a record may begin with."""
-        if self._wait is not None:
-            kept = self._wait.seen[-(self.settings.before_n + 1) :]
-            self._wait.seen = np.concatenate((kept, self._samples(count)))
+        kept = waiting.seen[-(self.settings.before_n + 1) :]
+        waiting.seen = np.concatenate((kept, self._samples(count)))
 
     def _take(self, seen: Volts, trigger_at: int) -> None:
         """The record of a trigger at that sample of those that were seen."""
         stop = trigger_at + self.settings.after_n
-        volts = np.concatenate((seen, self._samples(max(stop - len(seen), 0))))[:stop][-BUFFER_N:]
+        self._doing = filling = _Filling(seen[:stop], max(stop - len(seen), 0))
+        self._fill(filling)
+
+    def _fill(self, filling: _Filling) -> None:
+        """By no more than a record's length: of a long delay the rest is left for the next time."""
+        count = min(filling.left_n, BUFFER_N)
+        filling.seen = np.concatenate((filling.seen, self._samples(count)))[-BUFFER_N:]
+        filling.left_n -= count
+        if not filling.left_n:
+            self._keep(filling.seen)
+
+    def _keep(self, volts: Volts) -> None:
+        """As the record."""
         codes = self._inputs.codes(volts, self.settings.switches)
         self._records += 1
         if self._faults.half_filled:
             codes[MIDDLE_N:] = 0
         if self._faults.drop_out == "zeros" and self._records == self._faults.drop_out_record:
             codes[_LOST] = 0
-        self.record, self._wait = Record(codes, self.settings.switches), None
+        self.record, self._doing = Record(codes, self.settings.switches), None
 
     def _samples(self, count: int) -> Volts:
-        rate_hz = self._table.rate_hz
-        looks = self._table.look(count * LOOKS_PER_SAMPLE)
-        return self._inputs.samples(looks, rate_hz, averages=self.settings.averages)
+        return self._inputs.samples(self._table.look, count, averages=self.settings.averages)
 
-
-def look_rate_hz(decimation: int, faults: AcquisitionFaults) -> float:
-    """How often the leads are looked at, in true time."""
-    return LOOKS_PER_SAMPLE * CLOCK_HZ / decimation * (1.0 + 1e-6 * faults.clock_ppm)
+    def _tune(self, decimation: int) -> None:
+        """:raises EmulatorError: the generator is too fast for the rate; then nothing changes."""
+        true_rate_hz = CLOCK_HZ / decimation * (1.0 + 1e-6 * self._faults.clock_ppm)
+        looks_n = looks_per_sample(self._input_faults, true_rate_hz)
+        self._table.look_at(looks_n * true_rate_hz)
+        self._inputs.tune(looks_n, true_rate_hz)
 
 
 def with_switch(settings: Settings, channel: int, switch: str) -> Settings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,13 @@ from emulator.sampler import Card, Sampler
 BITS = 14
 RANGES_V = {"LV": 1.0, "HV": 20.0}
 """By the position of an input's switch: it takes plus and minus this."""
-LOOKS_PER_SAMPLE = 8
+LEAST_LOOKS, MOST_LOOKS = 8, 40
 """So often the leads are looked at while the instrument averages over one of its samples."""
+_AT_A_LOOK = 1e-3
+"""Looks: so close to one an instant is taken for its own."""
 
 MOST_SKEW_S = 1e-3
+
 MOST_INPUT_V = 100.0
 MOST_GAIN_ERROR = 0.5
 CHANNELS_N = 2
@@ -59,33 +62,43 @@ class Inputs:
         """``rng`` gives the noise."""
         self._faults = faults
         self._rng = rng
-        self._before: Volts = np.empty((0, CHANNELS_N))
+        self._looks_n = LEAST_LOOKS
+        self._late = 0.0
+        self._ahead: Volts = np.empty((0, CHANNELS_N))
+
+    def tune(self, looks_n: int, sample_rate_hz: float) -> None:
+        """A sample is made of so many looks, and there are so many samples a second."""
+        self._looks_n = looks_n
+        self._late = abs(self._faults.skew_s) * sample_rate_hz * looks_n
+        self.forget()
+
+    def until(self, looks_n: int) -> int:
+        """Samples until so many looks from now, whole ones."""
+        return (looks_n + self.ahead_n) // self._looks_n
+
+    @property
+    def ahead_n(self) -> int:
+        """Looks that have been taken and are of the samples that come: the later channel needs them before its time."""
+        return len(self._ahead)
 
     def forget(self) -> None:
-        """What was seen before has nothing to do with what comes."""
-        self._before = self._before[:0]
+        """What has been seen has nothing to do with what comes."""
+        self._ahead = self._ahead[:0]
 
-    def samples(self, looks: Volts, rate_hz: float, *, averages: bool) -> Volts:
-        """Consecutive looks, ``rate_hz`` of them a second and (8 n, 2), to samples: (n, 2).
+    def samples(self, look: Callable[[int], Volts], count: int, *, averages: bool) -> Volts:
+        """The next samples, (count, 2), from consecutive looks: ``look(n)`` is (n, 2).
 
-        A sample is the mean of its looks, or the first of them. A skew that is no multiple of a look's period is taken
-        on the chord between two looks.
+        A sample is the mean of its looks, or the first of them. The later channel is taken on the chord between two.
         """
-        if not len(looks):
-            return looks
-        by_sample = self._skewed(looks, rate_hz).reshape(-1, LOOKS_PER_SAMPLE, CHANNELS_N)
+        own = count * self._looks_n
+        lacking = own + math.ceil(self._late) - self.ahead_n
+        seen = np.concatenate((self._ahead, look(lacking))) if count else self._ahead
+        looks, self._ahead = seen[:own].copy(), seen[own:]
+        if self._late and count:
+            later = 1 if self._faults.skew_s > 0.0 else 0
+            looks[:, later] = np.interp(np.arange(own) + self._late, np.arange(len(seen)), seen[:, later])
+        by_sample = looks.reshape(count, self._looks_n, CHANNELS_N)
         return np.asarray(by_sample.mean(axis=1) if averages else by_sample[:, 0])
-
-    def _skewed(self, looks: Volts, rate_hz: float) -> Volts:
-        skew = self._faults.skew_s * rate_hz
-        channel, late = (1, skew) if skew > 0.0 else (0, -skew)
-        kept = math.ceil(late)
-        before = self._before if len(self._before) == kept else np.repeat(looks[:1], kept, axis=0)
-        seen = np.concatenate((before, looks))
-        self._before = seen[len(seen) - kept :]
-        skewed = looks.copy()
-        skewed[:, channel] = np.interp(np.arange(len(looks)) + kept - late, np.arange(len(seen)), seen[:, channel])
-        return skewed
 
     def codes(self, volts: Volts, switches: Sequence[str]) -> Codes:
         """What the converters make of samples: (n, 2), 0 for 0 V. ``switches``: the range of each channel."""
@@ -99,6 +112,13 @@ class Inputs:
         )
         codes, _ = Sampler(card, self._rng).sample(volts)
         return (codes.astype(np.int32) - (1 << (BITS - 1))).astype(np.int16)
+
+
+def looks_per_sample(faults: InputFaults, sample_rate_hz: float) -> int:
+    """So many that the later channel's instant is that of a look, if that can be; else it is close to one."""
+    part = abs(faults.skew_s) * sample_rate_hz
+    counts = range(LEAST_LOOKS, MOST_LOOKS + 1)
+    return next((n for n in counts if abs(part * n - round(part * n)) < _AT_A_LOOK), MOST_LOOKS)
 
 
 def lsb_v(switch: str) -> float:

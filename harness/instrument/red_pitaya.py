@@ -40,7 +40,6 @@ from harness.instrument.acquisition import (
     TRIGGERS,
     Acquisition,
     Settings,
-    look_rate_hz,
     with_switch,
 )
 from harness.instrument.description import InstrumentDescription
@@ -68,8 +67,7 @@ class RedPitaya:
         :raises EmulatorError: the computer cannot be made.
         """
         described = description or InstrumentDescription()
-        rate_hz = look_rate_hz(Settings().decimation, described.acquisition)
-        self._table = Table(computer, described.wiring, rate_hz)
+        self._table = Table(computer, described.wiring)
         self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition)
         self._generator = Generator()
         self._pots = tuple(self._table.dials)
@@ -143,8 +141,7 @@ class RedPitaya:
     def _trigger_generator(self, call: Call) -> None:
         self._table.generate(self._out(call).waveform())
         self._table.schedule(self._scheduled)
-        if self._acquisition.awaits_generator:
-            self._acquisition.take_now()
+        self._acquisition.generator_started()
 
     def _reset_generator(self) -> None:
         self._generator = Generator()
@@ -160,7 +157,7 @@ class RedPitaya:
             "ACQ:STOP": (0, lambda _: acquisition.stop()),
             "ACQ:TRig": (1, lambda call: acquisition.arm(call.word(0, TRIGGERS))),
             "ACQ:TRig:STAT?": (0, lambda _: self._triggered()),
-            "ACQ:TRig:FILL?": (0, lambda _: str(int(acquisition.filled))),
+            "ACQ:TRig:FILL?": (0, lambda _: self._filled()),
             "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
             "ACQ:SOUR#:DATA?": (0, lambda call: self._data(call, 0, BUFFER_N)),
             "ACQ:SOUR#:DATA:STArt:N?": (2, self._part_of_data),
@@ -209,7 +206,11 @@ class RedPitaya:
 
     def _triggered(self) -> str:
         self._acquisition.wait()
-        return "WAIT" if self._acquisition.record is None else "TD"
+        return "TD" if self._acquisition.triggered else "WAIT"
+
+    def _filled(self) -> str:
+        self._acquisition.wait()
+        return str(int(self._acquisition.filled))
 
     def _part_of_data(self, call: Call) -> Response:
         first, count = call.whole(0, 0, BUFFER_N - 1), call.whole(1, 1, BUFFER_N)
@@ -221,7 +222,7 @@ class RedPitaya:
         """Samples of the record, in the units and the form that are set."""
         channel, record = _channel(call), self._acquisition.record
         if record is None:
-            raise ScpiError(-230, "no record has been taken")
+            raise ScpiError(-230, "no record is complete")
         data = self._formed(record.codes[first : first + count, channel], record.switches[channel])
         return Broken(data, hangs_up=self._acquisition.hangs_up) if self._acquisition.drops_out() else data
 

@@ -156,17 +156,19 @@ class Interpreter:
             self.refuse(ScpiError(-101))
             return
         separator, path = b"", ""
-        for unit in text.split(";"):
+        units = text.split(";")
+        for left, unit in enumerate(units, start=1 - len(units)):
             try:
                 response, path = self._execute(unit.strip(), path)
             except ScpiError as error:
                 self.refuse(error)
                 response = None
-            yield b"" if response is None else separator + _as_sent(response)
+            part = b"" if response is None else separator + _as_sent(response)
             if isinstance(response, Broken):
+                yield part
                 raise DropOut(hangs_up=response.hangs_up)
-            separator = separator if response is None else b";"
-        yield END if separator else b""
+            separator = b";" if part else separator
+            yield part + END if separator and not left else part
 
     def refuse(self, error: ScpiError) -> None:
         """Remember what was wrong."""

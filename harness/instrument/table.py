@@ -22,6 +22,9 @@ from emulator.suspension import SuspensionComputer
 
 SEEN = tuple(CHANNELS.index(name) for name in ("force", "displacement"))
 
+FIRST_RATE_HZ = 160e3
+AT_A_TIME_N = 1 << 16
+"""Looks: the machine gives four channels, of which two are kept."""
 MOST_GAIN, MOST_STAGE_V = 1e3, 1e3
 _JUST_STARTED = 1e-9
 """Periods: so soon after an edge the generator still stands at it."""
@@ -82,7 +85,9 @@ class Turn:
 class Table:
     """The computer in operation, from rest; ``rate_hz`` is how often its channels are looked at."""
 
-    def __init__(self, computer: Callable[[float], SuspensionComputer], wiring: Wiring, rate_hz: float) -> None:
+    def __init__(
+        self, computer: Callable[[float], SuspensionComputer], wiring: Wiring, rate_hz: float = FIRST_RATE_HZ
+    ) -> None:
         """``computer`` makes the machine for a rate, its pots as they are set.
 
         :raises EmulatorError: it cannot be made.
@@ -102,6 +107,8 @@ class Table:
         """
         waveform = None if self._waveform is None else replace(self._waveform, phase=self._periods % 1.0)
         _check(waveform, rate_hz)
+        if rate_hz == self.rate_hz:
+            return
         left = [replace(turn, delay_s=(tick - self._now_tick) * self._tick_s) for tick, turn in self._due]
         computer = self._make(rate_hz)
         computer.machine.turn(self.dials)
@@ -171,7 +178,8 @@ class Table:
         """
         stop, parts = self._recorded + count, [np.empty((0, len(SEEN)))]
         while self._recorded < stop:
-            until = min(stop, self._due[0][0] // TICKS_PER_SAMPLE + 1) if self._due else stop
+            until = min(stop, self._recorded + AT_A_TIME_N)
+            until = min(until, self._due[0][0] // TICKS_PER_SAMPLE + 1) if self._due else until
             if until > self._recorded:
                 parts.append(self._play(until - self._recorded))
             while self._due and self._due[0][0] < self._now_tick:

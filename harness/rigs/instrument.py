@@ -65,16 +65,21 @@ class Instrument(ABC):
         :raises ConfigurationError: what it needs is not installed.
         """
 
+    @classmethod
+    @abstractmethod
+    def check(cls, excitation: Excitation) -> None:
+        """That its generator has such a waveform, in volts at its output.
+
+        :raises ConfigurationError: it has not; says why.
+        """
+
     @abstractmethod
     def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
         """Which inputs are wanted, in this order, each with the word for its range."""
 
     @abstractmethod
     def set_excitation(self, excitation: Excitation) -> None:
-        """What the generator gives, in volts at its output, from the first sample of each record on; it stays off.
-
-        :raises ConfigurationError: it has no such waveform.
-        """
+        """What the generator gives from the first sample of each record on, checked before; it stays off."""
 
     def turn(self, pot: str, dial: float) -> None:
         """At once.

@@ -12,7 +12,8 @@ import contextlib
 import dataclasses
 import itertools
 import logging
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
@@ -20,12 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator import Excitation, SuspensionComputer
-from harness.errors import ConfigurationError, RigError
+from harness.errors import ConfigurationError, RigError, SelfTestError
+from harness.plant import Plant
+from harness.rigs.by_hand import ByHand, Tweak
 from harness.rigs.emulator import Stream, emulator_errors, settings_of
 from harness.rigs.instrument import Instrument, Recorded, Turn, driver
+from harness.rigs.pots import Pots, PotsDescription
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
-from harness.run import CHANNELS, Channel
+from harness.run import CHANNELS, Channel, Segment
 from harness.scenario import Scenario
+from harness.two_filter import Record
 
 MEASURED = ("force", "displacement")
 
@@ -33,6 +38,11 @@ LEAD_N = 500
 """A record begins at least so long before a tweak, so that the device knows the plant that changes."""
 
 SELF_TEST_SEED = 0
+
+_AFTER_N = 0.05
+"""A pot that jumps at a sample does so this part of a sample after it."""
+
+_MOST_CODE = 0xFFFF
 
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
@@ -63,11 +73,16 @@ class Input:
     """In the instrument's own words."""
     gain: float = 1.0
     offset_v: float = 0.0
+    least_v: float = -1.0
+    """At the computer; what is below counts as clipped. Codes count from here: the larger the code of 0 V, the larger
+    the offset that the estimator has to learn."""
     noise_lsb: float = 1.0
     """rms before quantisation, as far as it is known; the self-test measures it."""
 
     def __post_init__(self) -> None:
         Stage(self.gain, self.offset_v)
+        if not abs(self.least_v) <= _MOST_VOLTS:
+            raise ValueError(f"least_v must be within +-{_MOST_VOLTS:g} V, not {self.least_v:g}")
         if not 0.0 <= self.noise_lsb <= 1e5:
             raise ValueError(f"noise_lsb must be 0 to 1e5, not {self.noise_lsb:g}")
 
@@ -114,6 +129,28 @@ class InstrumentPots:
     kind: Literal["instrument"]
 
 
+class _OnInstrument:
+    """Its pots; those that turn within a record are in the record's schedule."""
+
+    exact = True
+
+    def __init__(self, instrument: Instrument, pots: Iterable[str]) -> None:
+        """:raises RigError: it has not those pots."""
+        if lacking := sorted(set(pots) - set(instrument.pots)):
+            raise RigError(f"{instrument.name}: has no pots {', '.join(lacking)} that it could turn")
+        self._instrument = instrument
+
+    def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
+        for pot, dial in dials.items():
+            self._instrument.turn(pot, dial)
+
+    def turn(self, dials: Mapping[str, float], words: str) -> None:
+        self.settle(dials, words)
+
+    def close(self) -> None:
+        pass
+
+
 @dataclass(frozen=True)
 class RealDescription:
     """A rig of the kind ``real``: a table of a rigs file, or a file of its own."""
@@ -123,7 +160,7 @@ class RealDescription:
     """URL: ``redpitaya://HOST``."""
     inputs: Mapping[str, Input]
     """Of ``force`` and ``displacement``."""
-    pots: InstrumentPots
+    pots: InstrumentPots | PotsDescription
     generator: Stage = field(default_factory=Stage)
     plant: Literal["front", "shock"] = "front"
     """The program that is patched."""
@@ -185,6 +222,9 @@ class RealRig:
         self._description = description
         self._connect = connect or self._kind.open
         self._instrument: Instrument | None = None
+        self._pots: Pots | None = None
+        self._standing: dict[str, float] = {}
+        """Dials, as far as they are known."""
         self._caveats: tuple[str, ...] | None = None if description.self_test else ()
 
     def description(self) -> Mapping[str, Any]:
@@ -203,10 +243,10 @@ class RealRig:
         plan = self._plan(scenario, seed)
         return Performance(
             sample_period_s=1.0 / self._kind.rate_hz,
-            time_scale=self._description.scaling.time or plan.computer.scales.time,
+            time_scale=self._time_scale(plan.computer),
             channels=self._channels(plan.computer),
             blocks=self._blocks(scenario, plan, tested=tested),
-            hindsight=lambda: Hindsight(scenario.segments(), caveats=(self._caveats or ()) if tested else ()),
+            hindsight=lambda: Hindsight(plan.truth(), caveats=(self._caveats or ()) if tested else ()),
         )
 
     # ---- before
@@ -226,7 +266,8 @@ class RealRig:
         self._check_force(excitation, where)
         start = dict(computer.dials)
         self._check_dials(start, where)
-        tweaks: list[tuple[int, dict[str, float]]] = []
+        tweaks: list[Tweak] = []
+        plant = scenario.plant.plant()
         for i, tweak in enumerate(scenario.tweaks):
             place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
             if tweak.ramp_n:
@@ -234,8 +275,10 @@ class RealRig:
             with emulator_errors(place):
                 dials = computer.dials_for(**settings_of(computer, tweak.given()))
             self._check_dials(dials, place)
-            tweaks.append((tweak.sample, dials))
-        return _Plan(computer, excitation, start, tuple(tweaks))
+            before, plant = plant, dataclasses.replace(plant, **tweak.given())
+            tweaks.append(Tweak(tweak.sample, dials, before, plant))
+        truth = None if isinstance(self._description.pots, InstrumentPots) else [Segment(0, scenario.plant.plant())]
+        return _Plan(scenario, computer, excitation, start, tuple(tweaks), truth)
 
     def _check_force(self, excitation: Excitation, where: str) -> None:
         low_v, high_v = self._description.limits.force_v
@@ -244,13 +287,10 @@ class RealRig:
                 f"{where}the force of {excitation.low_v:g} V to {excitation.high_v:g} V exceeds limits.force_v,"
                 f" {low_v:g} V to {high_v:g} V"
             )
-        at_generator = self._at_generator(excitation)
-        least_v, most_v = self._kind.output_v
-        if at_generator.low_v < least_v - 1e-9 or at_generator.high_v > most_v + 1e-9:
-            raise ConfigurationError(
-                f"{where}the generator would have to give {at_generator.low_v:g} V to {at_generator.high_v:g} V, and"
-                f" has {least_v:g} V to {most_v:g} V"
-            )
+        try:
+            self._kind.check(self._at_generator(excitation))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}{error}") from error
 
     def _at_generator(self, excitation: Excitation) -> Excitation:
         """The waveform at the instrument that is ``excitation`` at the computer."""
@@ -278,12 +318,14 @@ class RealRig:
         for name in MEASURED:
             wired = self._description.inputs[name]
             ends_v = sorted((end - wired.offset_v) / wired.gain for end in self._kind.ranges_v[wired.range])
+            low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << self._kind.bits)
             out[name] = Channel(
-                low_v=ends_v[0],
-                lsb_v=(ends_v[1] - ends_v[0]) / (1 << self._kind.bits),
+                low_v=low_v,
+                lsb_v=lsb_v,
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
                 noise_lsb=wired.noise_lsb,
+                codes=math.ceil((ends_v[1] - low_v) / lsb_v),
             )
         return out
 
@@ -292,20 +334,48 @@ class RealRig:
     def _blocks(self, scenario: Scenario, plan: _Plan, *, tested: bool) -> Iterator[Block]:
         if tested and self._caveats is None:
             self._caveats = self._tested()
-        instrument = self._opened()
+        instrument, pots = self._opened()
         wired = [self._description.inputs[name] for name in MEASURED]
         instrument.set_inputs([(each.input, each.range) for each in wired])
         instrument.set_excitation(self._at_generator(plan.excitation))
-        cuts = records(scenario.samples, self._kind.record_n, [sample for sample, _ in plan.tweaks])
-        standing = plan.start
+        cuts = records(scenario.samples, self._kind.record_n, [tweak.sample for tweak in plan.tweaks])
+        standing, plant = plan.start, scenario.plant.plant()
         for record, (start, end) in enumerate(cuts):
-            mine = [(sample, dials) for sample, dials in plan.tweaks if start <= sample < end]
+            mine = [dataclasses.replace(t, sample=t.sample - start) for t in plan.tweaks if start <= t.sample < end]
             with self._left_safe(instrument):
-                self._settle(instrument, standing)
-                taken = instrument.record(end - start, self._turns(mine, start))
-            yield from self._cut(taken, start, record, plan.computer)
-            for _, dials in mine:
-                standing = {**standing, **dials}
+                self._settle(instrument, pots, standing, plant)
+                self._standing = {}  # unless the record comes to its end
+                taken, by_hand = self._record(instrument, pots, end - start, mine)
+            for tweak in mine:
+                standing, plant = {**standing, **tweak.dials}, tweak.after
+            self._standing = dict(standing)
+            volts, codes, clipped = self._converted(taken, self._channels(plan.computer))
+            if plan.dated is not None:
+                plan.dated.extend(by_hand.dated(self._as_measured(plan, codes, clipped), start))
+            for first in range(0, len(codes), BLOCK_SAMPLES):
+                part = slice(first, first + BLOCK_SAMPLES)
+                yield Block(start + first, volts[part], codes[part], clipped[part], record)
+
+    def _record(
+        self, instrument: Instrument, pots: Pots, samples: int, tweaks: Sequence[Tweak]
+    ) -> tuple[Recorded, ByHand]:
+        rate_hz = self._kind.rate_hz
+        if pots.exact:
+            turns = [
+                Turn((tweak.sample + _AFTER_N) / rate_hz, pot, dial)
+                for tweak in tweaks
+                for pot, dial in tweak.dials.items()
+            ]
+            return instrument.record(samples, turns), ByHand(pots, (), rate_hz)
+        by_hand = ByHand(pots, tweaks, rate_hz)
+        return instrument.record(samples, while_recording=by_hand.turn_all), by_hand
+
+    def _as_measured(self, plan: _Plan, codes: NDArray[np.uint16], clipped: NDArray[np.bool_]) -> Record:
+        period_s = self._time_scale(plan.computer) / self._kind.rate_hz
+        return Record.of(codes, clipped, self._channels(plan.computer), period_s)
+
+    def _time_scale(self, computer: SuspensionComputer) -> float:
+        return self._description.scaling.time or computer.scales.time
 
     @contextlib.contextmanager
     def _left_safe(self, instrument: Instrument) -> Iterator[None]:
@@ -329,54 +399,58 @@ class RealRig:
             return f"the generator of {instrument.name} may still be on: switch it off by hand"
         return ""
 
-    def _settle(self, instrument: Instrument, dials: Mapping[str, float]) -> None:
+    def _settle(self, instrument: Instrument, pots: Pots, dials: Mapping[str, float], plant: Plant) -> None:
         """The pots as they shall stand, and the computer at rest."""
         instrument.make_safe()
-        for pot, dial in dials.items():
-            instrument.turn(pot, dial)
+        if dict(dials) != self._standing:
+            pots.settle(dials, ", ".join(f"{name} {value:g}" for name, value in plant.parameters().items()))
+            self._standing = dict(dials)
         instrument.rest(self._description.settle_s)
-
-    def _turns(self, tweaks: list[tuple[int, dict[str, float]]], start: int) -> list[Turn]:
-        """Right after a sample: between it and the next one."""
-        rate_hz = self._kind.rate_hz
-        return [
-            Turn((sample - start + 0.5) / rate_hz, pot, dial) for sample, dials in tweaks for pot, dial in dials.items()
-        ]
-
-    def _cut(self, taken: Recorded, start: int, record: int, computer: SuspensionComputer) -> Iterator[Block]:
-        volts, codes, clipped = self._converted(taken, self._channels(computer))
-        for first in range(0, len(codes), BLOCK_SAMPLES):
-            part = slice(first, first + BLOCK_SAMPLES)
-            yield Block(start + first, volts[part], codes[part], clipped[part], record)
 
     def _converted(
         self, taken: Recorded, channels: Mapping[str, Channel]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts at the computer, codes and clipping, (n, 4) each."""
-        n, most = len(taken.volts), (1 << self._kind.bits) - 1
+        n = len(taken.volts)
         volts = np.full((n, len(CHANNELS)), np.nan)
         codes = np.zeros((n, len(CHANNELS)), np.uint16)
         clipped = np.zeros((n, len(CHANNELS)), np.bool_)
         for column, name in enumerate(MEASURED):
             wired, channel, at = self._description.inputs[name], channels[name], CHANNELS.index(name)
             volts[:, at] = (taken.volts[:, column] - wired.offset_v) / wired.gain
-            codes[:, at] = np.clip(np.rint((volts[:, at] - channel.low_v) / channel.lsb_v), 0, most)
-            clipped[:, at] = taken.clipped[:, column]
+            exact = np.rint((volts[:, at] - channel.low_v) / channel.lsb_v)
+            codes[:, at] = np.clip(exact, 0.0, _MOST_CODE)
+            clipped[:, at] = taken.clipped[:, column] | (exact < 0.0) | (exact > _MOST_CODE)
         return volts, codes, clipped
 
-    def _opened(self) -> Instrument:
-        """:raises RigError: it cannot be reached.
-        :raises ConfigurationError: it lacks what the description says.
+    def _opened(self) -> tuple[Instrument, Pots]:
+        """:raises RigError: one of them cannot be reached, or lacks what the description says.
+        :raises ConfigurationError: there is no terminal for the operator.
         """
+        description = self._description
         if self._instrument is None:
-            self._instrument = self._connect(self._description.instrument, self._description.timeout_s)
-            lacking = set(SuspensionComputer(self._description.plant).dials) - set(self._instrument.pots)
-            if lacking:
-                raise RigError(f"{self._instrument.name}: has no pots {', '.join(sorted(lacking))} that it could turn")
-        return self._instrument
+            self._instrument = self._connect(description.instrument, description.timeout_s)
+        if self._pots is None:
+            wanted = SuspensionComputer(description.plant).dials
+            self._pots = (
+                _OnInstrument(self._instrument, wanted)
+                if isinstance(description.pots, InstrumentPots)
+                else description.pots.open()
+            )
+        return self._instrument, self._pots
 
     def _tested(self) -> tuple[str, ...]:
-        return ()
+        """What is wrong with the rig.
+
+        :raises RigError: it failed.
+        """
+        from harness.self_test.conduct import self_test
+
+        try:
+            findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
+        except (SelfTestError, ConfigurationError) as error:
+            return (f"the rig's self-test could not be made: {error}",)
+        return tuple(f"the rig's self-test: {check.sentence}" for check in findings.having("wrong"))
 
     def __enter__(self) -> Self:
         return self
@@ -386,20 +460,29 @@ class RealRig:
             _warn(self._danger(self._instrument))
             self._instrument.close()
             self._instrument = None
+        if self._pots is not None:
+            self._pots.close()
+            self._pots = None
+        self._standing = {}
 
 
 @dataclass(frozen=True)
 class _Plan:
     """What will be played, all of it checked."""
 
+    scenario: Scenario
     computer: SuspensionComputer
     """Nominal, as the scenario starts it."""
     excitation: Excitation
     """At the computer."""
     start: Mapping[str, float]
     """Dials."""
-    tweaks: tuple[tuple[int, dict[str, float]], ...]
-    """Sample and dials."""
+    tweaks: tuple[Tweak, ...]
+    dated: list[Segment] | None
+    """The truth as the samples tell it, where nothing else does."""
+
+    def truth(self) -> tuple[Segment, ...]:
+        return self.scenario.segments() if self.dated is None else tuple(self.dated)
 
 
 class BareRig:

@@ -28,11 +28,12 @@ MIDDLE_N = BUFFER_N // 2
 BITS = 14
 
 _POLL_S = 0.01
+_ROUNDING_V = 1e-9
 _MOST_ANSWER_BYTES = 1 << 20
 _ZEROS_N = BUFFER_N // 10
-"""A buffer that ends with so many zeros on all inputs was not filled to its end."""
+"""So many zeros in a row on all inputs are no measurement."""
 
-_EARLY_N = 1e-3
+_EARLY_N = 1e-4
 """Edges come this part of a sample before the sample that shows them, so that no rounding makes them come after it."""
 
 
@@ -152,18 +153,27 @@ class RedPitaya(Instrument):
             connection.close()
             raise
 
+    @classmethod
+    def check(cls, excitation: Excitation) -> None:
+        least_v, most_v = cls.output_v
+        if excitation.low_v < least_v - _ROUNDING_V or excitation.high_v > most_v + _ROUNDING_V:
+            raise ConfigurationError(
+                f"the generator would have to give {excitation.low_v:g} V to {excitation.high_v:g} V, and has"
+                f" {least_v:g} V to {most_v:g} V"
+            )
+        if excitation.shape == "prbs":
+            raise ConfigurationError("the generator of a Red Pitaya has no prbs: say square or pulse")
+        period_n = cls.rate_hz / excitation.frequency_hz
+        if excitation.clock == "card" and not math.isclose(period_n, round(period_n), rel_tol=1e-12):
+            raise ConfigurationError(
+                f'{excitation.frequency_hz:g} Hz on the clock "card" need a period of whole samples, not {period_n:g}:'
+                ' the generator\'s edges come when they come; say clock = "free"'
+            )
+
     def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
         self._ranges = tuple(ranges)
 
     def set_excitation(self, excitation: Excitation) -> None:
-        period_n = self.rate_hz / excitation.frequency_hz
-        if excitation.shape == "prbs":
-            raise ConfigurationError(f"{self.name}: its generator has no prbs: say square or pulse")
-        if excitation.clock == "card" and not math.isclose(period_n, round(period_n), rel_tol=1e-12):
-            raise ConfigurationError(
-                f'{self.name}: {excitation.frequency_hz:g} Hz on the clock "card" need a period of whole samples, not'
-                f' {period_n:g}: its edges come when they come; say clock = "free"'
-            )
         self._excitation = excitation
 
     def turn(self, pot: str, dial: float) -> None:
@@ -256,10 +266,15 @@ class RedPitaya(Instrument):
         return volts
 
     def _check_filled(self, volts: NDArray[np.float64]) -> None:
+        """:raises RecordIncomplete: a stretch of it was never written."""
         measured = np.flatnonzero((volts != 0.0).any(axis=1))
-        filled = int(measured[-1]) + 1 if len(measured) else 0
-        if BUFFER_N - filled >= _ZEROS_N:
-            raise RecordIncomplete(f"{self.name}: its buffer is filled up to sample {filled} of {BUFFER_N} only")
+        marks = np.concatenate(([-1], measured, [BUFFER_N]))
+        longest = int(np.argmax(np.diff(marks)))
+        start, end = int(marks[longest]) + 1, int(marks[longest + 1])
+        if end - start >= _ZEROS_N:
+            raise RecordIncomplete(
+                f"{self.name}: its buffer is not filled: nothing but zeros from sample {start} to {end - 1}"
+            )
 
     def _lsb_v(self, word: str) -> float:
         low_v, high_v = self.ranges_v[word]

@@ -64,6 +64,18 @@ def test_length_of_blocks_changes_no_code() -> None:
     assert np.concatenate(parts[0]).tobytes() == np.concatenate(parts[1]).tobytes()
 
 
+@pytest.mark.parametrize("rig_name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
+def test_trials_of_one_scenario_are_each_what_a_rig_of_its_own_plays(rig_name: str) -> None:
+    trials, thesis = Trials(emulator(rig_name), describe("inproc")), Scenario.load("thesis")
+    other = dataclasses.replace(thesis, tweaks=thesis.tweaks[:2], samples=1500)
+    for scenario, seed in ((thesis, 3), (thesis, 1), (other, 1), (thesis, 4)):
+        trial = trials.run(scenario, seed)
+        own = list(emulator(rig_name).perform(scenario, seed).blocks)
+        assert trial.codes.tobytes() == np.concatenate([block.codes for block in own]).tobytes()
+        assert trial.conditions.segments == scenario.segments()
+        assert trial.conditions.scenario == scenario.as_table()
+
+
 def test_device_whose_line_is_spoiled_needs_the_bench() -> None:
     rig, device = emulator("emulator"), describe("inproc")
     assert are_possible(rig, device)

@@ -1,0 +1,79 @@
+"""A play that is made again and again, of other specimens of the amplifiers and under another excitation.
+
+Volts and lamps are those of SuspensionComputer.play, to the bit. What neither offsets nor edges change (wiring, pots,
+state spaces) is worked out once, which for some thousand samples takes longer than to play them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .circuit import OpAmp
+from .engine import Engine, Turns
+from .excitation import Excitation
+from .machine import lit
+from .nodal import Nodal
+from .program import SOURCE
+from .suspension import RampedTweak, SuspensionComputer, Tweak, in_full
+
+__all__ = ["Repeat", "RepeatedPlay", "is_repeatable"]
+
+
+class Repeat(NamedTuple):
+    """One play: volts of CHANNELS, float64 (samples, 4), and the lamps as of AnalogComputer.lamps."""
+
+    volts: NDArray[np.float64]
+    lamps: Mapping[str, int | None]
+
+
+def is_repeatable(computer: SuspensionComputer, tweaks: Sequence[Tweak | RampedTweak]) -> bool:
+    """Whether RepeatedPlay takes it: pots that jump, and op-amps whose offsets enter nothing but their own drives."""
+    return all(amp.model.has_state for amp in computer.circuit.of(OpAmp)) and not any(
+        ramp_n for _, _, ramp_n in map(in_full, tweaks)
+    )
+
+
+class RepeatedPlay:
+    """A play of `samples` (at least 1) from rest, with the computer's pots as they stand and tweaks as of its play().
+
+    The computer itself is not touched. Raises PotError for tweaks that cannot be, CircuitError unless is_repeatable().
+    """
+
+    def __init__(self, computer: SuspensionComputer, samples: int, tweaks: Sequence[Tweak | RampedTweak] = ()) -> None:
+        turns = computer.planned(tweaks, samples)
+        nodal, dials = Nodal(computer.circuit), dict(computer.dials)
+        solved = [nodal.trimmed(dials)]
+        for turn in turns:
+            dials |= turn.dials
+            solved.append(nodal.trimmed(dials))
+        systems = [system for system, _ in solved]
+        nodes = computer.program.channel_nodes
+        last_samples = [*(turn.sample for turn in turns), samples - 1]
+        self._turns = Turns(systems, nodes, last_samples, computer.machine.lamp_delay_ticks)
+        self._engine = Engine(systems[0], nodes, computer.sample_rate_hz)
+        self._kinks = systems[0].kinks
+        self._signs = computer.program.channel_signs
+        self._rate_hz = computer.sample_rate_hz
+        trim = solved[0][1]
+        self._amplifiers = trim.amps
+        self._numbers = np.array([int(name.removeprefix("U")) - 1 for name in trim.amps])
+        self._apart_v = np.stack([each.apart_v for _, each in solved])
+        self._gain_rate = trim.gain_rate
+        self._places = np.array(
+            [self._turns.abc_places[pole] if kink is None else self._turns.cde_places[kink] for pole, kink in trim.rows]
+        )
+
+    def play(self, excitation: Excitation, offsets_v: NDArray[np.float64]) -> Repeat:
+        """offsets_v: (amplifiers,) V, the whole input offset of each from U1 on (drawn_offsets_v).
+
+        Raises ExcitationError and EngineError.
+        """
+        self._turns.blocks[:, self._places] = (self._apart_v + offsets_v[self._numbers]) * self._gain_rate
+        edges = excitation.edges(0, int(self._turns.until_ticks[-1]) + 1, self._rate_hz)
+        volts = self._engine.play(self._turns, {SOURCE: edges})
+        volts *= self._signs
+        return Repeat(volts, lit(self._amplifiers, self._kinks, self._engine.overdue_ticks))

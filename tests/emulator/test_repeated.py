@@ -1,0 +1,85 @@
+"""A play that is repeated gives what SuspensionComputer.play gives, to the bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from emulator import (
+    CircuitError,
+    EngineError,
+    Excitation,
+    OpAmpModel,
+    PotError,
+    RepeatedPlay,
+    SuspensionComputer,
+    drawn_offsets_v,
+    is_repeatable,
+)
+from emulator.opamp import PRESETS, preset
+
+OFFSET_V, SAMPLES = 3e-3, 400
+JUMPS = [(150, {"K_n_per_m": 18000.0}), (151, {"B_n_s_per_m": 3453.0}), (SAMPLES - 1, {"K_n_per_m": 24500.0})]
+FULL = Excitation(low_v=0.1, high_v=9.9)
+NO_SLEW = replace(preset("tl07x"), slew_v_per_s=float("inf"))
+
+
+def fresh(model: OpAmpModel, program: str, seed: int) -> SuspensionComputer:
+    return SuspensionComputer(program, opamp=model, rng=np.random.default_rng(seed), offset_v=OFFSET_V)
+
+
+def offsets_v(model: OpAmpModel, computer: SuspensionComputer, seed: int) -> np.ndarray:
+    return drawn_offsets_v(model, computer.program.amplifiers, np.random.default_rng(seed), OFFSET_V)
+
+
+@pytest.mark.parametrize("model", [preset("tl07x"), preset("741"), NO_SLEW], ids=["tl07x", "741", "no slew"])
+@pytest.mark.parametrize("program", ["front", "bump-stop", "two-mass"])
+def test_every_repeat_is_the_play_of_a_machine_of_its_own(model: OpAmpModel, program: str) -> None:
+    first = fresh(model, program, 0)
+    jumps = JUMPS if program == "front" else [(150, {next(iter(first.dials)) + "_dial": 0.3})]
+    repeated = RepeatedPlay(first, SAMPLES, jumps)
+    for seed in (5, 0, 7):
+        excitation = replace(FULL, clock="free", drift_ppm=5.0 * seed, phase=0.1 * seed)
+        own = fresh(model, program, seed)
+        volts = np.concatenate(list(own.play(excitation, SAMPLES, jumps)))
+        repeat = repeated.play(excitation, offsets_v(model, own, seed))
+        assert repeat.volts.tobytes() == volts.tobytes()
+        assert repeat.lamps == own.machine.lamps
+
+
+def test_lamp_of_an_overload_is_lit_in_its_own_repeat_alone() -> None:
+    heavy = [(100, {"K_n_per_m": 9000.0})]
+    computer = fresh(preset("tl07x"), "front", 0)
+    computer.set(K_n_per_m=18000.0)
+    repeated = RepeatedPlay(computer, SAMPLES, heavy)
+    loud, quiet = replace(FULL, low_v=-40.0, high_v=40.0), replace(FULL, high_v=1.0)
+    zero_v = np.zeros(computer.program.amplifiers)
+    assert any(lamp is not None for lamp in repeated.play(loud, zero_v).lamps.values())
+    assert all(lamp is None for lamp in repeated.play(quiet, zero_v).lamps.values())
+
+
+def test_tweak_beyond_the_play_is_refused() -> None:
+    with pytest.raises(PotError, match="at sample 400"):
+        RepeatedPlay(fresh(preset("tl07x"), "front", 0), SAMPLES, [(SAMPLES, {"K_n_per_m": 18000.0})])
+
+
+def test_play_that_fails_does_not_spoil_the_next() -> None:
+    computer = fresh(preset("tl07x"), "front", 1)
+    repeated = RepeatedPlay(computer, SAMPLES)
+    offset_v = offsets_v(preset("tl07x"), computer, 1)
+    before = repeated.play(FULL, offset_v).volts
+    with pytest.raises(EngineError):
+        repeated.play(replace(FULL, high_v=1e308), offset_v * 1e300)
+    assert repeated.play(FULL, offset_v).volts.tobytes() == before.tobytes()
+
+
+def test_ramps_and_amplifiers_without_a_pole_are_not_repeatable() -> None:
+    computer = fresh(preset("tl07x"), "front", 0)
+    assert is_repeatable(computer, JUMPS)
+    assert not is_repeatable(computer, [(10, {"K_n_per_m": 18000.0}, 5)])
+    assert not is_repeatable(SuspensionComputer("front", opamp="ideal"), [])
+    with pytest.raises(CircuitError, match="without a pole"):
+        RepeatedPlay(SuspensionComputer("front", opamp="ideal"), SAMPLES)
+    assert PRESETS["ideal"] == OpAmpModel()
