@@ -94,17 +94,24 @@ class NoOnset:
 
 
 def onset(
-    record: Record, before: Plant, after: Plant | None, search: range, confidence: float = CONFIDENCE
+    record: Record,
+    before: Plant,
+    after: Plant | None,
+    search: range,
+    *,
+    within: range | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Onset | NoOnset:
     """The instant at which the plant jumped.
 
     :param before: as it was asked for; what it really is may be some per cent beside it.
     :param after: as it was asked for; None: nobody knows.
     :param search: the samples (indices of ``record``) one of which is the instant.
+    :param within: the samples in which the plant changes no other time; None: the whole record.
     :param confidence: with which the interval holds the instant.
-    :raises ValueError: the range is empty or leaves the record.
+    :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem = Problem.of(record, before, after, search)
+    problem = Problem.of(record, before, after, search, within)
     guess, profile = problem.solved(problem.fitted())
     if profile.unexplained > _TOO_NARROW and guess.edges != ANYWHERE:
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
@@ -215,14 +222,17 @@ class Problem:
     """(4,): standard deviations of the differences between ``new`` and ``old`` of a guess."""
 
     @classmethod
-    def of(cls, record: Record, before: Plant, after: Plant | None, search: range) -> Self:
+    def of(cls, record: Record, before: Plant, after: Plant | None, search: range, within: range | None) -> Self:
         if search.step != 1 or not 0 <= search.start < search.stop <= len(record):
             raise ValueError(f"{search} is empty or leaves the {len(record)} samples of the record")
-        first = max(search.start - WINDOW_N, 0)
+        alone = within or range(len(record))
+        if not alone.start <= search.start < search.stop <= alone.stop:
+            raise ValueError(f"{search} leaves {alone}, in which the plant changes no other time")
+        first = max(search.start - WINDOW_N, alone.start, 0)
         changed = before.changes_to(after or before)
         turned = [_UNKNOWN if after is None else _TURNED if name in changed else _LEFT_ALONE for name in PARAMETERS]
         return cls(
-            record.part(first, search.stop + WINDOW_N),
+            record.part(first, min(search.stop + WINDOW_N, alone.stop)),
             search,
             slice(search.start - first, search.stop - first),
             before,

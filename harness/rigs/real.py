@@ -133,6 +133,7 @@ class _OnInstrument:
     """Its pots; those that turn within a record are in the record's schedule."""
 
     exact = True
+    slow = False
 
     def __init__(self, instrument: Instrument, pots: Iterable[str]) -> None:
         """:raises RigError: it has not those pots."""
