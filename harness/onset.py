@@ -62,6 +62,9 @@ _LEAST_FIT_N = 30
 
 _MOST_LEFT = 1000.0
 """... and so where nothing changes."""
+_LEAST_NOISE, _LEAST_NOISE_FORCE = 8e-4, 2.5e-4
+"""Of the swing of displacement and force, rms: about that of 12 bits at full range. A finer card tells no more, since
+real components (dielectric absorption above all) are not one mass, damper and spring to better than that."""
 _RISING = 0.5
 """Twice the logarithm of the likelihood ratio of two neighbours, above which they are no part of a still stretch."""
 _LEAST_DOUBT = 2.0
@@ -74,8 +77,8 @@ _LAGS_N = 30
 _CHANCE = 2.0 * math.log(20.0)
 """By so much, in twice the logarithm of the likelihood, must a change explain the samples better than none; beyond
 what the best of so many instants does by chance."""
-_MOST_UNEXPLAINED = 4.0
-"""Variance of what is left of the samples, in that of the noise: with more they are not those of such a plant."""
+_MOST_UNEXPLAINED = 25.0
+"""Variance of what is left of the samples, in that of the noise: with more they are not those of such a plant ..."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +243,7 @@ class Problem:
         changed = before.changes_to(after or before)
         turned = [_UNKNOWN if after is None else _TURNED if name in changed else _LEFT_ALONE for name in PARAMETERS]
         return cls(
-            record.part(first, min(search.stop + WINDOW_N, alone.stop)),
+            _no_better(record.part(first, min(search.stop + WINDOW_N, alone.stop))),
             search,
             slice(search.start - first, search.stop - first),
             before,
@@ -364,6 +367,17 @@ class Problem:
             rows[_COMMON + i, [0, old]] = np.array([guess.old[i], 1.0]) / nominal[i]
             rows[_COMMON + _OWN + i, [0, old, new]] = np.array([guess.new[i] - guess.old[i], -1.0, 1.0]) / self.moves[i]
         return rows.T @ rows
+
+
+def _no_better(record: Record) -> Record:
+    """The same with at least the noise that stands for what one mass, damper and spring do not explain of a rig."""
+    if not record.valid.any():
+        return record
+    return dataclasses.replace(
+        record,
+        noise_n=max(record.noise_n, _LEAST_NOISE_FORCE * float(np.ptp(record.force_n[record.valid]))),
+        noise_m=max(record.noise_m, _LEAST_NOISE * float(np.ptp(record.displacement_m[record.valid]))),
+    )
 
 
 def colour(innovations: Sequence[Array]) -> float:

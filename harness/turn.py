@@ -83,7 +83,7 @@ def turn(
         return NoOnset(reason)
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
         return NoOnset(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
-    doubted = doubt(guess, unexplained)
+    doubted = doubt(guess, max(unexplained, float(best.on_the_way[at])))
     likely = [tried for tried in every if tried.cost.min() - best.cost[at] <= _LIKELY * doubted]
     shift = search.start - problem.candidates.start
     found = Turn(
@@ -103,6 +103,8 @@ class _Tried:
     """Twice the negative logarithm of the likelihood."""
     fit: Array
     """What is left of the samples."""
+    on_the_way: Array
+    """... of those between the two, of each on average."""
 
 
 def _zoomed(ways: _Ways, shape: Shape, candidates: slice, confidence: float) -> _Tried:
@@ -206,7 +208,7 @@ class _Ways:
         p, q, r = self.old.covariance[begin][:, [0, 0, 1], [0, 1, 1]].T
         x, v, p, q, r = (each.copy() for each in (x, v, p, q, r))
         fit, log = self.old.misfit[begin, 0, 0].copy(), self.old.log[begin].copy()
-        lengths = end - begin
+        lengths, own = end - begin, np.zeros(len(begin))
         for k in range(int(lengths.max())):
             on = slice(0, int((lengths > k).sum()))
             a, b, c, d, gx, gv, ex, ev, exx, exv, evv, offset = self._at(shape((k + 0.5) / lengths[on]))
@@ -225,7 +227,7 @@ class _Ways:
             weight = self.record.valid[at + 1]
             size = 1.0 + weight * p[on]
             innovation = self.record.displacement_m[at + 1] / self.record.noise_m - self.offset - x[on]
-            fit[on] += weight * innovation**2 / size
+            own[on] += weight * innovation**2 / size
             log[on] += np.log(size)
             gain, other = weight * p[on] / size, weight * q[on] / size
             x[on] += gain * innovation
@@ -234,8 +236,8 @@ class _Ways:
         state = np.stack([x, v], axis=1)[:, :, None]
         covariance = np.stack([p, q, q, r], axis=1).reshape(-1, 2, 2)
         form, met = joined(state, covariance, self.new.vector[end][:, :, :1], self.new.information[end])
-        fit = fit + form[:, 0, 0] + self.new.misfit[end, 0, 0]
-        return _Tried(begin, end, fit + log + met + self.new.log[end], fit)
+        fit = fit + own + form[:, 0, 0] + self.new.misfit[end, 0, 0]
+        return _Tried(begin, end, fit + log + met + self.new.log[end], fit, own / lengths)
 
     def _at(self, part: Array) -> Array:
         """(12, p): the columns of ``parts`` at these parts of the way."""

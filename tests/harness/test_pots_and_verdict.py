@@ -1,0 +1,141 @@
+"""From a command that turns pots at instants nobody knows to the verdict: a real process, an emulated computer."""
+
+from __future__ import annotations
+
+import dataclasses
+import stat
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator import COMPONENTS, Excitation, SuspensionComputer
+from harness import config
+from harness.bench import Bench
+from harness.dut import open_dut
+from harness.rigs.instrument import Recorded, Turn
+from harness.rigs.ni_daqmx import NiDaqmx
+from harness.rigs.real import RealDescription, RealRig
+from harness.run import Run
+from harness.scenario import Scenario
+from harness.scenario import Tweak as Asked
+from harness.verdict import judge
+
+SAMPLES, ASKED_AT = 20_000, 3000
+INSTANTS = (3215, 3311)
+"""After which samples the pots do what they are told within a record, the first and the second; the force is high then.
+They are searched however long the process takes, so that all comes out the same every time."""
+
+BLOCK_N = 16
+"""Pots of the computer turn between blocks of so many samples."""
+
+
+class CardAndComputer(NiDaqmx):
+    """A card of 16 bits at a computer of real components, whose pots go where the command says."""
+
+    def __init__(self, said: Path) -> None:
+        self.name = "card"
+        self._said = said
+        self._computer = SuspensionComputer(
+            "front", rng=np.random.default_rng(1), components=dataclasses.replace(COMPONENTS["polyester"], seed=1)
+        )
+        self._noise = np.random.default_rng(2)
+
+    def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
+        assert [word for _, word in ranges] == ["10V", "10V"]
+
+    def set_excitation(self, excitation: Excitation) -> None:
+        self._excitation = excitation
+
+    def record(
+        self, samples: int, turns: Sequence[Turn] = (), while_recording: Callable[[], None] | None = None
+    ) -> Recorded:
+        assert not turns and while_recording is not None
+        standing = len(self._heard())
+        while_recording()
+        self._computer.machine.turn(dict(self._heard()[:standing]))
+        due = dict(zip(INSTANTS, self._heard()[standing:], strict=False))
+        taken = []
+        for block in self._computer.play(self._excitation, samples, block_samples=BLOCK_N):
+            taken.append(block)
+            if (turned := due.get(len(taken) * BLOCK_N - 1)) is not None:
+                self._computer.machine.turn(dict([turned]))
+        volts = np.concatenate(taken)[:, :2]
+        lsb_v = 20.0 / (1 << self.bits)
+        codes = np.rint((volts + 10.0) / lsb_v + self._noise.normal(size=volts.shape))
+        return Recorded(codes * lsb_v - 10.0, np.zeros(volts.shape, bool))
+
+    def _heard(self) -> list[tuple[str, float]]:
+        """What the command was told, in order."""
+        lines = self._said.read_text().splitlines() if self._said.exists() else []
+        return [(pot, float(dial)) for pot, dial in map(str.split, lines)]
+
+    def rest(self, settle_s: float) -> None:
+        pass
+
+    def make_safe(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def described(program: Path) -> RealDescription:
+    table: dict[str, Any] = {
+        "kind": "real",
+        "instrument": "nidaqmx://Dev1",
+        "name": "bench",
+        "self_test": False,
+        "inputs": {
+            "force": {"input": 0, "range": "10V"},
+            "displacement": {"input": 1, "range": "10V"},
+        },
+        "pots": {"kind": "command", "arguments": [str(program), "{pot}", "{dial}"], "timeout_s": 60.0},
+    }
+    return config.build(RealDescription, table, "rigs.toml: rig.bench")
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """Turns a pot: says which, and to what."""
+    out = tmp_path / "set-pot"
+    out.write_text(f'#!/bin/sh\necho "$1 $2" >> {tmp_path / "said"}\n')
+    out.chmod(out.stat().st_mode | stat.S_IXUSR)
+    return out
+
+
+def played(program: Path, tweak: Asked) -> Run:
+    scenario = Scenario(
+        samples=SAMPLES, excitation=Excitation(low_v=0.1, high_v=9.9), tweaks=(tweak,), name="by command"
+    )
+    card = CardAndComputer(program.parent / "said")
+    with RealRig(described(program), connect=lambda *_: card) as rig, open_dut("inproc") as dut:
+        return Bench(rig, dut).play(scenario, seed=1)
+
+
+def test_instant_of_a_command_is_learned_and_the_device_is_judged_by_it(program: Path) -> None:
+    run = played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0))
+    (tweak,) = judge(run).tweaks
+    assert tweak.between[0] <= INSTANTS[0] <= tweak.between[1]
+    assert tweak.between[1] - tweak.between[0] < 60
+    assert tweak.result == "noticed"
+
+
+def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(program: Path) -> None:
+    run = played(program, Asked(ASKED_AT, damping_n_s_per_m=2123.0, stiffness_n_per_m=20000.0))
+    (_, segment) = run.conditions.segments
+    assert not segment.unseen, segment.unseen
+    earliest, latest = segment.earliest(), segment.latest()
+    assert earliest.start <= INSTANTS[0] <= latest.start
+    assert earliest.start + earliest.ramp_n <= INSTANTS[1] <= latest.start + latest.ramp_n
+    assert judge(run).tweaks[0].result == "noticed"
+
+
+def test_command_that_turns_nothing_leaves_a_change_that_is_not_judged(program: Path) -> None:
+    program.write_text("#!/bin/sh\nexit 0\n")
+    verdict = judge(played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0)))
+    assert verdict.tweaks[0].result == "not judged"
+    assert verdict.outcome != "passed"
+    assert "shows that the plant has changed" in verdict.reasons[-1]
