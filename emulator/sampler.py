@@ -191,16 +191,19 @@ class Sampler:
         self._held_v: NDArray[np.float64] | None = None
         self._levels = card.levels()
 
-    def sample(self, volts: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    def sample(
+        self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts (n, channels) to codes, uint16 (n, channels), and whether each was clipped, bool (n, channels).
 
         Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. Clipped says that what the
         converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
+        normals: the standard normal numbers of which the noise is made, (n, channels), instead of the rng's own.
         Raises SamplerError for a voltage that is not finite, or another shape.
         """
-        return self.converted(self.seen_lsb(volts))
+        return self.converted(self.seen_lsb(volts, normals))
 
-    def seen_lsb(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def seen_lsb(self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
 
         Raises SamplerError for a voltage that is not finite, or another shape.
@@ -213,8 +216,7 @@ class Sampler:
             raise SamplerError(
                 f"sample {sample} of the block, channel {channel}: the voltage must be finite, got {volt}"
             )
-        noise = self._rng.standard_normal(volts.shape)
-        noise *= self._noise_lsb
+        noise = (self._rng.standard_normal(volts.shape) if normals is None else normals) * self._noise_lsb
         noise += self._offset_lsb
         seen = self._acquired(volts) * self._gain
         seen -= self._droop_v

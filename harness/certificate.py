@@ -1,7 +1,8 @@
 """Whether a device raises false alarms rarely enough: the one question that every owner asks, with its error stated.
 
 A plant that does not change is played in runs of one length, with seeds in order. What counts as a trial is a sample
-that the estimator took in once it was warm; every alarm is a false one.
+that the estimator took in once it was warm; every alarm is a false one. Rates for which that would take too long are
+estimated by branches with louder noise instead (harness.rare), so many times over, each time off a play of its own.
 """
 
 from __future__ import annotations
@@ -20,8 +21,19 @@ from harness.campaign.spec import Case, device_of, open_table
 from harness.campaign.trial import Count, close_devices, count_alarms
 from harness.campaign.workers import Workers
 from harness.errors import ConfigurationError
+from harness.rare import Estimate, false_alarm_rate
+from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
-from harness.statistics import ConfidenceSequence, Decision, Design, SequentialTest, lower_rate, upper_rate
+from harness.statistics import (
+    LEAST_FOR_MEAN,
+    ConfidenceSequence,
+    Decision,
+    Design,
+    SequentialTest,
+    lower_rate,
+    mean_bounds,
+    upper_rate,
+)
 from harness.trials import are_possible
 
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
@@ -30,11 +42,16 @@ IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
 WORTH_A_WORKER_N = 3_000_000
 """Samples that a process plays in about the time that another takes to start."""
 
+WORTH_A_WORKER_ESTIMATES = 16
+"""As many of a rare rate."""
+
 APART = 10.0
 """The sequential test certifies quickest where the true rate is so many times below the limit."""
 
 MOST_LONGER = 3.0
 """A sequential test gives up after so many times the length of a fixed one."""
+
+MOST_ESTIMATES = 10_000
 
 Outcome = Literal["certified", "refuted", "inconclusive"]
 
@@ -53,6 +70,8 @@ class Question:
     allowed: int = 5
     """For a fixed length: with more alarms it is not certified."""
     sequential: bool = False
+    rare: int = 0
+    """So many estimates of a rare rate; 0: alarms are waited for."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.far * APART < 1.0:
@@ -61,12 +80,18 @@ class Question:
             raise ValueError(f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}")
         if not 0 <= self.allowed <= 1000:
             raise ValueError(f"allowed must be 0 to 1000, not {self.allowed}")
+        if self.rare and not LEAST_FOR_MEAN <= self.rare <= MOST_ESTIMATES:
+            raise ValueError(f"rare must be {LEAST_FOR_MEAN} to {MOST_ESTIMATES} estimates, not {self.rare}")
+        if self.rare and self.sequential:
+            raise ValueError("a rare rate is estimated, or alarms are waited for by a sequential test")
         if self.scenario.get("tweaks"):
             raise ValueError("the scenario changes the plant, and this is about alarms while nothing changes")
 
     @property
     def useful_workers(self) -> int:
         """More would take longer to start than to play."""
+        if self.rare:
+            return max(1, self.rare // WORTH_A_WORKER_ESTIMATES)
         return max(1, self.design_n // WORTH_A_WORKER_N) if self.is_in_process else self.design_n
 
     @functools.cached_property
@@ -88,10 +113,12 @@ class Certificate:
     outcome: Outcome
     reason: str
     alarms: int
+    """For a rare rate, branches that came to one."""
     samples: int
-    """That counted."""
+    """That counted; for a rare rate, that were played."""
     rate: tuple[float, float]
-    """One-sided exact bounds, for a fixed length; (0, 1) for a sequential test, whose outcome is all it says."""
+    """One-sided bounds: exact for a fixed length, of a mean for a rare rate; (0, 1) for a sequential test, which says
+    no more than its outcome."""
 
 
 def certify(
@@ -104,6 +131,8 @@ def certify(
     :raises ConfigurationError: the scenario cannot be played, or the device refuses its configuration.
     :raises WorkerError, LinkError, DeviceError, RigError: they cannot be had or kept.
     """
+    if question.rare:
+        return _of_rare_alarms(question, workers)
     most = math.ceil(question.design_n * (MOST_LONGER if question.sequential else 1.0))
     run_n = _run_n(question, most)
     text = json.dumps(dataclasses.asdict(question), sort_keys=True)
@@ -136,6 +165,40 @@ def count_run(question: str, run_n: int, seed: int) -> Count:
     return count_alarms(Case(asked.rig, asked.device, scenario, seed))
 
 
+def _of_rare_alarms(question: Question, workers: Workers) -> Certificate:
+    if not question.is_in_process:
+        name = question.device["name"]
+        raise ConfigurationError(f"certify: a rare rate is estimated within this process (inproc), not in {name}")
+    text = json.dumps(dataclasses.asdict(question), sort_keys=True)
+    seeds = range(question.first_seed, question.first_seed + question.rare)
+    found = dict(workers.play(functools.partial(estimate_once, text), iter(seeds)))
+    estimates = [Estimate(*found[seed]) for seed in seeds]
+    alarms, samples = sum(each.alarms for each in estimates), sum(each.samples for each in estimates)
+    fruitless = sum(not each.alarms for each in estimates)
+    if fruitless:
+        said = f"in {fruitless} of {len(estimates)} estimates no branch came to an alarm"
+        return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
+    rates = [each.rate for each in estimates]
+    low, high = mean_bounds(rates, question.confidence)
+    said = f"the rate is {math.fsum(rates) / len(rates):.3g}, {low:.3g} to {high:.3g}, from {len(rates)} estimates"
+    return Certificate(_outcome(question.far, low, high), f"{said}, {samples} samples", alarms, samples, (low, high))
+
+
+def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
+    """One estimate of a rare rate, as plain numbers."""
+    asked = config.build(Question, json.loads(question), "the question")
+    with open_table(asked.rig) as rig:
+        if not isinstance(rig, EmulatorRig):
+            raise ConfigurationError("certify: a rare rate is estimated on an emulated rig")
+        scenario = Scenario.from_table(asked.scenario, "the scenario")
+        rate, alarms, samples = false_alarm_rate(rig, device_of(asked.device), scenario, seed)
+        return rate, alarms, samples
+
+
+def _outcome(far: float, low: float, high: float) -> Outcome:
+    return "certified" if high <= far else "refuted" if low > far else "inconclusive"
+
+
 def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
     """The counts by seed, whichever is there first."""
     early: dict[int, Count] = {}
@@ -165,8 +228,7 @@ def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
     low = lower_rate(alarms, samples, question.confidence)
     high = upper_rate(alarms, samples, question.confidence)
     said = f"{alarms} alarms in {samples} samples: the rate is {low:.3g} to {high:.3g}"
-    outcome: Outcome = "certified" if high <= question.far else "refuted" if low > question.far else "inconclusive"
-    return Certificate(outcome, said, alarms, samples, (low, high))
+    return Certificate(_outcome(question.far, low, high), said, alarms, samples, (low, high))
 
 
 def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:

@@ -61,6 +61,7 @@ def _loaded(library: Path) -> ctypes.CDLL:
     except OSError as error:
         raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
     c.library_size.restype = c.library_run.restype = ctypes.c_size_t
+    c.library_run.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *(ctypes.c_void_p,) * 3, ctypes.POINTER(_Out)]
     c.library_start.restype = ctypes.c_bool
     c.library_theta_count.restype = ctypes.c_uint8
     c.library_counters.restype = _Counters
@@ -124,6 +125,33 @@ class Estimator:
         out = _Out(alarm=alarm.ctypes.data)
         return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
 
+    def save(self) -> NDArray[np.uint8]:
+        """All that it knows after the last sample, for ``branch`` of this very estimator."""
+        return np.frombuffer(bytes(self._state), np.uint8).copy()
+
+    def branch(
+        self, saved: NDArray[np.uint8], u: ArrayLike, y: ArrayLike, valid: ArrayLike
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8]]:
+        """Goes on from several saved states, each with samples of its own.
+
+        :param saved: (b, size), rows of ``save``.
+        :param u: (b, n); y and valid likewise, as of ``run``.
+
+        :return: statistic and alarm, (b, n), and the states afterwards, (b, size).
+        """
+        u, y = (np.ascontiguousarray(x, dtype=np.float32) for x in (u, y))
+        mask, after = np.ascontiguousarray(valid, dtype=np.uint8), np.array(saved, order="C")
+        statistic, alarm = np.empty(u.shape, np.float32), np.empty(u.shape, np.bool_)
+        state, size, n = ctypes.addressof(self._state), len(self._state), u.shape[1]
+        rows = [(x.ctypes.data, x.strides[0]) for x in (after, u, y, mask, statistic, alarm)]
+        for i in range(len(after)):
+            kept, u_i, y_i, mask_i, statistic_i, alarm_i = (start + i * stride for start, stride in rows)
+            ctypes.memmove(state, kept, size)
+            out = _Out(statistic=statistic_i, alarm=alarm_i)
+            self._c.library_run(state, n, u_i, y_i, mask_i, ctypes.byref(out))
+            ctypes.memmove(kept, state, size)
+        return statistic, alarm, after
+
     def _enter(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None, out: _Out) -> int:
         inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
         mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
@@ -133,9 +161,9 @@ class Estimator:
         return int(
             self._c.library_run(
                 self._state,
-                ctypes.c_size_t(len(inputs[0])),
-                *(ctypes.c_void_p(x.ctypes.data) for x in inputs),
-                ctypes.c_void_p(None if mask is None else mask.ctypes.data),
+                len(inputs[0]),
+                *(x.ctypes.data for x in inputs),
+                None if mask is None else mask.ctypes.data,
                 ctypes.byref(out),
             )
         )

@@ -53,8 +53,8 @@ _HELD = 1e-3
 """Standard deviation of what other samples have told."""
 
 _ROUNDS = 8
-_SETTLED = 1e-3
-"""A logarithm of M, B or K that moves less is at its best value."""
+_SETTLED = 5e-3
+"""A logarithm of M, B or K that moves less does so linearly: what is left out is 0.02 of the noise."""
 _LONGEST_MOVE = 0.3
 """Of such a logarithm in one round."""
 _LEAST_FIT_N = 30
@@ -94,17 +94,24 @@ class NoOnset:
 
 
 def onset(
-    record: Record, before: Plant, after: Plant | None, search: range, confidence: float = CONFIDENCE
+    record: Record,
+    before: Plant,
+    after: Plant | None,
+    search: range,
+    *,
+    within: range | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Onset | NoOnset:
     """The instant at which the plant jumped.
 
     :param before: as it was asked for; what it really is may be some per cent beside it.
     :param after: as it was asked for; None: nobody knows.
     :param search: the samples (indices of ``record``) one of which is the instant.
+    :param within: the samples in which the plant changes no other time; None: the whole record.
     :param confidence: with which the interval holds the instant.
-    :raises ValueError: the range is empty or leaves the record.
+    :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem = Problem.of(record, before, after, search)
+    problem = Problem.of(record, before, after, search, within)
     guess, profile = problem.solved(problem.fitted())
     if profile.unexplained > _TOO_NARROW and guess.edges != ANYWHERE:
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
@@ -215,14 +222,17 @@ class Problem:
     """(4,): standard deviations of the differences between ``new`` and ``old`` of a guess."""
 
     @classmethod
-    def of(cls, record: Record, before: Plant, after: Plant | None, search: range) -> Self:
+    def of(cls, record: Record, before: Plant, after: Plant | None, search: range, within: range | None) -> Self:
         if search.step != 1 or not 0 <= search.start < search.stop <= len(record):
             raise ValueError(f"{search} is empty or leaves the {len(record)} samples of the record")
-        first = max(search.start - WINDOW_N, 0)
+        alone = within or range(len(record))
+        if not alone.start <= search.start < search.stop <= alone.stop:
+            raise ValueError(f"{search} leaves {alone}, in which the plant changes no other time")
+        first = max(search.start - WINDOW_N, alone.start, 0)
         changed = before.changes_to(after or before)
         turned = [_UNKNOWN if after is None else _TURNED if name in changed else _LEFT_ALONE for name in PARAMETERS]
         return cls(
-            record.part(first, search.stop + WINDOW_N),
+            record.part(first, min(search.stop + WINDOW_N, alone.stop)),
             search,
             slice(search.start - first, search.stop - first),
             before,
@@ -286,10 +296,9 @@ class Problem:
 
     def solved(self, guess: Guess) -> tuple[Guess, Profile]:
         """All instants with the best values of what is not known, from those near it."""
-        profile = self.profile(guess)
         for _ in range(_ROUNDS):
-            last, guess = guess, guess.moved(profile.move)
             profile = self.profile(guess)
+            last, guess = guess, guess.moved(profile.move)
             if guess.near(last):
                 break
         return guess, profile
@@ -302,7 +311,7 @@ class Problem:
                 " their noise"
             )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        _, none, _ = _settled(self.record, self.before, guess, known)
+        _, none, _ = _settled(self.record, self.before, guess, known, rounds=1)
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if none - cost < chance * doubt(guess, unexplained):
             return f"nothing in the samples {self._searched} shows that the plant has changed"
@@ -345,7 +354,9 @@ def colour(innovations: Sequence[Array]) -> float:
     return max(1.0, variance)
 
 
-def _settled(record: Record, plant: Plant, guess: Guess, known: Array) -> tuple[Guess, float, Array]:
+def _settled(
+    record: Record, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS
+) -> tuple[Guess, float, Array]:
     """The guess with its offset, place and ``old`` moved to what these samples of one plant say, twice the negative
     logarithm of their likelihood, and the innovations.
 
@@ -353,7 +364,7 @@ def _settled(record: Record, plant: Plant, guess: Guess, known: Array) -> tuple[
     """
     cost, innovation = 0.0, np.zeros(0)
     first = guess
-    for _ in range(_ROUNDS if len(record) >= _LEAST_FIT_N else 0):
+    for _ in range(rounds if len(record) >= _LEAST_FIT_N else 0):
         model = Model.of(beside(plant, guess.old), guess.edges, record)
         transitions = np.broadcast_to(model.transition, (len(record), 2, 2))
         course = _course(transitions, model.inputs(record, guess.old[0]))

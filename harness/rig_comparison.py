@@ -19,7 +19,7 @@ from harness.campaign.comparison import Comparison, compare
 from harness.campaign.trial import Row, row
 from harness.run import CHANNELS, Run
 from harness.scenario import Scenario
-from harness.statistics import mean_interval, rate_interval
+from harness.statistics import mean_interval, rate_interval, upper_rate
 from harness.verdict import judge
 
 COMPARED = ("force", "displacement")
@@ -69,13 +69,15 @@ class LatencyDifference:
     most_n: float
     """Bounds of the mean."""
     seeds: int
+    changes: int
+    """Noticed on both, in all plays."""
+    unequal: int
+    """So many of them with another latency."""
+    within_n: float
+    """Bound of the mean's size: the larger of both bounds, and of what as many latencies would allow that differ by one
+    sample now and then, since a few that are all equal vary by nothing."""
     quantiles_n: tuple[tuple[float, ...], tuple[float, ...]]
     """Of all latencies on the first and on the second rig: median, 95 %, largest."""
-
-    @property
-    def within_n(self) -> float:
-        """The larger bound, without its sign."""
-        return max(abs(self.least_n), abs(self.most_n))
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def _compared(pairs: Sequence[_Pair], invalid: tuple[str, ...], scenario: str, c
 
 
 def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence: float) -> SignalDifference:
-    """Of one channel, in all plays, two at least; clipped samples and those at edges of the force are left out."""
+    """Of one channel in two plays or more; clipped samples, and those at edges of the force, are left out."""
     differences, compared, apart = zip(*(_difference(a, b, channel) for a, b in runs), strict=True)
     noise = math.sqrt(float(np.mean([_noise_variance(each) for each in differences])))
     squares = np.array([np.mean(np.square(each[use])) for each, use in zip(differences, compared, strict=True)])
@@ -270,9 +272,16 @@ def _latency(a: Sequence[Row], b: Sequence[Row], confidence: float) -> LatencyDi
         return None
     latencies = np.array([pair for changes in both for pair in changes], dtype=np.float64)
     quantiles = np.quantile(latencies, (0.5, 0.95, 1.0), axis=0).T
+    unequal = int((latencies[:, 0] != latencies[:, 1]).sum())
+    mean, least, most = mean_interval(by_seed, confidence)
     return LatencyDifference(
-        *mean_interval(by_seed, confidence),
+        mean_n=mean,
+        least_n=least,
+        most_n=most,
         seeds=len(by_seed),
+        changes=len(latencies),
+        unequal=unequal,
+        within_n=max(abs(least), abs(most), upper_rate(unequal, len(latencies), confidence)),
         quantiles_n=(tuple(map(float, quantiles[0])), tuple(map(float, quantiles[1]))),
     )
 

@@ -170,6 +170,8 @@ class Conditions:
     """First samples of the gap-free records, each of which the device began afresh and from rest."""
     line_s: float = 0.0
     """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
+    line: Mapping[str, int] = field(default_factory=dict)
+    """How the samples went (``Dut.line``); empty if that is not recorded."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -327,6 +329,7 @@ class Run:
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
             "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
+            "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
             "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),

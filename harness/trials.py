@@ -68,7 +68,7 @@ class Trials:
         """
         self._estimator.restart()
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
-        found = [block.first + self._estimator.alarms(*_entered(block)) for block in performance.blocks]
+        found = [block.first + self._estimator.alarms(*entered(block)) for block in performance.blocks]
         return np.concatenate(found)
 
     @property
@@ -84,7 +84,7 @@ class Trials:
         parts: list[Steps] = []
         for block in performance.blocks:
             blocks.append(block)
-            parts.append(self._estimator.run(*_entered(block)))
+            parts.append(self._estimator.run(*entered(block)))
         return self._run(scenario, seed, performance, blocks, parts)
 
     def _run(
@@ -128,5 +128,6 @@ class Trials:
         )
 
 
-def _entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
     return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)

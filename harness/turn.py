@@ -2,7 +2,8 @@
 
 As ``harness.onset``, but that between the two instants the plant is on its way. How a hand goes nobody knows: it may
 turn evenly, or begin and end gently (least jerk; Flash and Hogan 1985). Both are tried, and the intervals are those of
-whatever the samples do not refuse. The plants at both ends are those that the samples before and after the range tell.
+whatever the samples do not refuse. Two pots that jump one after the other are such a turn too, with a plant between
+them that is known. The plants at both ends are those that the samples before and after the range tell.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.onset import CONFIDENCE, Guess, NoOnset, Onset, Problem, beside, doubt, interval
-from harness.plant import Plant
-from harness.two_filter import Array, Backwards, Forwards, Model, Record, joined
+from harness.plant import PARAMETERS, Plant
+from harness.two_filter import Array, Backwards, Edges, Forwards, Model, Record, joined
 
 Indices = NDArray[np.int64]
 
@@ -28,7 +29,8 @@ _ZOOMS = 12
 _LIKELY = 12.0
 """Twice the logarithm of the likelihood ratio to the best, up to which a pair of instants is looked at more closely."""
 _BESIDE = 0.03
-"""Of the time of a turn: its instants may lie so far beside, since the way is not quite one of the shapes."""
+"""Of the time of a turn: its instants may lie so far beside, since the way is not quite one of the shapes; the pots'
+load alone makes it 2 %."""
 _FINE_N = 8
 """Instants within an interval that show its ends well enough."""
 
@@ -40,9 +42,9 @@ class Turn:
     begin: Onset
     end: Onset
 
-    def wider(self, search: range) -> Turn:
-        """By what the pots' load shifts a plant beside the even way between two dials, within the range."""
-        more = round(_BESIDE * (self.end.sample - self.begin.sample))
+    def wider(self, search: range, part: float) -> Turn:
+        """By a part of the time that it takes, within the range."""
+        more = round(part * (self.end.sample - self.begin.sample))
         begin, end = (
             Onset(each.sample, max(each.low - more, search.start), min(each.high + more, search.stop - 1))
             for each in (self.begin, self.end)
@@ -55,22 +57,33 @@ Shape = Callable[[Array], Array]
 
 
 def turn(
-    record: Record, before: Plant, after: Plant | None, search: range, confidence: float = CONFIDENCE
+    record: Record,
+    before: Plant,
+    after: Plant | None,
+    search: range,
+    *,
+    middle: Plant | None = None,
+    within: range | None = None,
+    confidence: float = CONFIDENCE,
 ) -> Turn | NoOnset:
-    """When a pot began to turn and when it stood, both in ``search``; arguments as of ``harness.onset.onset``.
+    """When a pot began to turn and when it stood, both in ``search``; other arguments as of ``harness.onset.onset``.
 
-    :raises ValueError: the range is empty or leaves the record.
+    :param middle: two pots jumped, one after the other, and between the two the plant was this one.
+    :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem = Problem.of(record, before, after, search)
+    problem = Problem.of(record, before, after, search, within)
     guess = problem.fitted()
-    ways = _Ways.of(problem, guess)
-    every = [_zoomed(ways, shape, problem.candidates, confidence) for shape in (_evenly, _gently)]
+    ways = _Ways.of(problem, guess) if middle is None else _Ways.stopping(problem, guess, middle)
+    shapes = (_evenly, _gently) if middle is None else (_evenly,)
+    every = [_zoomed(ways, shape, problem.candidates, confidence) for shape in shapes]
     every.sort(key=lambda tried: float(tried.cost.min()))
     best = every[0]
     at = int(best.cost.argmin())
     unexplained = float(best.fit[at]) / max(1, int(problem.record.valid.sum()))
     if reason := problem.objection(float(best.cost[at]), unexplained, guess):
         return NoOnset(reason)
+    if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
+        return NoOnset(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
     doubted = doubt(guess, unexplained)
     likely = [tried for tried in every if tried.cost.min() - best.cost[at] <= _LIKELY * doubted]
     shift = search.start - problem.candidates.start
@@ -78,9 +91,7 @@ def turn(
         _over([_instant(tried.begin, tried.cost / doubted, confidence) for tried in likely], shift),
         _over([_instant(tried.end, tried.cost / doubted, confidence) for tried in likely], shift),
     )
-    if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
-        return NoOnset(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
-    return found.wider(search)
+    return found.wider(search, _BESIDE if middle is None else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,15 +179,23 @@ class _Ways:
 
     @classmethod
     def of(cls, problem: Problem, guess: Guess) -> Self:
-        old, new = problem.filters(guess)
-        plants = beside(problem.before, guess.old), beside(problem.after, guess.new)
-        rows = []
-        for part in np.linspace(0.0, 1.0, _PARTS).tolist():
-            model = Model.of(plants[0].on_the_way(plants[1], part), guess.edges, problem.record)
-            offset = guess.old[0] + part * (guess.new[0] - guess.old[0])
-            covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
-            rows.append(np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]]))
-        return cls(problem.record, old, new, guess.offset, np.array(rows))
+        old, new = beside(problem.before, guess.old), beside(problem.after, guess.new)
+        parts = np.linspace(0.0, 1.0, _PARTS).tolist()
+        offsets = np.linspace(guess.old[0], guess.new[0], _PARTS).tolist()
+        rows = [
+            _row(problem.record, old.on_the_way(new, part), guess.edges, offset)
+            for part, offset in zip(parts, offsets, strict=True)
+        ]
+        return cls(problem.record, *problem.filters(guess), guess.offset, np.array(rows))
+
+    @classmethod
+    def stopping(cls, problem: Problem, guess: Guess, middle: Plant) -> Self:
+        """All the way the plant is one that has of each parameter the old or the new value."""
+        turned = problem.before.changes_to(middle)
+        own = [guess.new[1 + i] if name in turned else guess.old[1 + i] for i, name in enumerate(PARAMETERS)]
+        offset = 0.5 * float(guess.old[0] + guess.new[0])
+        row = _row(problem.record, beside(middle, np.array([offset, *own])), guess.edges, offset)
+        return cls(problem.record, *problem.filters(guess), guess.offset, np.tile(row, (_PARTS, 1)))
 
     def tried(self, begins: Indices, ends: Indices, shape: Shape) -> _Tried:
         """Every pair in which the end is after the begin; those that take longest first."""
@@ -225,6 +244,13 @@ class _Ways:
         lower = np.minimum(place.astype(np.int64), _PARTS - 2)
         beyond = (place - lower)[:, None]
         return np.asarray((self.parts[lower] * (1.0 - beyond) + self.parts[lower + 1] * beyond).T)
+
+
+def _row(record: Record, plant: Plant, edges: Edges, offset: float) -> Array:
+    """(12,) of ``_Ways.parts``."""
+    model = Model.of(plant, edges, record)
+    covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
+    return np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]])
 
 
 def _evenly(part: Array) -> Array:

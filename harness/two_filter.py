@@ -29,7 +29,7 @@ COMMON, OWN = 2, 4
 
 _EDGE = 30.0
 """A step of the force is an edge, in rms of its noise."""
-_DIFFUSE = 1e8
+_DIFFUSE = 1e6
 """Variance of the state at the first sample, in that of the noise."""
 _VANISHED = 1e-14
 _STEP = 1e-4

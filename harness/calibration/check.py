@@ -28,7 +28,9 @@ def seen_lsb(description: EmulatorDescription, scenario: Scenario, seed: int) ->
 
 
 def difference_lsb(recording: Recording, twin: EmulatorDescription, noise_lsb: float) -> float:
-    """Of the displacement between rig and twin, LSB rms, noise and rounding taken out.
+    """Within how many LSB rms the displacements of rig and twin are: two standard errors above what is found.
+
+    The averages of the recording are compared; what noise and rounding make of the squares is taken out.
 
     :param noise_lsb: of the rig's displacement.
     :raises ConfigurationError, RigError: as ``seen_lsb``.
@@ -36,4 +38,5 @@ def difference_lsb(recording: Recording, twin: EmulatorDescription, noise_lsb: f
     average = averaged(recording, DISPLACEMENT, noise_lsb)
     there = periods(recording, seen_lsb(twin, recording.scenario, 0)[:, DISPLACEMENT]).mean(axis=0)
     mean_square = float(np.mean((average.means - there[average.phases]) ** 2))
-    return math.sqrt(max(0.0, mean_square - average.variance))
+    uncertain = average.variance * math.sqrt(2.0 / len(average.means))
+    return math.sqrt(max(0.0, mean_square - average.variance) + 2.0 * uncertain)

@@ -66,7 +66,7 @@ class Calibration:
     residual_lsb: float
     """rms between the averages of the recordings and of the twin."""
     chi_squares: Mapping[tuple[Stock, Pots], float]
-    """Of the kinds of machine that were tried."""
+    """Of the kinds of machine that can be fitted at all, of those that were tried."""
     freedom: int
     """Its expectation."""
 
@@ -110,13 +110,8 @@ def calibrate(
     :raises ConfigurationError: half a period is no whole number of samples.
     """
     noise_lsb, noise_error = noise_of(recordings, DISPLACEMENT)
-    fits: dict[tuple[Stock, Pots], _Fit] = {}
-    for set_by in pots:
-        start: Vector | None = None
-        for stock in stocks:
-            machine = ComputerDescription(op_amp=op_amp, components=stock, pots=set_by)
-            fits[stock, set_by] = _fitted(Model(recordings, machine, noise_lsb), start)
-            start = fits[stock, set_by].x
+    kinds = [[ComputerDescription(op_amp=op_amp, components=stock, pots=set_by) for stock in stocks] for set_by in pots]
+    fits = _fits([[Model(recordings, machine, noise_lsb) for machine in alike] for alike in kinds])
     best = _likeliest(fits)
     noise = Estimate("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
     estimates = (*best.estimates(), noise, *_force_channel(recordings))
@@ -129,6 +124,27 @@ def calibrate(
         {kind: fit.chi_square for kind, fit in fits.items()},
         best.freedom,
     )
+
+
+def _fits(models: Sequence[Sequence[Model]]) -> dict[tuple[Stock, Pots], _Fit]:
+    """Of every kind that can be fitted at all; those that have the same unknowns are in one row.
+
+    :raises RigError: none can; that of the first.
+    """
+    fits: dict[tuple[Stock, Pots], _Fit] = {}
+    problems: list[RigError] = []
+    for alike in models:
+        start: Vector | None = None
+        for model in alike:
+            try:
+                fit = _fitted(model, start)
+            except RigError as error:
+                problems.append(error)
+            else:
+                fits[model.nominal.components, model.nominal.pots], start = fit, fit.x
+    if not fits:
+        raise problems[0]
+    return fits
 
 
 def _likeliest(fits: Mapping[tuple[Stock, Pots], _Fit]) -> _Fit:
@@ -225,11 +241,17 @@ def _inverse(normal: Vector) -> Vector:
 
     :raises RigError: there is none.
     """
-    scale = 1.0 / np.sqrt(np.diag(normal))
+    own, untold = np.diag(normal), "the recordings do not tell what is to be fitted: are there enough, and of a signal?"
+    if not (own > 0.0).all():
+        raise RigError(untold)
+    units = np.sqrt(np.outer(own, own))
     try:
-        return np.asarray(np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale))
+        inverse = np.linalg.inv(normal / units) / units
     except np.linalg.LinAlgError as error:
-        raise RigError("the recordings do not tell what is to be fitted: do they hold a signal?") from error
+        raise RigError(untold) from error
+    if not (np.diag(inverse) > 0.0).all():
+        raise RigError(untold)
+    return np.asarray(inverse)
 
 
 # ---- the card

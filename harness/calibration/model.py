@@ -133,7 +133,7 @@ class Model:
     def __init__(self, recordings: Sequence[Recording], computer: ComputerDescription, noise_lsb: float) -> None:
         self.recordings = recordings
         self.unknowns = _unknowns(computer)
-        self._nominal = computer
+        self.nominal = computer
         self._averages = [averaged(recording, DISPLACEMENT, noise_lsb) for recording in recordings]
         self._settings = tuple(dict.fromkeys(setting for each in recordings for setting in self._settings_of(each)))
         self.known_to = np.array([each.known_to for each in self.unknowns] + [each.known_to for each in self._settings])
@@ -190,7 +190,7 @@ class Model:
         for gain, factor in (missed or {}).items():
             tables["deviation"][gain] = (1.0 + tables["deviation"][gain]) * factor - 1.0
         try:
-            return dataclasses.replace(self._nominal, values=MeasuredValues(**tables))
+            return dataclasses.replace(self.nominal, values=MeasuredValues(**tables))
         except ValueError as error:
             raise RigError(f"the emulator does not become like the recordings: {error}") from error
 

@@ -16,6 +16,9 @@ from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
 if TYPE_CHECKING:
     from harness.certificate import Certificate, Question
 
+_ESTIMATES = 64
+"""Of a rare rate, when nobody says how many."""
+
 _STATUS = {"certified": PASSED, "refuted": FAILED, "inconclusive": INCONCLUSIVE}
 
 
@@ -29,6 +32,15 @@ def add(commands: Any) -> None:
         "--allowed", type=int, default=5, metavar="N", help="alarms that a test of fixed length forgives (%(default)d)"
     )
     command.add_argument("--sequential", action="store_true", help="stop as soon as the answer is certain")
+    command.add_argument(
+        "--rare",
+        type=int,
+        nargs="?",
+        const=_ESTIMATES,
+        default=0,
+        metavar="N",
+        help=f"for rates too rare to be waited for: N estimates from branches with louder noise ({_ESTIMATES})",
+    )
     command.add_argument("--scenario", default="healthy", metavar="NAME", help="one without changes (%(default)s)")
     command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", "emulator"), metavar="NAME", help="the rig")
     command.add_argument("--dut", default=os.environ.get("ANALOGRIG_DUT", "host"), metavar="NAME", help="the device")
@@ -53,6 +65,7 @@ def _run(arguments: argparse.Namespace) -> int:
         confidence=arguments.confidence,
         allowed=arguments.allowed,
         sequential=arguments.sequential,
+        rare=arguments.rare,
         first_seed=arguments.seed,
     )
     try:
@@ -66,6 +79,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sentence(question: Question, answer: Certificate) -> str:
     way = "sequential test" if question.sequential else f"fixed length, at most {question.allowed} alarms allowed"
+    way = "a rare rate" if question.rare else way
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
         f" confidence {question.confidence:g} ({way}): {answer.outcome.upper()}\n  {answer.reason}"
@@ -73,7 +87,9 @@ def _sentence(question: Question, answer: Certificate) -> str:
 
 
 def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
-    asked = {name: getattr(question, name) for name in ("far", "confidence", "allowed", "sequential", "first_seed")}
+    asked = {
+        name: getattr(question, name) for name in ("far", "confidence", "allowed", "sequential", "rare", "first_seed")
+    }
     names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario["name"]}
     return {**names, **asked, **vars(answer)}
 

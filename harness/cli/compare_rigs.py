@@ -100,8 +100,9 @@ def _latency_lines(found: RigComparison) -> list[str]:
         return ["  no change was noticed on both"]
     bounds = f"{late.least_n:+.3f} to {late.most_n:+.3f}"
     a, b = ("/".join(f"{n:.3g}" for n in quantiles) for quantiles in late.quantiles_n)
+    unequal = f"{late.unequal} of {late.changes} changes differ"
     return [
         "",
-        f"  latency, B less A: {late.mean_n:+.3f} samples ({bounds}), {late.seeds} seeds",
+        f"  latency, B less A: {late.mean_n:+.3f} samples ({bounds}), {late.seeds} seeds; {unequal}",
         f"  latency, median/95 %/largest: {a} on A, {b} on B",
     ]

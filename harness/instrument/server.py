@@ -81,8 +81,10 @@ class Server:
     async def listen(self, host: str, port: int) -> tuple[str, int]:
         """Begin to listen; returns where. Port 0: any that is free.
 
-        :raises ConfigurationError: there one cannot listen.
+        :raises ConfigurationError: there one cannot listen; nowhere is not everywhere.
         """
+        if not host:
+            raise ConfigurationError("cannot listen: the host is empty; say 0.0.0.0 for every network of this machine")
         try:
             self._server = await asyncio.start_server(self._accept, host, port, limit=MOST_LINE_BYTES)
         except OSError as error:

@@ -11,6 +11,7 @@ from harness.onset import NoOnset, onset
 from harness.plant import Plant
 from harness.rigs.pots import Pots
 from harness.run import Segment
+from harness.turn import Turn, turn
 from harness.two_filter import Record
 
 BEFORE_S, AFTER_S = 0.02, 0.05
@@ -35,6 +36,16 @@ class Tweak:
         """As an operator thinks of it."""
         changed = self.before.changes_to(self.after)
         return ", ".join(f"{name} {new:g}" for name, (_, new) in changed.items())
+
+    @property
+    def middle(self) -> Plant | None:
+        """The plant between the jumps of two pots, which are set one after the other; None: only one changes it."""
+        changed = self.before.changes_to(self.after)
+        in_turn = [pot for pot in self.dials if pot in changed]
+        if len(changed) != 2 or len(in_turn) != 2:
+            return None
+        old, new = changed[in_turn[0]]
+        return self.before.scaled(in_turn[0], new / old)
 
 
 class ByHand:
@@ -75,17 +86,33 @@ class ByHand:
         for i, (tweak, (low_n, high_n)) in enumerate(zip(self._tweaks, self._spans_n, strict=True)):
             following = self._spans_n[i + 1][0] if i + 1 < len(self._spans_n) else float(len(record))
             search = range(max(earliest, int(low_n)), min(len(record) - 1, int(following), int(high_n) + 1))
-            segment = _dated(record, tweak, search)
+            within = range(min(earliest, search.start), max(int(min(following, len(record))), search.stop))
+            segment = _dated(record, tweak, search, within, slow=self._pots.slow)
             earliest = (segment.end_high or segment.start_high or search.stop) + 1
             out.append(_moved(segment, first))
         return out
 
 
-def _dated(record: Record, tweak: Tweak, search: range) -> Segment:
+def _dated(record: Record, tweak: Tweak, search: range, within: range, *, slow: bool) -> Segment:
     if len(search) < LEAST_SEARCH_N:
         start = min(search.start, len(record) - 1)
         return Segment(start, tweak.after, unseen="the pot was turned when the record was over, or nearly so")
-    found = onset(record, tweak.before, tweak.after, search)
+    middle = None if slow else tweak.middle
+    if slow or middle is not None:
+        turned = turn(record, tweak.before, tweak.after, search, middle=middle, within=within)
+        if isinstance(turned, Turn):
+            begin, end = turned.begin, turned.end
+            return Segment(
+                begin.sample,
+                tweak.after,
+                ramp_n=end.sample - begin.sample,
+                start_low=begin.low,
+                start_high=begin.high,
+                end_low=end.low,
+                end_high=end.high,
+            )
+        return Segment(search.start, tweak.after, ramp_n=len(search), unseen=turned.reason)
+    found = onset(record, tweak.before, tweak.after, search, within=within)
     if isinstance(found, NoOnset):
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=found.reason)
     return Segment(found.sample, tweak.after, start_low=found.low, start_high=found.high)

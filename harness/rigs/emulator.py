@@ -288,6 +288,10 @@ class EmulatorRig:
         channel = CHANNELS.index("force")
         return -self._card.ranges_v[channel][0] / float(self._card.lsb_v[channel])
 
+    def sampler(self, rng: np.random.Generator) -> Sampler:
+        """Its card, with noise of its own: to convert once more what the circuit has played."""
+        return Sampler(self._card, rng)
+
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
         """The machine as the scenario starts it, and what will be played on it.
 
@@ -324,7 +328,7 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            blocks=_sampled(volts, Sampler(self._card, Stream.CARD.generator(seed))),
+            blocks=_sampled(volts, self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(
                 scenario.segments(), _lit(computer.machine.lamps, probes_per_sample(self._card))
             ),
@@ -363,7 +367,7 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=stage.computer.scales.time,
             channels=stage.channels,
-            blocks=_sampled(volts(), Sampler(self._card, Stream.CARD.generator(seed))),
+            blocks=_sampled(volts(), self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(stage.segments, lit),
         )
 

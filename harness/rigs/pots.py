@@ -41,6 +41,8 @@ class Pots(Protocol):
 
     exact: bool
     """The instants of their turns are known to the sample."""
+    slow: bool
+    """A hand turns them, and is on its way for many samples; otherwise each jumps, one after the other."""
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:
         """Set pots, by their names, and be done with it when this returns: nothing is being recorded.
@@ -169,6 +171,7 @@ class _OneByOne:
     """Pots that are set one after another, in settling and in turning alike."""
 
     exact = False
+    slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
         for pot, dial in dials.items():
@@ -268,6 +271,7 @@ class _Box(_OneByOne):
 
 class _Operator:
     exact = False
+    slow = True
 
     def __init__(self, terminal: Path) -> None:
         self._name = str(terminal)
@@ -310,6 +314,7 @@ class _Operator:
 
 class _Nobody:
     exact = False
+    slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:
         """They are taken to stand there."""

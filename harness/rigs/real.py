@@ -133,6 +133,7 @@ class _OnInstrument:
     """Its pots; those that turn within a record are in the record's schedule."""
 
     exact = True
+    slow = False
 
     def __init__(self, instrument: Instrument, pots: Iterable[str]) -> None:
         """:raises RigError: it has not those pots."""
@@ -344,15 +345,17 @@ class RealRig:
             mine = [dataclasses.replace(t, sample=t.sample - start) for t in plan.tweaks if start <= t.sample < end]
             with self._left_safe(instrument):
                 self._settle(instrument, pots, standing, plant)
+                self._standing = {}  # unless the record comes to its end
                 taken, by_hand = self._record(instrument, pots, end - start, mine)
+            for tweak in mine:
+                standing, plant = {**standing, **tweak.dials}, tweak.after
+            self._standing = dict(standing)
             volts, codes, clipped = self._converted(taken, self._channels(plan.computer))
             if plan.dated is not None:
                 plan.dated.extend(by_hand.dated(self._as_measured(plan, codes, clipped), start))
             for first in range(0, len(codes), BLOCK_SAMPLES):
                 part = slice(first, first + BLOCK_SAMPLES)
                 yield Block(start + first, volts[part], codes[part], clipped[part], record)
-            for tweak in mine:
-                standing, plant = {**standing, **tweak.dials}, tweak.after
 
     def _record(
         self, instrument: Instrument, pots: Pots, samples: int, tweaks: Sequence[Tweak]
@@ -446,7 +449,7 @@ class RealRig:
 
         try:
             findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
-        except SelfTestError as error:
+        except (SelfTestError, ConfigurationError) as error:
             return (f"the rig's self-test could not be made: {error}",)
         return tuple(f"the rig's self-test: {check.sentence}" for check in findings.having("wrong"))
 

@@ -18,13 +18,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator import PROGRAMS, Capacitor, Components, OpAmp, Resistor, SuspensionComputer
+from emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
 from harness.calibration.check import seen_lsb
 from harness.calibration.fit import Calibration, Pots, Stock, calibrate
 from harness.calibration.plan import Program, scenarios
 from harness.calibration.recordings import DISPLACEMENT, record
 from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from harness.scenario import PlantChoice, Scenario, Tweak
+
+_LOADS = {"M": "R1", "B": "RB", "K": "RK"}
 
 GBW_HZ, SLEW_V_PER_S = 3e6, 13e6
 """Of the TL07x model."""
@@ -43,7 +45,8 @@ class DrawnRig:
 
 
 def drawn(number: int) -> DrawnRig:
-    """Components within their tolerances; every second one on the card of a served instrument."""
+    """Components within their tolerances; every second one on the card of a served instrument, every third one with
+    pots that are set by their dials, every fifth one wired as the shock absorber."""
     rng = np.random.default_rng([20, number])
     span_v, bits = (20.0, 14) if number % 2 else (10.0, 12)
     card = CardDescription(
@@ -57,7 +60,8 @@ def drawn(number: int) -> DrawnRig:
         },
     )
     stock: Stock = "polyester" if number % 4 < 2 else "polypropylene"
-    computer = ComputerDescription(components=stock, specimen=number, offset_v=2e-3)
+    pots: Pots = "dial" if number % 3 == 2 else "coefficient"
+    computer = ComputerDescription(components=stock, specimen=number, offset_v=2e-3, pots=pots)
     return DrawnRig(EmulatorDescription(card=card, computer=computer), "shock" if number % 5 == 4 else "front")
 
 
@@ -71,14 +75,14 @@ def calibrated(
 
 
 def truth(rig: DrawnRig) -> dict[str, float]:
-    """What the estimates should be."""
+    """What the estimates should be, by name; those of the tracks are made where the pots are set by their dials."""
     there, nominal = _values(rig.description, rig.program), _nominal(rig.program)
     channel = DISPLACEMENT
     card = rig.description.card
     gain = 1.0 + card.faults["gain_error"][channel]
     lsb_v = (card.range_v["displacement"][1] - card.range_v["displacement"][0]) / 2**card.bits
     r4, r5 = there["R4FB"] / there["R4"], there["R5FB"] / there["R5"]
-    part = {name: there[name] / nominal[name] for name in nominal if name[0] in "RC"}
+    part = {name: there[name] / nominal[name] for name in nominal if name[0] in "RCMBK"}
     deviation = {
         "RF": part["RF"] * part["R5"] / (part["RK"] * part["R5FB"] * gain) - 1.0,
         "C1": part["C1"] * part["R1"] * part["RB"] * part["R4"] / (part["RFB"] * part["R4FB"]) - 1.0,
@@ -96,6 +100,7 @@ def truth(rig: DrawnRig) -> dict[str, float]:
         "U1 bandwidth": there["GBW1"] / GBW_HZ / noise_gains - 1.0,
         **{f"U{i} bandwidth": there[f"GBW{i}"] / GBW_HZ - 1.0 for i in (2, 3, 4)},
         "U1 slew": there["SR1"] / SLEW_V_PER_S - 1.0,
+        **{f"{pot} track": part[pot] / part[load] - 1.0 for pot, load in _LOADS.items()},
         "skew": card.faults["skew_s"][channel] + (1.0 / GBW_HZ - 1.0 / there["GBW5"]) / math.pi,
         "displacement offset": card.faults["offset_lsb"][channel] + gain * (1.0 + r5) * there["V5"] / lsb_v,
         "displacement noise": float(card.noise_lsb),  # type: ignore[arg-type]
@@ -147,6 +152,8 @@ def _read(computer: SuspensionComputer) -> dict[str, float]:
     for element in computer.circuit.elements:
         if isinstance(element, Resistor):
             out[element.name] = element.ohm
+        elif isinstance(element, Pot):
+            out[element.name] = element.track_ohm
         elif isinstance(element, Capacitor):
             out[element.name] = element.farad
         elif isinstance(element, OpAmp):

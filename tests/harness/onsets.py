@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from emulator import Excitation
 from harness import config, information
 from harness.onset import NoOnset, Onset, onset
-from harness.plant import AT_REST, PARAMETERS, Plant, SampledPlant
+from harness.plant import PARAMETERS, Plant, SampledPlant
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.scenario import PLANTS, Scenario, Tweak
 from harness.turn import Turn, turn
@@ -120,21 +119,32 @@ class Trial:
         """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the
         information between the courses that the displacement then takes is below ln 20, as in harness.information."""
         first = max(0, self.sample - 400)
-        force_n = self.record.force_n[first : self.sample + 400].tolist()
-        near = range(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
-        true_m = self._course(force_n, self.sample - first)
-        apart_m = np.array([self._course(force_n, sample - first) - true_m for sample in near])
-        gathered = (apart_m**2).sum(axis=1) / (2.0 * self.record.noise_m**2)
+        samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
+        courses_m = self._courses(first, samples)
+        true_m = courses_m[samples == self.sample]
+        gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.record.noise_m**2)
         return int((gathered < information.LN_CERTAIN).sum())
 
-    def _course(self, force_n: Sequence[float], sample: int) -> NDArray[np.float64]:
-        """(n,) metres, the plant changing at a sample."""
+    def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(m, 800) metres from a sample on, the plant changing at each of these samples (m,)."""
         before, after = (SampledPlant.of(plant, self.record.period_s) for plant in (FRONT, self.after))
-        state, out = AT_REST, []
-        for k, force in enumerate(force_n):
-            out.append(state[0])
-            state = (before if k < sample else after).next(state, force)
-        return np.array(out)
+        x, v = np.zeros(len(samples)), np.zeros(len(samples))
+        out = []
+        for k, force in enumerate(self.record.force_n[first : first + 800].tolist(), start=first):
+            out.append(x)
+            (xa, va), (xb, vb) = (_next(plant, x, v, force) for plant in (before, after))
+            changed = k >= samples
+            x, v = np.where(changed, xb, xa), np.where(changed, vb, va)
+        return np.array(out).T
+
+
+def _next(
+    plant: SampledPlant, x: NDArray[np.float64], v: NDArray[np.float64], force_n: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """SampledPlant.next for many states."""
+    xx, xv, vx, vv = plant.transition
+    xf, vf = plant.response
+    return xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n
 
 
 def still(seed: int, clock: Clock) -> Trial:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.harness.processes import LONG_S
+from tests.instrument.serving import serving
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,11 +39,5 @@ class Served(NamedTuple):
 @contextlib.contextmanager
 def served(*arguments: str) -> Iterator[Served]:
     """``analogrig serve`` with some arguments, listening; it is ended afterwards."""
-    command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--json", *arguments]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            yield Served(process, json.loads(process.stdout.readline())["address"])
-        finally:
-            process.send_signal(signal.SIGTERM)
-            process.wait(LONG_S)
+    with serving(*arguments) as instrument:
+        yield Served(instrument.process, instrument.said["address"])

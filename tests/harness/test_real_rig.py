@@ -78,6 +78,12 @@ def test_verdicts_are_those_of_the_emulated_rig(bench: str) -> None:
             assert abs(mine.latency_n - other.latency_n) <= 2
 
 
+def test_each_play_begins_with_the_pots_of_its_scenario(bench: str) -> None:
+    with open_rig(bench) as rig:
+        first, again = (volts(rig.perform(THESIS, 1)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
 def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
     tweaks = (Tweak(5000, stiffness_n_per_m=18000.0), Tweak(16_500, damping_n_s_per_m=3453.0))
     run = played(bench, dataclasses.replace(THESIS, samples=20_000, tweaks=tweaks), 1)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+ROOT = Path(__file__).parents[2]
 LONG_S = 30.0
 """For what comes at once unless something is broken."""
 
@@ -69,7 +70,7 @@ class Client:
 def serving(*options: str) -> Iterator[Served]:
     """On any free port, until the end of the block."""
     command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--json", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None:
                 raise RuntimeError("it has no standard output")

@@ -132,6 +132,7 @@ def test_an_error_is_a_number_and_a_quoted_text_of_at_most_255_characters(lamp: 
     number, _, text = ask(lamp, "SYST:ERR?").rstrip().partition(b",")
     assert number == b"-113" and text.startswith(b'"Undefined header;FFF') and len(text) - 2 <= 255
     assert ask(lamp, "SYST:ERR?") == b'0,"No error"\r\n'
+    assert len(str(ScpiError(-221, "x" * 400))) == len('-221,""') + 255
 
 
 def test_errors_are_told_in_their_order_and_an_overflow_takes_the_last_place(lamp: Interpreter) -> None:

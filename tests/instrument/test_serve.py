@@ -165,6 +165,7 @@ def status_of(*options: str) -> int:
         (["--defect", "acquisition.drop_out='now'"], "instrument: acquisition: drop_out: must be one of 'none'"),
         (["--defect", "wiring.force.limits_v=[1,0]"], "force: limits_v must be (low, high) within"),
         (["--host", "192.0.2.1"], "cannot listen at 192.0.2.1:0"),
+        (["--host", ""], "cannot listen: the host is empty"),
         (["--port", "65536"], "argument --port: must be a whole number from 0 to 65535"),
         (["--plant", "rear"], "argument --plant: invalid choice: 'rear'"),
     ],

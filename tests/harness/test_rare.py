@@ -1,0 +1,159 @@
+"""Rates of rare alarms: against alarms that were waited for, against themselves, and as a certificate."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from harness import rare
+from harness.campaign.spec import rig_table
+from harness.campaign.workers import Processes, ThisProcess
+from harness.certificate import certify, question_of
+from harness.cli import main
+from harness.devices import DeviceDescription, describe
+from harness.errors import ConfigurationError
+from harness.estimator import Estimator
+from harness.rare import PLAY_N, false_alarm_rate
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
+from harness.scenario import Scenario
+from harness.statistics import mean_bounds
+from harness.trials import Trials
+
+SURELY = 5.3
+"""Standard errors; a normal variable is farther off once in ten million times."""
+
+HEALTHY = Scenario.load("healthy")
+
+
+def emulator() -> EmulatorRig:
+    rig = open_rig("emulator")
+    assert isinstance(rig, EmulatorRig)
+    return rig
+
+
+def device(arl0: float) -> DeviceDescription:
+    described = describe("inproc")
+    return dataclasses.replace(described, estimator=dataclasses.replace(described.estimator, arl0=arl0))
+
+
+def mean_rate(arl0: float, plays: int, branches: int) -> tuple[float, float]:
+    """Of plays from seed 0 on, with its standard error."""
+    rates = [false_alarm_rate(emulator(), device(arl0), HEALTHY, seed, branches).rate for seed in range(plays)]
+    return float(np.mean(rates)), float(np.std(rates, ddof=1)) / math.sqrt(plays)
+
+
+def waited_for(arl0: float, plays: int) -> tuple[float, float]:
+    """First alarms per sample of plays up to the first, with the standard error of a count."""
+    first = device(arl0).estimator.warm_up_n + 16
+    trials, played = Trials(emulator(), device(arl0)), dataclasses.replace(HEALTHY, samples=first + PLAY_N)
+    alarms = [trials.alarms(played, seed) for seed in range(1000, 1000 + plays)]
+    ends = [int(each[each >= first][0]) + 1 if (each >= first).any() else played.samples for each in alarms]
+    events, samples = sum(end < played.samples for end in ends), sum(end - first for end in ends)
+    return events / samples, math.sqrt(events) / samples
+
+
+def test_rate_is_that_of_alarms_that_were_waited_for() -> None:
+    """A device with one false alarm in about 65,000 samples."""
+    (rate, error), (waited, off) = mean_rate(1000.0, plays=16, branches=500), waited_for(1000.0, plays=250)
+    assert abs(rate - waited) < SURELY * math.hypot(error, off)
+    assert math.hypot(error, off) < 0.2 * waited
+
+
+def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One false alarm in 16 million samples: the weights make up for every loudness."""
+    rate, error = mean_rate(1e5, plays=16, branches=1000)
+    monkeypatch.setattr(rare, "LOUDER", np.array([1.8, 2.3]))
+    other, off = mean_rate(1e5, plays=16, branches=1000)
+    assert abs(rate - other) < SURELY * math.hypot(error, off)
+    assert math.hypot(error, off) < 0.2 * rate
+    assert 1e-8 < rate < 1e-5
+
+
+def test_rig_on_which_no_branch_comes_to_an_alarm_leaves_the_answer_open() -> None:
+    """Without noise there is nothing to be louder; that is no proof of silence."""
+    device, ideal = describe("inproc").as_table(), rig_table("emulator-ideal")
+    answer = certify(question_of(ideal, device, HEALTHY, far=1e-5, confidence=0.99, rare=8), ThisProcess())
+    assert (answer.outcome, answer.alarms, answer.rate) == ("inconclusive", 0, (0.0, 1.0))
+
+
+def test_branch_goes_on_as_the_estimator_would_have() -> None:
+    rng = np.random.default_rng(3)
+    u = np.where(np.arange(600) // 50 % 2, 3600.0, 400.0)
+    y = 0.5 * u + rng.normal(0.0, 40.0, 600)
+    estimator = Estimator()
+    whole = estimator.run(u, y)
+    estimator.restart()
+    estimator.run(u[:400], y[:400])
+    saved, valid = np.stack([estimator.save()] * 2), np.ones((2, 100), np.bool_)
+    other = np.stack([y[400:500], y[300:400]])
+    statistic, alarm, after = estimator.branch(saved, np.stack([u[400:500]] * 2), other, valid)
+    assert whole.statistic[400:].any()
+    assert statistic[0].tobytes() == whole.statistic[400:500].tobytes()
+    assert np.flatnonzero(alarm[0]).tolist() == [at - 400 for at in whole.alarms if 400 <= at < 500]
+    assert statistic[1].tobytes() != statistic[0].tobytes()
+    again, _, _ = estimator.branch(after[:1], u[None, 500:], y[None, 500:], valid[:1])
+    assert again[0].tobytes() == whole.statistic[500:].tobytes()
+
+
+# ------------------------------------------------------------------------------------------------ bounds of their mean
+
+
+def test_bounds_of_a_mean_are_those_of_the_table() -> None:
+    """Student's t for 9 degrees of freedom at 97.5 %: 2.262 (any table)."""
+    low, high = mean_bounds([1.0, 3.0] * 5, 0.975)
+    spread = math.sqrt(10.0 / 9.0) / math.sqrt(10.0)
+    assert ((high - 2.0) / spread, (2.0 - low) / spread) == pytest.approx((2.262, 2.262), abs=5e-4)
+    assert mean_bounds([0.0] * 9 + [1.0], 0.999)[0] == 0.0
+    assert mean_bounds([2.0] * 9, 0.999) == (2.0, 2.0)
+    with pytest.raises(ValueError, match="at least 8 estimates, not 2"):
+        mean_bounds([1.0, 2.0], 0.9)
+
+
+def test_bounds_of_the_mean_of_skewed_estimates_are_wrong_about_as_often_as_they_say() -> None:
+    """Exponential ones, of which the skewness is 2: 1 % is promised above and below; Student's t alone is wrong above
+    in more than 3 %. 4000 means of 64; 4.7 standard errors are allowed."""
+    samples = np.random.default_rng(5).exponential(size=(4000, 64)).tolist()
+    bounds = [mean_bounds(each, 0.99) for each in samples]
+    below, above = sum(high < 1.0 for _, high in bounds), sum(low > 1.0 for low, _ in bounds)
+    most = 4000 * 0.01 + 4.7 * math.sqrt(4000 * 0.01)
+    assert 0 < below < 1.5 * most
+    assert 0 < above < most
+
+
+# -------------------------------------------------------------------------------------------------- as a certificate
+
+
+def asked(dut: str = "inproc", **settings: Any) -> Any:
+    return question_of(rig_table("emulator"), describe(dut).as_table(), HEALTHY, **settings)
+
+
+def test_rare_rate_certifies_or_stays_open_and_does_not_depend_on_the_workers() -> None:
+    settings: dict[str, Any] = {"confidence": 0.99, "rare": 8}
+    certified = certify(asked(far=1e-5, **settings), Processes(2))
+    assert certified.outcome == "certified"
+    assert 1e-8 < certified.rate[0] < certified.rate[1] < 1e-6
+    assert certify(asked(far=1e-5, **settings), ThisProcess()) == certified
+    assert certify(asked(far=sum(certified.rate) / 2.0, **settings), ThisProcess()).outcome == "inconclusive"
+
+
+def test_device_whose_rare_rate_is_above_the_limit_is_refuted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["certify", "--dut", "inproc", "--far", "1e-9", "--confidence", "0.99", "--rare", "8"]) == 1
+    assert "(a rare rate): REFUTED" in capsys.readouterr().out
+
+
+def test_what_cannot_be_is_refused(tmp_path: Any) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text('kind = "inproc"\n[estimator]\ntrigger = "prediction-error"\nceiling = 50.0\n')
+    with pytest.raises(ConfigurationError, match="for the trigger cusum, not prediction-error of other"):
+        certify(asked(str(other), far=1e-8, confidence=0.99, rare=8), ThisProcess())
+    with pytest.raises(ConfigurationError, match="certify: a rare rate is estimated within this process"):
+        certify(asked("host", far=1e-8, confidence=0.99, rare=8), ThisProcess())
+    with pytest.raises(ConfigurationError, match="certify: rare must be 8 to 10000 estimates, not 3"):
+        asked(far=1e-8, confidence=0.99, rare=3)
+    with pytest.raises(ConfigurationError, match="certify: a rare rate is estimated, or alarms are waited for"):
+        asked(far=1e-8, confidence=0.99, rare=8, sequential=True)
