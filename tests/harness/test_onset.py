@@ -122,10 +122,10 @@ def test_offsets_of_both_channels_make_no_difference() -> None:
 
 
 def test_noise_that_is_larger_than_it_is_said_to_be_makes_the_interval_wider() -> None:
-    """Eight times as large, at instants that one can tell to the sample otherwise."""
+    """Eight times as large."""
     rng = np.random.default_rng(37)
     wider_by = 0
-    for seed in (1, 3, 5):
+    for seed in (6, 7, 8):
         trial = Trial.jump(seed, "card")
         noise_m = 8.0 * M_PER_LSB * rng.normal(size=len(trial.record))
         noisy = dataclasses.replace(trial.record, displacement_m=trial.record.displacement_m + noise_m)
