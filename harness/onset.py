@@ -67,7 +67,7 @@ _LEAST_NOISE, _LEAST_NOISE_FORCE = 8e-4, 2.5e-4
 real components (dielectric absorption above all) are not one mass, damper and spring to better than that."""
 _RISING = 0.5
 """Twice the logarithm of the likelihood ratio of two neighbours, above which they are no part of a still stretch."""
-_LEAST_DOUBT = 2.0
+_LEAST_DOUBT = 1.3
 """With it the intervals hold the instants of machines of real components as often as they say."""
 _SETTLING_N = 20
 """Innovations after which a filter that began with any state has come to rest."""

@@ -23,7 +23,7 @@ from harness.scenario import Scenario
 from harness.scenario import Tweak as Asked
 from harness.verdict import judge
 
-SAMPLES, ASKED_AT = 20_000, 3000
+SAMPLES, ASKED_AT = 10_000, 3000
 INSTANTS = (3215, 3311)
 """After which samples the pots do what they are told within a record, the first and the second; the force is high then.
 They are searched however long the process takes, so that all comes out the same every time."""
