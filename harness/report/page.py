@@ -18,7 +18,8 @@ from harness.verdict import Verdict
 FOLDER = Path(__file__).parent
 STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
 """Of every page with plots."""
-PLOTTER = FOLDER / "uPlot.iife.min.js"
+SCRIPTS = (FOLDER / "uPlot.iife.min.js", FOLDER / "plots.js")
+"""So too."""
 
 
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
@@ -39,7 +40,7 @@ def render(run: Run, verdict: Verdict) -> str:
     return assembled(
         FOLDER / "page.html",
         STYLES,
-        (PLOTTER, FOLDER / "page.js"),
+        (*SCRIPTS, FOLDER / "page.js"),
         data=as_script(payload(run, verdict)),
         title=tables.title(run, verdict),
         outcome=tables.outcome(run, verdict),
