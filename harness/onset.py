@@ -60,6 +60,10 @@ _LONGEST_MOVE = 0.3
 _LEAST_FIT_N = 30
 """Fewer samples tell nothing of a plant."""
 
+_MOST_LEFT = 1000.0
+"""... and so where nothing changes."""
+_RISING = 0.5
+"""Twice the logarithm of the likelihood ratio of two neighbours, above which they are no part of a still stretch."""
 _LEAST_DOUBT = 2.0
 """With it the intervals hold the instants of machines of real components as often as they say."""
 _SETTLING_N = 20
@@ -111,8 +115,8 @@ def onset(
     :param confidence: with which the interval holds the instant.
     :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem = Problem.of(record, before, after, search, within)
-    guess, profile = problem.solved(problem.fitted())
+    problem, guess = Problem.of(record, before, after, search, within).fitted()
+    guess, profile = problem.solved(guess)
     if profile.unexplained > _TOO_NARROW and guess.edges != ANYWHERE:
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
         guess, profile = min((guess, profile), other, key=lambda each: float(each[1].cost.min()))
@@ -162,6 +166,8 @@ class Guess:
     """(4,): the same of the plant after the change."""
     sample: int
     """Of the change, in the window."""
+    left: float = 1.0
+    """Variance of the innovations before and after the range, in what it is expected to be."""
     colour: float = 1.0
     """How many times as far as white noise the innovations go astray in the long run, as a variance."""
 
@@ -220,6 +226,8 @@ class Problem:
     after: Plant
     moves: Array
     """(4,): standard deviations of the differences between ``new`` and ``old`` of a guess."""
+    left: float = 1.0
+    """By how much the variance of the noise was raised."""
 
     @classmethod
     def of(cls, record: Record, before: Plant, after: Plant | None, search: range, within: range | None) -> Self:
@@ -240,7 +248,20 @@ class Problem:
             np.array([_OFFSET_MOVES, *turned]),
         )
 
-    def fitted(self) -> Guess:
+    def fitted(self) -> tuple[Problem, Guess]:
+        """What is not known, from the samples before the range and those after it; and the same problem with as much
+        noise as there is, if that is more: real components are not quite a mass, a damper and a spring."""
+        guess = self.fit()
+        if guess.left < _TOO_NARROW:
+            return self, guess
+        more = math.sqrt(guess.left)
+        noisier = dataclasses.replace(
+            self.record, noise_n=self.record.noise_n * more, noise_m=self.record.noise_m * more
+        )
+        problem = dataclasses.replace(self, record=noisier, left=guess.left)
+        return problem, problem.fit()
+
+    def fit(self) -> Guess:
         """From the samples before the range, and those after it, each by themselves."""
         zero = np.zeros(_OWN)
         guess = Guess(0.0, ANYWHERE.mean, ANYWHERE.half_width, zero, zero, self.candidates.start)
@@ -255,7 +276,10 @@ class Problem:
             guess, _, innovation = locked
         known = np.array([_HELD, _HELD, *np.hypot(self.moves, known[_COMMON:])])
         after, _, innovation_after = _settled(later, self.after, guess, known)
-        return dataclasses.replace(guess, new=after.old, colour=colour([innovation, innovation_after]))
+        every = [innovation, innovation_after]
+        settled = np.concatenate([each[_SETTLING_N:] for each in every])
+        left = float(settled @ settled) / len(settled) if len(settled) >= _LEAST_FIT_N else 1.0
+        return dataclasses.replace(guess, new=after.old, left=left, colour=colour(every))
 
     def filters(self, guess: Guess) -> tuple[Forwards, Backwards]:
         """Of the plant as it was, and of the plant as it then is."""
@@ -305,10 +329,10 @@ class Problem:
 
     def objection(self, cost: float, unexplained: float, guess: Guess) -> str:
         """Why the likeliest instant, of that cost, is none; empty if it is one."""
-        if unexplained > _MOST_UNEXPLAINED:
+        if unexplained > _MOST_UNEXPLAINED or self.left > _MOST_LEFT:
             return (
-                f"what a plant that changes once leaves of the samples has {unexplained:.3g} times the variance of"
-                " their noise"
+                f"what a plant that changes once leaves of the samples has {unexplained * self.left:.3g} times the"
+                " variance of their noise"
             )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
         _, none, _ = _settled(self.record, self.before, guess, known, rounds=1)
@@ -318,9 +342,10 @@ class Problem:
         return ""
 
     def beyond(self, cost: Array) -> str:
-        """Why the likeliest of the instants that have these costs is none: it is at an end of the range."""
-        likelihood = np.exp(-0.5 * (cost - cost.min()))
-        if len(likelihood) > 1 and max(likelihood[0], likelihood[-1]) > 0.5 * likelihood.sum():
+        """Why the likeliest of the instants that have these costs is none: towards an end of the range they fall."""
+        best = int(cost.argmin())
+        inwards = {0: 1, len(cost) - 1: len(cost) - 2}.get(best)
+        if inwards is not None and len(cost) > 1 and cost[inwards] - cost[best] > _RISING:
             return f"the plant seems to have changed before or after the samples {self._searched}"
         return ""
 

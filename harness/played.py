@@ -91,7 +91,8 @@ class Played:
     @_of_a_valid_play
     def isolates(self) -> Finding:
         """Whatever was said to have changed has changed. Silence is allowed."""
-        said = [(tweak, tweak.diagnosis) for tweak in self.verdict.tweaks if tweak.diagnosis is not None]
+        judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
+        said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
                  if not diagnosis.right]  # fmt: skip
         return Finding(

@@ -71,8 +71,7 @@ def turn(
     :param middle: two pots jumped, one after the other, and between the two the plant was this one.
     :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem = Problem.of(record, before, after, search, within)
-    guess = problem.fitted()
+    problem, guess = Problem.of(record, before, after, search, within).fitted()
     ways = _Ways.of(problem, guess) if middle is None else _Ways.stopping(problem, guess, middle)
     shapes = (_evenly, _gently) if middle is None else (_evenly,)
     every = [_zoomed(ways, shape, problem.candidates, confidence) for shape in shapes]

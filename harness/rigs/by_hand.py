@@ -39,7 +39,7 @@ class Tweak:
 
     @property
     def middle(self) -> Plant | None:
-        """The plant between the jumps of two pots, which are set one after the other; None: only one changes it."""
+        """The plant between the jumps of two pots, which are set one after the other; None: not two change it."""
         changed = self.before.changes_to(self.after)
         in_turn = [pot for pot in self.dials if pot in changed]
         if len(changed) != 2 or len(in_turn) != 2:
@@ -97,8 +97,8 @@ def _dated(record: Record, tweak: Tweak, search: range, within: range, *, slow: 
     if len(search) < LEAST_SEARCH_N:
         start = min(search.start, len(record) - 1)
         return Segment(start, tweak.after, unseen="the pot was turned when the record was over, or nearly so")
-    middle = None if slow else tweak.middle
-    if slow or middle is not None:
+    if slow or len(tweak.before.changes_to(tweak.after)) > 1:
+        middle = None if slow else tweak.middle
         turned = turn(record, tweak.before, tweak.after, search, middle=middle, within=within)
         if isinstance(turned, Turn):
             begin, end = turned.begin, turned.end

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from harness.campaign.trial import row
+from harness.catalogue import Change
 from harness.errors import RecordingError
 from harness.plant import Plant
 from harness.played import Played
@@ -207,6 +209,17 @@ def test_quiet_is_not_said_of_a_run_with_an_alarm_that_may_be_false() -> None:
     played = Played(learned(between(380, 400, 402), alarms=[390], expect=allowed))
     assert played.verdict.outcome == "passed"
     assert "INCONCLUSIVE: the alarm at 390" in played.stays_quiet().why
+
+
+def test_change_that_was_not_found_is_neither_missed_nor_misnamed() -> None:
+    unseen = Segment(300, SOFT, 200, unseen="nothing to be seen")
+    run = learned(unseen, alarms=[200, 404], diagnoses=[(420, Change.MASS, 398, 1.3)])
+    verdict = judge(run)
+    assert row(run, verdict)["changes"] == [[None, None, False, False]]
+    played = Played(run)
+    assert played.verdict.outcome == "failed", "for the alarm at 200"
+    assert "no change could be seen" in played.detects().why
+    assert played.isolates()
 
 
 # ---- the file
