@@ -40,7 +40,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz faults defects \
+.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -86,6 +86,9 @@ $(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/
 
 fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
+
+fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/README.md
+	@$(BIN)/python -m tests.instrument.hostile $(FUZZ_S) 0
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -92,6 +92,10 @@ class Grade:
         for name in ("tolerance", "temperature_spread_per_k", "ageing"):
             _require(self, name, 0.0 <= getattr(self, name) < 1.0, "must be at least 0 and less than 1")
         _require(self, "temperature_per_k", abs(self.temperature_per_k) < 0.01, "must be within +-0.01 per kelvin")
+
+    def undrawn(self) -> Grade:
+        """What all of the kind have in common."""
+        return Grade(temperature_per_k=self.temperature_per_k)
 
 
 @dataclass(frozen=True)
@@ -240,7 +244,7 @@ class Components:
     """What a machine is built of. The defaults are perfect and change nothing.
 
     given: by element name, the deviation of a resistor, capacitor or track from its value (a fraction), or the offset
-    of an op-amp in V, instead of the drawn one.
+    of an op-amp in V, instead of the drawn one. given_bandwidth, given_slew: by op-amp, the deviation from the model's.
     temperature_c: of all components; age_h: hours since they were new; seed: of all draws.
     Raises CircuitError naming the field.
     """
@@ -251,6 +255,8 @@ class Components:
     op_amps: OpAmpGrade = field(default_factory=OpAmpGrade)
     pots: PotGrade = field(default_factory=PotGrade)
     given: Mapping[str, float] = field(default_factory=dict)
+    given_bandwidth: Mapping[str, float] = field(default_factory=dict)
+    given_slew: Mapping[str, float] = field(default_factory=dict)
     temperature_c: float = REFERENCE_C
     age_h: float = 0.0
     seed: int = 0
@@ -274,15 +280,39 @@ class Components:
         elements = tuple(elements)
         if self._perfect:
             return elements
-        unknown = set(self.given) - {element.name for element in elements}
-        if unknown:
-            raise CircuitError(f"components: given: no element is called {min(unknown)!r}")
+        self._check_given(elements)
         return tuple(part for element in elements for part in self._parts(element))
+
+    def undrawn(self) -> Components:
+        """The same with nothing drawn: what is not given is as the diagram and the models say.
+
+        The tracks are continuous then: on which winding a wiper rests hangs on track and load more finely than they are
+        known.
+        """
+        return replace(
+            self,
+            resistors=self.resistors.undrawn(),
+            capacitors=self.capacitors.undrawn(),
+            op_amps=replace(self.op_amps, offset_v=0.0, offset_v_per_k=0.0, bandwidth=0.0, slew=0.0, bias_spread=0.0),
+            pots=replace(self.pots, track=self.pots.track.undrawn(), windings=0),
+        )
+
+    def _check_given(self, elements: Sequence[Element]) -> None:
+        every = {element.name for element in elements}
+        amplifiers = {element.name for element in elements if isinstance(element, OpAmp)}
+        for field_name, known, what in (
+            ("given", every, "element"),
+            ("given_bandwidth", amplifiers, "op-amp"),
+            ("given_slew", amplifiers, "op-amp"),
+        ):
+            if unknown := set(getattr(self, field_name)) - known:
+                raise CircuitError(f"components: {field_name}: no {what} is called {min(unknown)!r}")
 
     @property
     def _perfect(self) -> bool:
         """Whether nothing would change: most machines are nominal, and drawing takes longer than solving them."""
-        return not self.given and self._kinds == NOMINAL._kinds
+        given = self.given or self.given_bandwidth or self.given_slew
+        return not given and self._kinds == NOMINAL._kinds
 
     @property
     def _kinds(self) -> tuple[object, ...]:
@@ -328,12 +358,14 @@ class Components:
     def _specimen(self, amp: OpAmp, draws: NDArray[np.float64]) -> OpAmpModel:
         grade, model = self.op_amps, amp.model
         offset_v = self.given.get(amp.name, grade.offset_v * float(draws[_Draw.OFFSET]))
+        bandwidth = self.given_bandwidth.get(amp.name, grade.bandwidth * float(draws[_Draw.BANDWIDTH]))
+        slew = self.given_slew.get(amp.name, grade.slew * float(draws[_Draw.SLEW]))
         drift_v = grade.offset_v_per_k * float(draws[_Draw.OFFSET_DRIFT]) * self._warming_k
         return replace(
             model,
             vos_v=model.vos_v + offset_v + drift_v,
-            gbw_hz=model.gbw_hz * (1.0 + grade.bandwidth * float(draws[_Draw.BANDWIDTH])),
-            slew_v_per_s=model.slew_v_per_s * (1.0 + grade.slew * float(draws[_Draw.SLEW])),
+            gbw_hz=model.gbw_hz * (1.0 + bandwidth),
+            slew_v_per_s=model.slew_v_per_s * (1.0 + slew),
         )
 
     def _inputs(self, amp: OpAmp, draws: NDArray[np.float64]) -> Iterator[Element]:

@@ -104,7 +104,7 @@ def _false_alarms(verdict: Verdict) -> Iterator[str]:
 
 def _unseen(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
-        if tweak.bound_n is None:
+        if tweak.bound_n is None and not tweak.unseen:
             yield f"{tweak.what} at {tweak.sample} could not be seen before the next change or the end: not judged"
 
 

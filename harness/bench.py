@@ -146,6 +146,7 @@ class Bench:
             rig=self.rig.description(),
             dut=self.dut.description(),
             link=self.dut.link_name,
+            line=self.dut.line,
             real_time=self._real_time or 0.0,
         )
         collected = _Collected()

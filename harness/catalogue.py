@@ -30,9 +30,12 @@ from harness._catalogue import (
 __all__ = [
     "BLOCK_SAMPLES",
     "CATALOGUE_HASH",
+    "INDICES",
     "LAYOUTS",
     "RUNS",
     "RUN_SHIFT",
+    "SEQS",
+    "STEPPED_FLAGS",
     "Alarm",
     "Change",
     "Command",
@@ -58,6 +61,8 @@ __all__ = [
     "Stepped",
     "SteppedFlag",
     "Trigger",
+    "brief",
+    "index_up_to",
     "pack",
     "unpack",
 ]
@@ -69,6 +74,14 @@ RUN_SHIFT, _RUN_BITS = LAYOUTS["Stepped"].bits["run"]
 """Samples and what answers them carry the id of their run in their flags, from this bit on."""
 RUNS = 1 << _RUN_BITS
 """Run ids are modulo this."""
+
+SEQS = 1 << 8
+"""Sequence numbers are modulo this."""
+INDICES = 1 << 16
+"""Indices of samples are modulo this in a message."""
+
+STEPPED_FLAGS = sum(SteppedFlag)
+"""All bits of the flags of Stepped but the run id."""
 
 
 class Identify(NamedTuple):
@@ -253,8 +266,25 @@ def unpack(packet: bytes) -> Message | None:
     return packing.make(values) if not packing.has_float or isfinite(values[-1]) else None
 
 
+def brief(message: Message) -> str:
+    """Its type, and its sample if it is about one."""
+    index = getattr(message, "sample_index", None)
+    return type(message).__name__ if index is None else f"{type(message).__name__} {index}"
+
+
+def index_up_to(most: int, wire_index: int) -> int:
+    """The last sample, up to ``most``, that a message calls ``wire_index``."""
+    return most - (most - wire_index) % INDICES
+
+
+_MODULI = {"seq": ("B", SEQS), "sample_index": ("H", INDICES)}
+
+
 def _packing(message_type: Any) -> _Packing:
     layout = LAYOUTS[message_type.__name__]
+    for field, (code, modulus) in _MODULI.items():
+        if field in layout.fields and layout.format[1 + layout.fields.index(field)] != code:
+            raise TypeError(f"{message_type.__name__}: {field} is not modulo {modulus}")
     if layout.bits.get("run", (RUN_SHIFT, _RUN_BITS)) != (RUN_SHIFT, _RUN_BITS):
         raise TypeError(f"{message_type.__name__} has the run id elsewhere than Stepped")
     if message_type is SampleBlock:

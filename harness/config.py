@@ -165,6 +165,11 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 
 def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
+    if (kinds := _by_kind(arguments)) and isinstance(value, dict):
+        if "kind" not in value:
+            raise ConfigurationError(f"{where}: the key 'kind' is lacking")
+        kind = _convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
+        return _convert(kinds[kind], value, where)
     problems = []
     for argument in arguments:
         if argument is types.NoneType:
@@ -174,6 +179,14 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
         except ConfigurationError as error:
             problems.append(str(error).removeprefix(f"{where}: "))
     raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
+
+
+def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
+    """The tables of a union by what their ``kind`` must be; empty if that does not tell them apart."""
+    hints = [typing.get_type_hints(each).get("kind") for each in arguments if dataclasses.is_dataclass(each)]
+    if len(hints) < len(arguments) or not all(typing.get_origin(hint) is Literal for hint in hints):
+        return {}
+    return {kind: table for hint, table in zip(hints, arguments, strict=True) for kind in typing.get_args(hint)}
 
 
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:

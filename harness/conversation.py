@@ -8,12 +8,9 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from harness.catalogue import Configured, Controlled, Firmware, Hello, Message, Status, pack
+from harness.catalogue import SEQS, Configured, Controlled, Firmware, Hello, Message, Status, brief, pack
 from harness.errors import DeviceError, LinkError, LinkTimeout
 from harness.links.link import Link
-
-_SEQ = 256
-"""Sequence numbers are modulo this."""
 
 LATEST = 32
 """A message is one that comes again, and not one after a loss, if its number is at most so far behind."""
@@ -39,7 +36,7 @@ class Conversation:
     @property
     def last(self) -> str:
         """The last message of the device, in a word or two."""
-        return "none" if self._last is None else _brief(self._last)
+        return "none" if self._last is None else brief(self._last)
 
     @property
     def so_far(self) -> str:
@@ -55,7 +52,7 @@ class Conversation:
     def next_seq(self) -> int:
         """The number of the next message to the device."""
         seq = self._seq
-        self._seq = (seq + 1) % _SEQ
+        self._seq = (seq + 1) % SEQS
         return seq
 
     def send(self, message: Message) -> float:
@@ -79,19 +76,19 @@ class Conversation:
             if message is None:
                 return None
             if self._expected is None or message.seq == self._expected:
-                self._expected = (message.seq + 1) % _SEQ
+                self._expected = (message.seq + 1) % SEQS
                 self._heard[message.seq] = self._last = message
                 return message
-            if (self._expected - message.seq) % _SEQ > LATEST:
-                lost = (message.seq - self._expected) % _SEQ
+            if (self._expected - message.seq) % SEQS > LATEST:
+                lost = (message.seq - self._expected) % SEQS
                 raise LinkError(
-                    f"device {self.name}: {lost} messages were lost between {self.last} and {_brief(message)}"
-                    f" ({self.link.counters['frames_dropped']} frames were damaged)"
+                    f"device {self.name}: {lost} messages were lost between {self.last} and {brief(message)}, or"
+                    f" somebody else speaks as the device ({self.link.counters['frames_dropped']} frames were damaged)"
                 )
             before = self._heard.get(message.seq)
             if before is not None and pack(before) != pack(message):
                 raise LinkError(
-                    f"device {self.name}: {_brief(before)} and {_brief(message)} have the same number, {message.seq}:"
+                    f"device {self.name}: {brief(before)} and {brief(message)} have the same number, {message.seq}:"
                     " it was reset, or two speak as this device"
                 )
         return None
@@ -122,13 +119,7 @@ class Conversation:
             if isinstance(message, kind) and message.answers == request.seq:
                 return message
             if not after_anything and not isinstance(message, Hello | Firmware):
-                raise DeviceError(f"device {self.name}: {_brief(message)} came too late")
+                raise DeviceError(f"device {self.name}: {brief(message)} came too late")
 
     def _named(self, error: LinkError) -> LinkError:
         return type(error)(f"device {self.name}: {error}")
-
-
-def _brief(message: Message) -> str:
-    """The type of a message, and its sample if it is about one."""
-    index = getattr(message, "sample_index", None)
-    return type(message).__name__ if not isinstance(index, int) else f"{type(message).__name__} {index}"

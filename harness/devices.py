@@ -86,8 +86,17 @@ class DeviceDescription:
         :raises ConfigurationError: ``rest`` makes no sense.
         """
         where, _, query = rest.partition("?")
-        table = cls._located(name, where) | {key: _value(cls, key, text) for key, text in _pairs(name, query)}
-        return config.build(cls, {"name": name, **table}, name)
+        table = {"name": name, **cls._located(name, where)}
+        for key, text in _pairs(name, query):
+            if key in table:
+                raise ConfigurationError(f"{name}: {key} is said twice")
+            table[key] = _value(cls, key, text)
+        return config.build(cls, cls._sorted_out(table), name)
+
+    @classmethod
+    def _sorted_out(cls, table: dict[str, Any]) -> dict[str, Any]:
+        """Keys and values, each in its place."""
+        return table
 
     @classmethod
     def _located(cls, name: str, where: str) -> dict[str, Any]:
@@ -114,9 +123,8 @@ class DeviceDescription:
         """
         return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
 
-    @property
-    def hint(self) -> str:
-        """What to know when nobody answers, if there is anything."""
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
+        """What to know when nobody answers on the link of that name, if there is anything."""
         return ""
 
     @property
@@ -149,7 +157,9 @@ def _pairs(name: str, query: str) -> list[tuple[str, str]]:
 
 
 def _value(cls: type[DeviceDescription], key: str, text: str) -> Any:
-    """A number or a truth if it looks like one, as python-can has it too."""
+    """A number or a truth if it looks like one, as python-can has it too, and the key is not one of ours for a text."""
+    if isinstance(getattr(cls, key, None), str):
+        return text
     is_flag = isinstance(getattr(cls, key, None), bool)
     if text.lower() in {"true", "false"} or (is_flag and text in {"1", "0"}):
         return text.lower() in {"true", "1"}
@@ -454,13 +464,16 @@ class SerialDevice(ByteDevice):
     def wire(self) -> Wire:
         return PortWire(self.url, self.baud or DEFAULT_BAUD)
 
-    @property
-    def hint(self) -> str:
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
         return f"the line was opened at {self.baud} baud"
 
     @property
     def elsewhere(self) -> str:
         return f"{self.kind}:{self.url}"
+
+
+_ONE_CONNECTION = frozenset({"slcan", "serial", "robotell", "seeedstudio"})
+"""Interfaces of python-can that are behind a serial port."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -479,43 +492,61 @@ class CanDevice(FrameDevice):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.device == "host" and self.interface not in {"", "socketcan"}:
-            raise ValueError(f"device: a host process answers on SocketCAN, not on {self.interface}: say inproc")
+        if self.interface:
+            self._check_answers_on(self.interface)
+
+    def _check_answers_on(self, interface: str) -> None:
+        """:raises ValueError: the device that shall answer cannot be on such a bus."""
+        if self.device == "host" and interface != "socketcan":
+            raise ValueError(f"device: a host process answers on SocketCAN, not on {interface}: say inproc")
+        if self.device == "inproc" and interface in _ONE_CONNECTION:
+            raise ValueError(
+                f"device: inproc needs a connection of its own, and {interface} is an adapter that takes but one"
+            )
 
     @classmethod
-    def named(cls, name: str, rest: str) -> Self:
-        where, _, query = rest.partition("?")
+    def _located(cls, name: str, where: str) -> dict[str, Any]:  # noqa: ARG003
         interface, _, channel = where.partition("/")
-        pairs = {key: _value(cls, key, text) for key, text in _pairs(name, query)}
-        own = {key: value for key, value in pairs.items() if key in cls.__dataclass_fields__}
-        options = {key: value for key, value in pairs.items() if key not in own}
-        return config.build(
-            cls, {"name": name, "interface": interface, "channel": channel, "options": options, **own}, name
-        )
+        return {key: value for key, value in (("interface", interface), ("channel", channel)) if value}
+
+    @classmethod
+    def _sorted_out(cls, table: dict[str, Any]) -> dict[str, Any]:
+        """What is none of ours is for python-can."""
+        own = {key: value for key, value in table.items() if key in cls.__dataclass_fields__}
+        return {"options": {key: value for key, value in table.items() if key not in own}, **own}
 
     def bus(self) -> CanBus:
-        from harness.links.can_bus import PythonCanBus
+        from harness.links.can_bus import PythonCanBus, completed
 
-        asked = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
-        asked |= {"interface": self.interface or None, "channel": self.channel or None}
-        asked = {key: value for key, value in asked.items() if value is not None}
-        if self.interface == "virtual" and not self.channel:
-            asked["channel"] = f"analogrig-{secrets.token_hex(4)}"  # which nobody else in this process has
-        bus = PythonCanBus(asked)
+        config = completed(self._asked())
+        interface = str(config["interface"])
         try:
-            return self._answered(bus, asked)
+            self._check_answers_on(interface)
+        except ValueError as error:
+            raise ConfigurationError(f"device {self.name}: {error}") from error
+        if interface == "virtual" and config["channel"] is None:
+            config["channel"] = f"analogrig-{secrets.token_hex(4)}"  # which nobody else in this process has
+        bus = PythonCanBus(config)
+        try:
+            return self._answered(bus, config)
         except BaseException:
             bus.close()
             raise
 
-    def _answered(self, bus: PythonCanBus, asked: Mapping[str, Any]) -> CanBus:
+    def _asked(self) -> dict[str, Any]:
+        """The bus in the words of python-can, as far as it is described."""
+        asked = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
+        asked |= {"interface": self.interface or None, "channel": self.channel or None}
+        return {key: value for key, value in asked.items() if value is not None}
+
+    def _answered(self, bus: PythonCanBus, config: Mapping[str, Any]) -> CanBus:
         """With the device that shall be on it."""
         from harness.links.can_bus import ChildBus, PythonCanBus
         from harness.links.can_device import InhabitedBus
 
-        who = self.device or ("inproc" if self.interface == "virtual" else "none")
+        who = self.device or ("inproc" if config["interface"] == "virtual" else "none")
         if who == "inproc":
-            return InhabitedBus(bus, PythonCanBus(asked), boot_nonce=secrets.randbits(32))
+            return InhabitedBus(bus, PythonCanBus(config), boot_nonce=secrets.randbits(32))
         if who == "none":
             return bus
         child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])])
@@ -526,15 +557,13 @@ class CanDevice(FrameDevice):
             child.end()
             raise
 
-    @property
-    def hint(self) -> str:
-        return f"the bus was opened as {self._url()}: is the device on it, at the same bit rate?"
+    def hint(self, link_name: str) -> str:
+        return f"the bus was opened as {self.kind}:{link_name}: is the device on it, at the same bit rate?"
 
     @property
     def elsewhere(self) -> str:
-        return self._url() if self.interface != "virtual" else ""
-
-    def _url(self) -> str:
+        if self.interface == "virtual":
+            return ""
         return f"{self.kind}:{self.interface}{'/' if self.channel else ''}{self.channel}"
 
 

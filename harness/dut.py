@@ -108,6 +108,14 @@ class Dut:
         return self._talk.link.line_s - self._line_s
 
     @property
+    def line(self) -> dict[str, int]:
+        """How samples go: its bit rates (``Line.rates``), as far as they are known; ``samples_per_message`` and
+        ``window``, the most messages that may be unanswered."""
+        line, packing = self._talk.link.line, self._packing()
+        rates = {} if line is None else line.rates()
+        return {**rates, "samples_per_message": packing.per_message, "window": packing.window}
+
+    @property
     def estimator(self) -> EstimatorConfig:
         """How its estimator is configured."""
         return self._description.estimator
@@ -185,7 +193,9 @@ class Dut:
 
         :raises ConfigurationError: that does not fit the line.
         """
-        check_line(self._description, self._talk.link, period_s)
+        line = self._talk.link.line
+        if line is not None:
+            check_line(self._description, line, period_s, in_blocks=self._packing().in_blocks)
         return Pace(self._talk.clock, period_s)
 
     def start(self, pace: Pace | None = None) -> None:
@@ -370,7 +380,8 @@ def reopen_dut(description: Mapping[str, Any], *, listener: CanListener | None =
     recorded = from_table(table, "the recorded device")
     if recorded.elsewhere:
         raise ConfigurationError(
-            f"the recorded device was {recorded.elsewhere}: say --dut {recorded.elsewhere}, or another"
+            f"the recorded device was {recorded.elsewhere}, and is not opened on the word of a recording:"
+            f" say --dut {recorded.elsewhere}, or another"
         )
     return connect(_changed(recorded, changes), listener)
 
@@ -405,9 +416,10 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
     try:
         dut.handshake()
     except LinkTimeout as error:
-        if not description.hint:
+        hint = description.hint(dut.link_name)
+        if not hint:
             raise
-        raise LinkTimeout(f"{error}; {description.hint}") from error
+        raise LinkTimeout(f"{error}; {hint}") from error
 
 
 def _float32(value: float) -> float:

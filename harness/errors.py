@@ -4,6 +4,11 @@ AnalogrigError
 ├── ConfigurationError          a file, key, value or command-line argument is wrong
 ├── RecordingError              a recording cannot be read or written
 ├── RigError                    the rig failed
+│   ├── RigTimeout              the instrument did not answer, or finish, in time
+│   ├── RigClosed               the instrument cannot be reached, or is gone
+│   ├── RigRefused              the instrument refused a command
+│   ├── RecordIncomplete        the record that it gave is not whole
+│   └── SelfTestError           its self-test could not be made
 ├── WorkerError                 the workers of a campaign cannot be had or kept
 ├── LinkError                   the link failed
 │   ├── LinkTimeout             nothing came in time
@@ -32,6 +37,26 @@ class RecordingError(AnalogrigError):
 
 class RigError(AnalogrigError):
     """The rig failed."""
+
+
+class RigTimeout(RigError):  # noqa: N818 - the word of the field
+    """The instrument did not answer, or finish, in time."""
+
+
+class RigClosed(RigError):  # noqa: N818 - the word of the field
+    """The instrument cannot be reached, or is gone."""
+
+
+class RigRefused(RigError):  # noqa: N818 - the word of the field
+    """The instrument refused a command."""
+
+
+class RecordIncomplete(RigError):  # noqa: N818 - the word of the field
+    """The record that the instrument gave is not whole."""
+
+
+class SelfTestError(RigError):
+    """The self-test of the rig could not be made: nothing is known about it."""
 
 
 class WorkerError(AnalogrigError):

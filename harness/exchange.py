@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from harness.catalogue import (
     BLOCK_SAMPLES,
+    INDICES,
     RUN_SHIFT,
     RUNS,
+    STEPPED_FLAGS,
     Alarm,
     Change,
     Diagnosis,
@@ -31,6 +33,7 @@ from harness.catalogue import (
     SampleFlag,
     Stepped,
     SteppedFlag,
+    index_up_to,
 )
 from harness.conversation import Conversation
 from harness.errors import DeviceError, LinkClosed, LinkError, LinkTimeout
@@ -40,11 +43,7 @@ from harness.run import LOST, UNREPORTED
 MOST_SILENCES = 10
 """So often a run goes on after it waited in vain for answers; each time costs a time-out."""
 
-_DEVICE_FLAGS = sum(SteppedFlag)
 _RUN_MASK = (RUNS - 1) << RUN_SHIFT
-_INDEX = 65536
-"""Sample indices are modulo this on the line."""
-
 _NO_INDEX = -1
 _NO_ELEMENT = -1
 
@@ -253,11 +252,11 @@ class Exchange:
         if not self._packing.in_blocks:
             force, displacement, missing = samples[0]
             flags = self._run | (SampleFlag.MISSING if missing else 0)
-            return Sample(seq, flags, first % _INDEX, force, displacement)
+            return Sample(seq, flags, first % INDICES, force, displacement)
         mask = sum(1 << i for i, (_, _, missing) in enumerate(samples) if missing)
         codes = [code for force, displacement, _ in samples for code in (force, displacement)]
         codes += [0] * (2 * BLOCK_SAMPLES - len(codes))
-        return SampleBlock(seq, self._run | len(samples), first % _INDEX, mask, tuple(codes))
+        return SampleBlock(seq, self._run | len(samples), first % INDICES, mask, tuple(codes))
 
     # ---- from the device
 
@@ -310,9 +309,9 @@ class Exchange:
         return is_whole and message.flags & _RUN_MASK == self._run
 
     def _step(self, message: Stepped) -> None:
-        flags = message.flags & _DEVICE_FLAGS
+        flags = message.flags & STEPPED_FLAGS
         if self._diagnosis is not None:
-            onset = self._answered - (self._answered - self._diagnosis.onset_index) % _INDEX
+            onset = index_up_to(self._answered, self._diagnosis.onset_index)
             stated = StatedDiagnosis(self._answered, self._diagnosis.change, onset, self._diagnosis.extent)
             self._rows.diagnoses.append(stated)
             self._diagnosis = None
@@ -329,7 +328,7 @@ class Exchange:
 
     def _await(self, index: int) -> None:
         self._answered = index
-        self._wire_index = index % _INDEX
+        self._wire_index = index % INDICES
 
     def _pass_on(self) -> None:
         """The oldest message is done with; the next one is the oldest."""
@@ -346,7 +345,7 @@ class Exchange:
         index = getattr(message, "sample_index", None)
         if self._at or not self._pending or self._answered != self._pending[0][0]:
             return 0
-        return next((i for i, (first, _) in enumerate(self._pending) if first % _INDEX == index), 0)
+        return next((i for i, (first, _) in enumerate(self._pending) if first % INDICES == index), 0)
 
     def _lose(self, messages: int) -> None:
         """The oldest so many never came to the device."""

@@ -7,7 +7,7 @@ import math
 from harness.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from harness.devices import DeviceDescription
 from harness.errors import ConfigurationError
-from harness.links.link import Link
+from harness.links.line import Line
 from harness.links.wire import Clock
 
 
@@ -40,15 +40,11 @@ class Pace:
         self.overruns += is_full or late_s > window * self._period_s
 
 
-def check_line(device: DeviceDescription, link: Link, period_s: float) -> None:
-    """That the line, if its speed is known, carries a sample every ``period_s``, alarms and the like not counted.
+def check_line(device: DeviceDescription, line: Line, period_s: float, *, in_blocks: bool) -> None:
+    """That ``line`` carries a sample every ``period_s``, alarms and the like not counted.
 
     :raises ConfigurationError: it does not; with the arithmetic.
     """
-    line = link.line
-    if line is None:
-        return
-    in_blocks = device.exchange != "sample" and link.carries_blocks
     to_s = line.message_s(SampleBlock) / BLOCK_SAMPLES if in_blocks else line.message_s(Sample)
     elements = device.estimator.parameters + 1
     stepped_s = line.message_s(Stepped)

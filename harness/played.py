@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from harness.run import Run
 from harness.statistics import upper_rate
+from harness.summary import latency_text
 from harness.verdict import TweakVerdict, Verdict, judge
 
 Arguments = ParamSpec("Arguments")
@@ -71,24 +72,27 @@ class Played:
         """
         if not self.verdict.tweaks:
             return Finding(holds=False, why="nothing has changed, so nothing could be detected")
-        seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None]
+        seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None and not tweak.unseen]
         if not seeable:
             return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
         wrong = [why for tweak in seeable if (why := _not_detected(tweak, within))]
-        latencies = ", ".join(f"{tweak.what} after {tweak.latency_n} (bound {tweak.bound_n})" for tweak in seeable)
+        latencies = ", ".join(f"{tweak.what} after {latency_text(tweak)} (bound {tweak.bound_n})" for tweak in seeable)
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
     @_of_a_valid_play
     def stays_quiet(self) -> Finding:
         """No alarm but one for each change."""
-        alarms = self.verdict.false_alarms
+        alarms, doubtful = self.verdict.false_alarms, self.verdict.doubtful_alarms
+        if doubtful and not alarms:
+            return Finding(holds=False, why=f"INCONCLUSIVE: the alarm at {doubtful[0]} is false, or not: {_UNKNOWN}")
         where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
         return Finding(not alarms, f"{len(alarms)} false alarms in {self.run.samples} samples: {where}".rstrip(": "))
 
     @_of_a_valid_play
     def isolates(self) -> Finding:
         """Whatever was said to have changed has changed. Silence is allowed."""
-        said = [(tweak, tweak.diagnosis) for tweak in self.verdict.tweaks if tweak.diagnosis is not None]
+        judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
+        said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
                  if not diagnosis.right]  # fmt: skip
         return Finding(
@@ -134,8 +138,22 @@ class Played:
         return Finding(holds=False, why=f"{why}, not {wanted[sample, element]:g} +- {allowed[sample, element]:g}")
 
 
+_UNKNOWN = "it depends on when the change came, which is not known better"
+
+
 def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
-    """Why a change that could be seen was not detected in time; empty if it was."""
+    """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
+    reasons = [_too_late(each, within) for each in tweak.possible]
+    if all(reasons):
+        return _too_late(tweak, within)
+    low, high = tweak.between
+    return f"INCONCLUSIVE: {tweak.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
+
+
+def _too_late(tweak: TweakVerdict, within: float | None) -> str:
+    """As ``_not_detected``, for the very instant that it has."""
+    if tweak.latency_n is None and tweak.bound_n is None:
+        return ""
     if tweak.latency_n is None:
         return f"{tweak.what} at {tweak.sample} was missed (bound {tweak.bound_n})"
     if within is None:

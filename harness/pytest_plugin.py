@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from harness.played import Played
     from harness.rigs.rig import Rig
     from harness.scenario import Scenario
+    from harness.verdict import TweakVerdict
 
 PROFILES = ("ci", "nightly", "soak")
 
@@ -289,12 +290,19 @@ def _note(item: pytest.Item, played: Played) -> None:
         "commit": _commit(),
         "outcome": verdict.outcome,
         "theta_hash": verdict.theta_hash,
-        "latency_n": " ".join(str(tweak.latency_n) for tweak in verdict.tweaks),
+        "latency_n": " ".join(_latency(tweak) for tweak in verdict.tweaks),
         "bound_n": " ".join(str(tweak.bound_n) for tweak in verdict.tweaks),
         "false_alarms": len(verdict.false_alarms),
         "overruns": conditions.counters.get("receive_overruns", 0),
     }
     item.user_properties.extend(properties.items())
+
+
+def _latency(tweak: TweakVerdict) -> str:
+    """``4``, or ``1..9`` where the instant of the change is not known better; ``None`` without an alarm."""
+    if tweak.latencies_n is None or not tweak.others:
+        return str(tweak.latency_n)
+    return "{}..{}".format(*tweak.latencies_n)
 
 
 def _commit() -> str:

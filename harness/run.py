@@ -6,14 +6,15 @@ ever executed (``allow_pickle=False``); a verdict can be computed from it alone,
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,8 @@ class Channel:
     unit_per_v: float
     noise_lsb: float
     """rms of the noise before quantisation, as far as the rig knows it."""
+    codes: int = 4096
+    """How many there are, from 0 on."""
 
     def physical(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
         """Codes of any shape to ``unit`` (float64, same shape)."""
@@ -97,11 +100,40 @@ def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Segment:
-    """The plant from ``start`` (sample index) until the next segment; ramp_n samples go by until it has become so."""
+    """The plant from a sample on, until the next segment."""
 
     start: int
+    """Sample index."""
     plant: Plant
     ramp_n: int = 0
+    """So many samples go by until it has become so."""
+    start_low: int | None = None
+    """The earliest instant at which it may have begun, where the samples had to tell; None: it is exact ..."""
+    start_high: int | None = None
+    """... and the latest."""
+    end_low: int | None = None
+    """The earliest instant at which a ramp may have been over ..."""
+    end_high: int | None = None
+    """... and the latest."""
+    unseen: str = ""
+    """Why nobody knows whether the plant changed, somewhere on the ramp; empty if one does."""
+
+    def earliest(self) -> Self:
+        """As if it had begun, and been over, as early as it may have."""
+        return self._between(self.start_low, self.end_low)
+
+    def latest(self) -> Self:
+        """... as late as it may have."""
+        return self._between(self.start_high, self.end_high)
+
+    def _between(self, start: int | None, end: int | None) -> Self:
+        start = self.start if start is None else start
+        ramp_n = self.ramp_n if end is None else max(0, end - start)
+        return dataclasses.replace(self, start=start, ramp_n=ramp_n)
+
+    @property
+    def is_exact(self) -> bool:
+        return self.start_low is None and self.start_high is None and self.end_low is None and self.end_high is None
 
 
 @dataclass(frozen=True)
@@ -138,6 +170,8 @@ class Conditions:
     """First samples of the gap-free records, each of which the device began afresh and from rest."""
     line_s: float = 0.0
     """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
+    line: Mapping[str, int] = field(default_factory=dict)
+    """How the samples went (``Dut.line``); empty if that is not recorded."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -214,6 +248,17 @@ class Run:
         starts = [start for start in self.conditions.records if start < self.samples]
         return tuple(itertools.pairwise([*starts, self.samples]))
 
+    def supposing(self, instant: Callable[[Segment], Segment]) -> Run:
+        """The same run if each change had come at another instant, within its record and before the end."""
+        segments = []
+        for segment in self.conditions.segments:
+            first, end = next((span for span in self.records if span[0] <= segment.start < span[1]), (-1, -1))
+            supposed = instant(segment)
+            if first < segment.start < end:
+                supposed = dataclasses.replace(supposed, start=min(max(supposed.start, first + 1), end - 1))
+            segments.append(supposed)
+        return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, segments=tuple(segments)))
+
     def theta_hash(self) -> str:
         """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
         return hashlib.sha256(np.ascontiguousarray(self.theta, dtype="<f4").tobytes()).hexdigest()
@@ -255,7 +300,14 @@ class Run:
         """The arrays belong together, and so do they and the header."""
         n, alarms, diagnoses = self.samples, len(self.alarm_index), len(self.diagnosis_index)
         conditions = self.conditions
-        starts = [segment.start for segment in conditions.segments]
+        earliest, starts, latest = (
+            [each.start for each in segments]
+            for segments in (
+                [segment.earliest() for segment in conditions.segments],
+                conditions.segments,
+                [segment.latest() for segment in conditions.segments],
+            )
+        )
         checks = {
             "arrays of different lengths": all(
                 len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
@@ -272,10 +324,12 @@ class Run:
             ),
             "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
             "records": conditions.records[:1] == (0,) and list(conditions.records) == sorted(set(conditions.records)),
-            "segments": not starts or (starts[0] == 0 and starts == sorted(set(starts))),
+            "segments": all(_ascend(starts) for starts in (earliest, starts, latest))
+            and all(low <= start <= high for low, start, high in zip(earliest, starts, latest, strict=True)),
             "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
             "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
+            "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
             "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
             "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),
@@ -283,6 +337,11 @@ class Run:
         wrong = [what for what, holds in checks.items() if not holds]
         if wrong:
             raise RecordingError(f"{path}: damaged recording: its {', '.join(wrong)} do not fit together")
+
+
+def _ascend(starts: Sequence[int]) -> bool:
+    """From 0."""
+    return not starts or (starts[0] == 0 and list(starts) == sorted(set(starts)))
 
 
 def _check_archive(raw: BinaryIO) -> None:
@@ -314,7 +373,10 @@ def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
 def _to_json(conditions: Conditions) -> dict[str, Any]:
     out = dict(vars(conditions))
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
-    out["segments"] = [{**vars(s), "plant": vars(s.plant)} for s in conditions.segments]
+    out["segments"] = [
+        {**{key: value for key, value in vars(s).items() if value is not None}, "plant": vars(s.plant)}
+        for s in conditions.segments
+    ]
     return out
 
 

@@ -17,6 +17,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 MOST_EVENTS = 10**9
 
 LEAST_FOR_MEAN = 8
@@ -131,6 +134,22 @@ class Design:
         from scipy.stats import binom
 
         return float(binom.cdf(self.allowed, self.trials, true_rate))
+
+
+def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:
+    """The mean of two values or more and both bounds of it, each wrong with half of 1 - confidence (Student 1908).
+
+    :raises ValueError: fewer values, or a confidence that is none.
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    _check(0, len(sample), confidence)
+    if len(sample) < 2:
+        raise ValueError("one value says nothing about the next")
+    from scipy.special import stdtrit
+
+    mean, error = float(sample.mean()), float(sample.std(ddof=1)) / math.sqrt(len(sample))
+    margin = float(stdtrit(len(sample) - 1, 0.5 * (1.0 + confidence))) * error
+    return mean, mean - margin, mean + margin
 
 
 # ---------------------------------------------------------------------------------------------- where stopping is free

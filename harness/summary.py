@@ -23,7 +23,7 @@ def summary(run: Run, verdict: Verdict) -> str:
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
-        lines += [_tweak_line(tweak) for tweak in verdict.tweaks]
+        lines += [line for tweak in verdict.tweaks for line in _tweak_lines(tweak)]
     diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
         lines += [
@@ -32,6 +32,9 @@ def summary(run: Run, verdict: Verdict) -> str:
             *diagnoses,
         ]
     lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
+    if verdict.doubtful_alarms:
+        at = ", ".join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))
+        lines += [f"  false or not, depending on when the changes came: alarms at {at}"]
     if verdict.missing_n:
         lines += [f"  {missing_text(run)}: {verdict.missing_n} samples"]
     if verdict.overloads:
@@ -75,10 +78,23 @@ def _false_alarms(verdict: Verdict) -> str:
     return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
 
 
-def _tweak_line(tweak: TweakVerdict) -> str:
-    latency = "missed" if tweak.missed else "-" if tweak.latency_n is None else str(tweak.latency_n)
+def _tweak_lines(tweak: TweakVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
-    return f"  {tweak.sample:6}  {_change(tweak.before, tweak.after):43}  {latency:>7}  {bound:>5}"
+    change = _change(tweak.before, tweak.after)
+    out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]
+    low, high = tweak.between
+    if low < high:
+        out += [f"          between {low} and {high}, the likeliest instant is shown: {tweak.result}"]
+    return out
+
+
+def latency_text(tweak: TweakVerdict) -> str:
+    """``4``, ``1-9`` where the instant is not known better, ``missed``, or ``-``."""
+    if tweak.result in {"missed", "not judged"}:
+        return {"missed": "missed", "not judged": "unknown"}[tweak.result]
+    if tweak.latencies_n is None:
+        return "-"
+    return "-".join(map(str, dict.fromkeys(tweak.latencies_n)))
 
 
 def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:

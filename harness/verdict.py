@@ -3,6 +3,11 @@
 An alarm belongs to the change in whose segment it falls; the first one there is its detection, every other alarm is a
 false alarm, but for those while a change lasts. The device is late when the information that had accumulated by its
 alarm was many times what is needed.
+
+Where nobody knows the instant of a change, but between which instants it lies, the run is judged three times: as if all
+changes had come at their earliest, their likeliest, their latest instants. What all three say holds: an alarm before
+the earliest instant is a false one, and a device is late if it is late even for the latest. Where they differ the run
+is INCONCLUSIVE, and so it is where a change cannot be found in the samples at all.
 """
 
 from __future__ import annotations
@@ -19,12 +24,16 @@ from numpy.typing import NDArray
 from harness import config, information
 from harness.catalogue import Change, SteppedFlag
 from harness.plant import PARAMETERS, physical_parameters
-from harness.run import LOST, Run
+from harness.run import LOST, Run, Segment
 
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
 
 Outcome = Literal["passed", "failed", "inconclusive"]
+
+Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not judged"]
+"""Of a change: unseeable carried too little information; undecided depends on its instant, which is not known so well;
+not judged was not found in the samples."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,34 @@ class TweakVerdict:
     """A later alarm is late."""
     diagnosis: DiagnosisVerdict | None = None
     """None: the device did not say, for lack of certainty or because it does not isolate."""
+    others: tuple[TweakVerdict, ...] = ()
+    """The same for the earliest and the latest instant at which it may have come; none if it is known."""
+    unseen: str = ""
+    """Why nobody knows whether and when it came; it is then not judged."""
+
+    @property
+    def possible(self) -> tuple[TweakVerdict, ...]:
+        """For each instant that it is judged for, in order of time."""
+        return tuple(sorted((self, *self.others), key=lambda each: each.sample))
+
+    @property
+    def between(self) -> tuple[int, int]:
+        """The earliest and the latest instant."""
+        return self.possible[0].sample, self.possible[-1].sample
+
+    @property
+    def latencies_n(self) -> tuple[int, int] | None:
+        """The least and the greatest that it may be; None: no alarm belongs to it."""
+        known = [each.latency_n for each in self.possible if each.latency_n is not None]
+        return (min(known), max(known)) if known else None
+
+    @property
+    def result(self) -> Result:
+        """For every instant that it is judged for."""
+        if self.unseen:
+            return "not judged"
+        results = {_result(each) for each in self.possible}
+        return results.pop() if len(results) == 1 else "undecided"
 
     @property
     def missed(self) -> bool:
@@ -105,6 +142,15 @@ class TweakVerdict:
     @property
     def late(self) -> bool:
         return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
+
+
+def _result(tweak: TweakVerdict) -> Result:
+    """For the very instant that it has."""
+    if tweak.missed:
+        return "missed"
+    if tweak.late:
+        return "late"
+    return "unseeable" if tweak.latency_n is None else "noticed"
 
 
 @dataclass(frozen=True)
@@ -132,7 +178,7 @@ class Verdict:
     """Why it is not ``passed``; empty if it is."""
     tweaks: tuple[TweakVerdict, ...]
     false_alarms: tuple[int, ...]
-    """Sample indices."""
+    """Sample indices; of those that are so whenever the changes came."""
     estimates: tuple[SegmentEstimate, ...]
     arl0: float
     """The mean time between false alarms that the bounds assume."""
@@ -142,6 +188,8 @@ class Verdict:
     theta_hash: str
     overloads: Mapping[str, int] = field(default_factory=dict)
     """Amplifier to the first sample that was taken with its overload lamp lit."""
+    doubtful_alarms: tuple[int, ...] = ()
+    """Sample indices of those that are false ones, or not, depending on when a change came."""
 
     @property
     def valid(self) -> bool:
@@ -163,16 +211,18 @@ def judge(run: Run) -> Verdict:
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
     trigger = run.conditions.dut["estimator"]
     level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
-    tweaks, false_alarms = _attribute_alarms(run, expect, level)
+    judged = _judged(run, expect, level)
     invalid = _invalidities(run, expect)
-    failures = _failures(tweaks, false_alarms, expect)
-    outcome: Outcome = "inconclusive" if invalid else "failed" if failures else "passed"
+    outcome, reasons = _concluded(judged, expect)
+    certain = set(judged[0].false_alarms).intersection(*(each.false_alarms for each in judged))
+    possible = {index for each in judged for index in each.false_alarms}
     return Verdict(
-        outcome=outcome,
-        reasons=(*invalid, *failures),
-        tweaks=tweaks,
-        false_alarms=false_alarms,
-        estimates=_segment_estimates(run),
+        outcome="inconclusive" if invalid else outcome,
+        reasons=(*invalid, *reasons),
+        tweaks=_with_others(judged),
+        false_alarms=tuple(sorted(certain)),
+        doubtful_alarms=tuple(sorted(possible - certain)),
+        estimates=_segment_estimates(run.supposing(Segment.earliest)),
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
         missing_n=int(run.missing.sum()),
@@ -205,15 +255,20 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
                 "what": tweak.what,
                 "from": dict(tweak.before),
                 "to": dict(tweak.after),
+                "between": list(tweak.between),
+                "result": tweak.result,
                 "latency": tweak.latency_n,
+                "latencies": None if tweak.latencies_n is None else list(tweak.latencies_n),
                 "bound": tweak.bound_n,
                 "deadline": tweak.deadline_n,
-                "missed": tweak.missed,
+                "missed": tweak.result == "missed",
+                "unseen": tweak.unseen,
                 "diagnosis": None if tweak.diagnosis is None else dataclasses.asdict(tweak.diagnosis),
             }
             for tweak in verdict.tweaks
         ],
         "false_alarms": list(verdict.false_alarms),
+        "doubtful_alarms": list(verdict.doubtful_alarms),
         "estimates": [
             {
                 "start": segment.start,
@@ -230,9 +285,63 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class _Judgement:
+    """Of a run whose changes came at these instants."""
+
+    tweaks: tuple[TweakVerdict, ...]
+    false_alarms: tuple[int, ...]
+    failures: tuple[str, ...]
+
+
+def _judged(run: Run, expect: Expectations, level: float) -> list[_Judgement]:
+    """At the likeliest instants; and at the earliest and the latest, where they are not exact."""
+    runs = [run]
+    if not all(segment.is_exact for segment in run.conditions.segments):
+        runs += [run.supposing(Segment.earliest), run.supposing(Segment.latest)]
+    out = []
+    for supposed in runs:
+        tweaks, false_alarms = _attribute_alarms(supposed, expect, level)
+        out.append(_Judgement(tweaks, false_alarms, tuple(_failures(tweaks, false_alarms, expect))))
+    return out
+
+
+def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outcome, list[str]]:
+    """Outcome of a valid run, and why it is not ``passed``."""
+    tweaks = _with_others(judged)
+    unseen = [f"{tweak.what} at {tweak.sample} is not judged: {tweak.unseen}" for tweak in tweaks if tweak.unseen]
+    if all(each.failures for each in judged):
+        return "failed", [*judged[0].failures, *unseen]
+    undecided = [_doubt(tweak) for tweak in tweaks if tweak.result == "undecided"]
+    counts = sorted(len(each.false_alarms) for each in judged)
+    if counts[0] <= expect.false_alarms < counts[-1]:
+        undecided.append(
+            f"{counts[0]} or {counts[-1]} false alarms, depending on when the changes came;"
+            f" at most {expect.false_alarms} expected"
+        )
+    doubts = undecided if any(each.failures for each in judged) else []  # which then are some
+    return ("inconclusive" if doubts or unseen else "passed"), [*doubts, *unseen]
+
+
+def _doubt(tweak: TweakVerdict) -> str:
+    """Why it is undecided."""
+    low, high = tweak.between
+    results = " or ".join(dict.fromkeys(_result(each) for each in tweak.possible))
+    return f"{tweak.what} between {low} and {high} was {results}, depending on when it came"
+
+
+def _with_others(judged: Sequence[_Judgement]) -> tuple[TweakVerdict, ...]:
+    """The changes at their likeliest instants, each with what is said of it at the others."""
+    likeliest, *others = (each.tweaks for each in judged)
+    return tuple(
+        dataclasses.replace(tweak, others=tuple(each[i] for each in others if each[i] != tweak))
+        for i, tweak in enumerate(likeliest)
+    )
+
+
 def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tuple[TweakVerdict, ...], tuple[int, ...]]:
     alarms = run.alarm_index.tolist()
-    ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
+    begun = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
     isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
@@ -244,11 +353,12 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
         # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
         mine = [index for index in alarms if start < index <= end]
         detection = mine[0] if mine else None
-        detected |= _belonging(mine, start + ramps_n[start])
+        detected |= _belonging(mine, start + begun[start].ramp_n)
         changed = before.changes_to(after)
         late = information.first_reaching(gathered, expect.late_information_ratio * level)
         tweaks.append(
             TweakVerdict(
+                unseen=begun[start].unseen,
                 sample=start,
                 what=", ".join(changed),
                 before={name: old for name, (old, _) in changed.items()},
@@ -331,14 +441,15 @@ def _losses(run: Run) -> list[str]:
 
 def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations) -> list[str]:
     reasons = []
-    missed = [tweak for tweak in tweaks if tweak.missed]
+    judged = [tweak for tweak in tweaks if not tweak.unseen]
+    missed = [tweak for tweak in judged if tweak.missed]
     if len(missed) > expect.missed:
         names = "; ".join(f"{tweak.what} at {tweak.sample}" for tweak in missed)
-        reasons.append(f"missed {len(missed)} of {len(tweaks)} changes ({names}), at most {expect.missed} expected")
+        reasons.append(f"missed {len(missed)} of {len(judged)} changes ({names}), at most {expect.missed} expected")
     reasons += [
         f"{tweak.what} at {tweak.sample} was noticed after {tweak.latency_n} samples,"
         f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
-        for tweak in tweaks
+        for tweak in judged
         if tweak.late
     ]
     if len(false_alarms) > expect.false_alarms:
@@ -347,7 +458,8 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
 
 
 def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
-    segments = run.segments
+    unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
+    segments = [segment for segment in run.segments if segment[0] not in unseen]
     lasts = trajectory(run, [end - 1 for _, end, _ in segments])
     out = []
     for (start, end, plant), last in zip(segments, lasts, strict=True):

@@ -41,8 +41,7 @@ void can_device_enter(can_device_t* self, const can_frame_t* frame);
 /// The next answer to the last message; false if there is none. Cost: as device_answer().
 bool can_device_answer(can_device_t* self, can_frame_t* answer);
 
-/// Works until all frames of the input are taken and answered, or the output is full: then call again, with the rest of the
-/// input and a new output (both counted in frames).
+/// Works as device_progress_t says, on frames; an answer needs one.
 device_progress_t
 can_device_run(can_device_t* self, const can_frame_t* in, size_t in_n, can_frame_t* out, size_t out_n);
 

@@ -72,7 +72,11 @@ typedef struct {
     uint8_t payload[DEVICE_ANSWER_LENGTH];
 } device_message_t;
 
-/// How far a shell has come with its input and output.
+/// How far a shell of the device has come with its input and output, both counted in items: bytes, or frames. Its run function
+/// works until all input is taken and answered, or until the output has less room than an answer needs: then call again, with
+/// the rest of the input and a new output. Call again too when all input was taken and the output was nearly full:
+/// device_is_busy() tells. Input is taken only as far as it could be answered.
+/// Cost: per item O(1); per message as device_enter() and device_answer().
 typedef struct {
     size_t taken;  ///< of the input: done with
     size_t given;  ///< written to the output

@@ -30,10 +30,7 @@ typedef struct {
 /// Makes the device ready: default configuration, stopped, at the beginning of a frame.
 void serial_device_init(serial_device_t* self, const device_identity_t* identity);
 
-/// Works until all input is taken and answered, or until the output has less than SERIAL_DEVICE_ANSWER bytes left: then call
-/// again, with the rest of the input and a new output (both counted in bytes). Call again too when all input was taken and the output was nearly
-/// full: device_is_busy() tells. Input is taken only as far as it could be answered.
-/// Cost: per byte O(1); per message as device_enter() and device_answer().
+/// Works as device_progress_t says, on bytes; an answer needs SERIAL_DEVICE_ANSWER of them.
 device_progress_t serial_device_run(serial_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
 /// sizeof(serial_device_t), for callers in other languages.

@@ -29,10 +29,7 @@ typedef struct {
 /// Makes the device ready: default configuration, stopped, the adapter's channel closed. It takes CAN FD.
 void slcan_device_init(slcan_device_t* self, const device_identity_t* identity);
 
-/// Works until all input is taken and answered, or until the output has less than SLCAN_DEVICE_ANSWER bytes left: then call
-/// again, with the rest of the input and a new output (both counted in bytes). Call again too when all input was taken and
-/// the output was nearly full: device_is_busy() tells. Input is taken only as far as it could be answered.
-/// Cost: per byte O(1); per message as device_enter() and device_answer().
+/// Works as device_progress_t says, on bytes; an answer, or a reply of the adapter, needs SLCAN_DEVICE_ANSWER of them.
 device_progress_t slcan_device_run(slcan_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
 /// sizeof(slcan_device_t), for callers in other languages.

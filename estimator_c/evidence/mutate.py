@@ -72,6 +72,7 @@ DEADLINE_S = 60
 
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
+    *("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"),
     *(f"-I{path}" for path in (CORE.parent / "device", CORE.parent / "isolation", GENERATED)),
 )
 """One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""

@@ -19,6 +19,8 @@ HERE = ESTIMATOR / "fuzz"
 
 LONGEST_INPUT = {"fuzz_est": 512, "fuzz_serial": 2048, "fuzz_can": 2048, "fuzz_slcan": 2048}
 """By target, in bytes: some hundred samples."""
+LINES = ("fuzz_serial", "fuzz_can", "fuzz_slcan")
+"""Those over the device."""
 
 _SANITIZED = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined")
 _INCLUDE = tuple(f"-I{part}" for part in (*PARTS, LOOP, HERE))
@@ -32,7 +34,8 @@ def build(target: str, folder: Path) -> Path:
     """
     program = folder / target
     parts = [path for part in PARTS for path in sorted(part.glob("*.c"))]
-    sources = [HERE / f"{target}.c", HERE / "fuzz_line.c", *sorted(LOOP.glob("*_line.c")), *parts]
+    line = [HERE / "fuzz_line.c", *sorted(LOOP.glob("*_line.c"))] if target in LINES else []
+    sources = [HERE / f"{target}.c", *line, *parts]
     subprocess.run(["clang", *_FLAGS, *map(str, sources), "-o", str(program)], check=True)
     return program
 

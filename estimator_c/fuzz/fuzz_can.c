@@ -7,7 +7,7 @@
 
 #include <string.h>
 
-static void begin(stream_t* const stream) { (void)stream; }
+void target_begin(stream_t* const stream) { (void)stream; }
 
 static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
     (void)memcpy(&stream->bytes[stream->n], frame, sizeof(*frame));
@@ -15,8 +15,8 @@ static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
 }
 
 /// Now and then in the wrong kind of frame, or with another identifier of the same last byte.
-static void
-add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void
+target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     can_frame_t   frame  = { .id = id, .length = analogrig_length(id) };
     const uint8_t choice = take_byte(input);
     frame.flags          = (frame.length > CAN_FRAME_CLASSIC_MAX) ? CAN_FRAME_FD : 0U;
@@ -26,7 +26,7 @@ add_message(stream_t* const stream, const uint8_t id, const uint8_t* const paylo
     add_frame(stream, &frame);
 }
 
-static void add_noise(stream_t* const stream, input_t* const input) {
+void target_add_noise(stream_t* const stream, input_t* const input) {
     can_frame_t frame = { .flags = take_byte(input), .length = take_byte(input) };
     for (uint8_t i = 0U; i < 4U; i++) {
         frame.id = (frame.id << 8U) | take_byte(input);
@@ -38,7 +38,7 @@ static void add_noise(stream_t* const stream, input_t* const input) {
 }
 
 /// Of the harness, each in a data frame of its length.
-static size_t messages(const stream_t* const stream) {
+size_t target_messages(const stream_t* const stream) {
     size_t n = 0U;
     for (size_t i = 0U; i < stream->n; i += sizeof(can_frame_t)) {
         can_frame_t frame;
@@ -51,7 +51,7 @@ static size_t messages(const stream_t* const stream) {
 }
 
 /// Nothing but classic frames of the device.
-static size_t checked(const answers_t* const answers) {
+size_t target_checked(const answers_t* const answers) {
     const size_t frames = answers->n / sizeof(can_frame_t);
     expect((answers->n % sizeof(can_frame_t)) == 0U);
     for (size_t i = 0U; i < frames; i++) {
@@ -63,18 +63,9 @@ static size_t checked(const answers_t* const answers) {
     return frames;
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
-    static can_device_t device;
-    static can_device_t device_at_once;
-    const bool          is_fd = (size > 0U) && ((data[size - 1U] & 1U) != 0U);
-    const fuzz_line_t   kind  = { .line        = is_fd ? &can_fd_line : &can_line,
-                                  .item_size   = sizeof(can_frame_t),
-                                  .answer_size = sizeof(can_frame_t),
-                                  .begin       = begin,
-                                  .add_message = add_message,
-                                  .add_noise   = add_noise,
-                                  .messages    = messages,
-                                  .checked     = checked };
-    fuzz_line(&kind, &device, &device_at_once, data, size);
-    return 0;
+target_t target(const uint8_t* const data, const size_t size) {
+    const bool is_fd = (size > 0U) && ((data[size - 1U] & 1U) != 0U);
+    return (target_t){ .line        = is_fd ? &can_fd_line : &can_line,
+                       .item_size   = sizeof(can_frame_t),
+                       .answer_size = sizeof(can_frame_t) };
 }

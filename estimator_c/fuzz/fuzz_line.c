@@ -2,6 +2,9 @@
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
+#include "can_device.h"
+#include "serial_device.h"
+#include "slcan_device.h"
 
 #include <stdlib.h>
 #include <string.h>
@@ -25,7 +28,7 @@ uint8_t take_byte(input_t* const input) {
 
 /// A message of the harness, mostly with the sequence number that is due; values that no fuzzer finds in reasonable time,
 /// identifiers and checksums, are made for it.
-static void add_message(const fuzz_line_t* const kind, stream_t* const stream, input_t* const input) {
+static void add_message(stream_t* const stream, input_t* const input) {
     static const uint8_t ids[] = { ANALOGRIG_SAMPLE_FRAME_ID,   ANALOGRIG_SAMPLE_BLOCK_FRAME_ID,
                                    ANALOGRIG_CONTROL_FRAME_ID,  ANALOGRIG_CONFIGURE_FRAME_ID,
                                    ANALOGRIG_IDENTIFY_FRAME_ID, ANALOGRIG_HELLO_FRAME_ID };
@@ -39,23 +42,23 @@ static void add_message(const fuzz_line_t* const kind, stream_t* const stream, i
         payload[0] = stream->seq;
     }
     stream->seq = (uint8_t)(payload[0] + 1U);
-    kind->add_message(stream, id, payload, input);
+    target_add_message(stream, id, payload, input);
 }
 
-static void add_next(const fuzz_line_t* const kind, stream_t* const stream, input_t* const input) {
+static void add_next(stream_t* const stream, input_t* const input) {
     if ((take_byte(input) % 8U) != 0U) {
-        add_message(kind, stream, input);
+        add_message(stream, input);
     } else {
-        kind->add_noise(stream, input);
+        target_add_noise(stream, input);
     }
 }
 
 /// The stream in pieces into the device, its answers in pieces out of it; sizes come from the input, the largest without one.
-static void play(const fuzz_line_t* const kind,
-                 void* const              state,
-                 const stream_t* const    stream,
-                 input_t* const           sizes,
-                 answers_t* const         answers) {
+static void play(const target_t* const kind,
+                 void* const           state,
+                 const stream_t* const stream,
+                 input_t* const        sizes,
+                 answers_t* const      answers) {
     const device_t* const device = state;
     size_t                taken  = 0U;
     while ((taken < stream->n) || device_is_busy(device)) {
@@ -80,14 +83,20 @@ void expect_answer(const uint8_t id, const uint8_t* const payload, const size_t 
     expect(payload[0] == (uint8_t)number);
 }
 
-void fuzz_line(const fuzz_line_t* const kind,
-               void* const              state,
-               void* const              state_at_once,
-               const uint8_t* const     data,
-               const size_t             size) {
+/// The state of any shell.
+typedef union {
+    serial_device_t serial;
+    can_device_t    can;
+    slcan_device_t  slcan;
+} shell_t;
+
+int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
+    static shell_t          shell;
+    static shell_t          shell_at_once;
     static stream_t         stream;
     static answers_t        answers;
     static answers_t        answers_at_once;
+    const target_t          kind     = target(data, size);
     const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH, .boot_nonce = 1U, .firmware_id = 1U };
     const size_t            sizes_n  = (size > 0U) ? ((data[0] < size) ? data[0] : (size - 1U)) : 0U;
     input_t                 sizes    = { .bytes = &data[(size > 0U) ? 1U : 0U], .n = sizes_n };
@@ -96,14 +105,15 @@ void fuzz_line(const fuzz_line_t* const kind,
     stream.seq                       = 0U;
     answers.n                        = 0U;
     answers_at_once.n                = 0U;
-    kind->begin(&stream);
+    target_begin(&stream);
     while ((input.n > 0U) && (stream.n < (STREAM_MAX - NOISE_MAX))) {
-        add_next(kind, &stream, &input);
+        add_next(&stream, &input);
     }
-    kind->line->init(state, &identity);
-    kind->line->init(state_at_once, &identity);
-    play(kind, state, &stream, &sizes, &answers);
-    play(kind, state_at_once, &stream, &(input_t){ .bytes = 0, .n = 0U }, &answers_at_once);
+    kind.line->init(&shell, &identity);
+    kind.line->init(&shell_at_once, &identity);
+    play(&kind, &shell, &stream, &sizes, &answers);
+    play(&kind, &shell_at_once, &stream, &(input_t){ .bytes = 0, .n = 0U }, &answers_at_once);
     expect((answers.n == answers_at_once.n) && (memcmp(answers.bytes, answers_at_once.bytes, answers.n) == 0));
-    expect(kind->checked(&answers) <= (kind->messages(&stream) * ANSWERS_PER_MESSAGE));
+    expect(target_checked(&answers) <= (target_messages(&stream) * ANSWERS_PER_MESSAGE));
+    return 0;
 }

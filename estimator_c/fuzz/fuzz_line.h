@@ -33,23 +33,37 @@ typedef struct {
     uint8_t bytes[ANSWERS_MAX];
 } answers_t;
 
-/// A kind of line as its fuzz target knows it.
+/// Most bytes that one step may add to a stream.
+#define NOISE_MAX 256U
+
+// ---- what each target defines
+
+/// Its kind of line.
 typedef struct {
     const device_line_t* line;
     size_t               item_size;    ///< bytes that come together
     size_t               answer_size;  ///< bytes of room for which something is answered
-    void (*begin)(stream_t* stream);   ///< what must be said first
-    void (*add_message)(stream_t* stream, uint8_t id, const uint8_t* payload, input_t* input);
-    void (*add_noise)(stream_t* stream, input_t* input);  ///< adds at most NOISE_MAX bytes
-    size_t (*messages)(const stream_t* stream);           ///< no fewer than the harness's messages in it
-    size_t (*checked)(const answers_t* answers);          ///< how many answers; with answer() for each
-} fuzz_line_t;
+} target_t;
 
-/// Most bytes that one step may add to a stream.
-#define NOISE_MAX 256U
+/// For this input of the fuzzer.
+target_t target(const uint8_t* data, size_t size);
 
-/// Plays an input; two states of the shell's size.
-void fuzz_line(const fuzz_line_t* kind, void* state, void* state_at_once, const uint8_t* data, size_t size);
+/// What must be said first.
+void target_begin(stream_t* stream);
+
+/// Adds a message of the harness.
+void target_add_message(stream_t* stream, uint8_t id, const uint8_t* payload, input_t* input);
+
+/// Adds at most NOISE_MAX bytes of anything else.
+void target_add_noise(stream_t* stream, input_t* input);
+
+/// No fewer than the harness's messages in it.
+size_t target_messages(const stream_t* stream);
+
+/// How many answers there are; expect_answer() for each.
+size_t target_checked(const answers_t* answers);
+
+// ---- what they have to do it with
 
 /// Aborts unless it holds.
 void expect(bool holds);

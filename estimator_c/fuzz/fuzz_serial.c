@@ -4,21 +4,21 @@
 #include "fuzz_line.h"
 #include "serial_device.h"
 
-static void begin(stream_t* const stream) { (void)stream; }
+void target_begin(stream_t* const stream) { (void)stream; }
 
-static void
-add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void
+target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     (void)input;
     stream->n += frame_encode(ANALOGRIG_CATALOGUE_HASH, id, payload, &stream->bytes[stream->n]);
 }
 
-static void add_noise(stream_t* const stream, input_t* const input) {
+void target_add_noise(stream_t* const stream, input_t* const input) {
     for (uint8_t n = (uint8_t)(1U + (take_byte(input) % 32U)); n > 0U; n--) {
         stream->bytes[stream->n++] = take_byte(input);
     }
 }
 
-static size_t messages(const stream_t* const stream) {
+size_t target_messages(const stream_t* const stream) {
     frame_decoder_t decoder;
     frame_decoder_init(&decoder, ANALOGRIG_CATALOGUE_HASH);
     size_t frames = 0U;
@@ -29,7 +29,7 @@ static size_t messages(const stream_t* const stream) {
 }
 
 /// Nothing but whole frames.
-static size_t checked(const answers_t* const answers) {
+size_t target_checked(const answers_t* const answers) {
     frame_decoder_t decoder;
     frame_decoder_init(&decoder, ANALOGRIG_CATALOGUE_HASH);
     size_t frames = 0U;
@@ -46,17 +46,8 @@ static size_t checked(const answers_t* const answers) {
     return frames;
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
-    static serial_device_t   device;
-    static serial_device_t   device_at_once;
-    static const fuzz_line_t kind = { .line        = &serial_line,
-                                      .item_size   = 1U,
-                                      .answer_size = SERIAL_DEVICE_ANSWER,
-                                      .begin       = begin,
-                                      .add_message = add_message,
-                                      .add_noise   = add_noise,
-                                      .messages    = messages,
-                                      .checked     = checked };
-    fuzz_line(&kind, &device, &device_at_once, data, size);
-    return 0;
+target_t target(const uint8_t* const data, const size_t size) {
+    (void)data;
+    (void)size;
+    return (target_t){ .line = &serial_line, .item_size = 1U, .answer_size = SERIAL_DEVICE_ANSWER };
 }

@@ -22,11 +22,11 @@ static void add_text(stream_t* const stream, const char* const text) {
     stream->n += n;
 }
 
-static void begin(stream_t* const stream) { add_text(stream, "O\r"); }
+void target_begin(stream_t* const stream) { add_text(stream, "O\r"); }
 
 /// Now and then in the wrong kind of frame, or a digit too long.
-static void
-add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void
+target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     const slcan_t adapter = { .is_open = true };
     const uint8_t choice  = take_byte(input);
     can_frame_t   frame   = { .id = id, .length = analogrig_length(id) };
@@ -40,7 +40,7 @@ add_message(stream_t* const stream, const uint8_t id, const uint8_t* const paylo
 }
 
 /// Any bytes, or such as a line is made of.
-static void add_noise(stream_t* const stream, input_t* const input) {
+void target_add_noise(stream_t* const stream, input_t* const input) {
     static const char letters[] = "\r\r\r\rtTrRdDbBOOOLCSsYVNFZ0123456789ABCDEFabcdef0000";
     const uint8_t     choice    = take_byte(input);
     for (uint8_t n = (uint8_t)(1U + (choice % 32U)); n > 0U; n--) {
@@ -55,7 +55,7 @@ static bool may_be_message(const uint8_t* const line, const size_t n) {
            ((n == BLOCK_LINE) && ((line[4] == (uint8_t)'F') || (line[4] == (uint8_t)'f')));
 }
 
-static size_t messages(const stream_t* const stream) {
+size_t target_messages(const stream_t* const stream) {
     size_t found = 0U;
     size_t start = 0U;
     for (size_t i = 0U; i < stream->n; i++) {
@@ -96,7 +96,7 @@ static bool is_reply(const uint8_t* const line, const size_t n) {
 }
 
 /// Nothing but whole lines: replies, and frames of the device.
-static size_t checked(const answers_t* const answers) {
+size_t target_checked(const answers_t* const answers) {
     size_t frames = 0U;
     size_t start  = 0U;
     for (size_t i = 0U; i < answers->n; i++) {
@@ -119,17 +119,8 @@ static size_t checked(const answers_t* const answers) {
     return frames;
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
-    static slcan_device_t    device;
-    static slcan_device_t    device_at_once;
-    static const fuzz_line_t kind = { .line        = &slcan_line,
-                                      .item_size   = 1U,
-                                      .answer_size = SLCAN_DEVICE_ANSWER,
-                                      .begin       = begin,
-                                      .add_message = add_message,
-                                      .add_noise   = add_noise,
-                                      .messages    = messages,
-                                      .checked     = checked };
-    fuzz_line(&kind, &device, &device_at_once, data, size);
-    return 0;
+target_t target(const uint8_t* const data, const size_t size) {
+    (void)data;
+    (void)size;
+    return (target_t){ .line = &slcan_line, .item_size = 1U, .answer_size = SLCAN_DEVICE_ANSWER };
 }

@@ -65,6 +65,11 @@ class Difference:
     adjusted_p: float
     word: Word
 
+    @property
+    def shown(self) -> bool:
+        """Whether there is a difference beyond chance."""
+        return self.word != "no difference shown"
+
 
 @dataclass(frozen=True)
 class Comparison:

@@ -18,7 +18,7 @@ from harness.rigs.emulator import EmulatorRig
 from harness.rigs.rig import Rig
 from harness.run import Run
 from harness.trials import Trials, are_possible
-from harness.verdict import Verdict, judge
+from harness.verdict import TweakVerdict, Verdict, judge
 
 Row = dict[str, Any]
 """Of one trial, in plain values; see ``row``."""
@@ -43,6 +43,13 @@ def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
     return rows
 
 
+def _change(tweak: TweakVerdict) -> list[int | None]:
+    """At its likeliest instant; one that was not found in the samples is as one that nobody could see."""
+    if tweak.unseen:
+        return [None, None, False, False]
+    return [tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late]
+
+
 def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
     """What is kept of a trial.
 
@@ -54,7 +61,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
         "outcome": verdict.outcome,
         "samples": run.samples,
         "false_alarms": len(verdict.false_alarms),
-        "changes": [[tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late] for tweak in verdict.tweaks],
+        "changes": [_change(tweak) for tweak in verdict.tweaks],
         "errors": list(verdict.estimates[-1].error.values()) if verdict.estimates else [],
         "theta": verdict.theta_hash[:16],
     }

@@ -10,10 +10,40 @@ import os
 from collections.abc import Sequence
 from typing import NoReturn
 
-from harness.cli import campaign, certify, compare, effects, emulate, judge, netlist, replay, run, thesis
+from harness.cli import (
+    calibrate,
+    campaign,
+    certify,
+    compare,
+    compare_rigs,
+    doctor,
+    effects,
+    emulate,
+    judge,
+    netlist,
+    replay,
+    run,
+    serve,
+    thesis,
+)
 from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
 
-_COMMANDS = (run, replay, judge, campaign, certify, compare, thesis, emulate, effects, netlist)
+_COMMANDS = (
+    run,
+    replay,
+    judge,
+    campaign,
+    certify,
+    compare,
+    thesis,
+    emulate,
+    serve,
+    doctor,
+    calibrate,
+    compare_rigs,
+    effects,
+    netlist,
+)
 """Each has ``add(commands)``; in the order of ``--help``."""
 
 

@@ -53,8 +53,14 @@ def _text(found: Comparison) -> str:
     lines = [
         f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; {same} of {both} in common identical to the bit",
         "",
+        differences_text(found),
     ]
-    lines.append(f"  {'':14}{'A':>11}{'B':>11}  {'unit':24}{'seeds':>6}{'p':>10}{'adjusted':>10}  test")
+    return "\n".join(lines)
+
+
+def differences_text(found: Comparison) -> str:
+    """The table of differences, and what may be said of it."""
+    lines = [f"  {'':14}{'A':>11}{'B':>11}  {'unit':24}{'seeds':>6}{'p':>10}{'adjusted':>10}  test"]
     lines += [
         f"  {each.quantity:14}{each.a:11.4g}{each.b:11.4g}  {each.unit:24}{each.seeds:6}{each.p:10.2g}"
         f"{each.adjusted_p:10.2g}  {each.test}: {each.word.upper() if each.word == 'worse' else each.word}"

@@ -29,14 +29,24 @@ def prepare(out: Path, rig: Rig) -> None:
     from harness.errors import ConfigurationError
     from harness.rigs.recording import RecordingRig
 
+    make_folder(out)
+    if isinstance(rig, RecordingRig) and rig.path.resolve() == (out / RUN_FILE).resolve():
+        raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
+
+
+def make_folder(out: Path) -> None:
+    """Find out before the work whether its results can be kept.
+
+    :raises ConfigurationError: the folder cannot be made, or cannot be written to.
+    """
+    from harness.errors import ConfigurationError
+
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigurationError(f"--out {out}: {error.strerror or error}") from error
     if not os.access(out, os.W_OK | os.X_OK):
         raise ConfigurationError(f"--out {out}: cannot be written to")
-    if isinstance(rig, RecordingRig) and rig.path.resolve() == (out / RUN_FILE).resolve():
-        raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
 
 
 def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:

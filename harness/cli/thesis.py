@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from harness.cli.playing import make_folder
 from harness.cli.terminal import PASSED, show
 
 
@@ -26,6 +27,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from harness.thesis import reproduce
     from harness.thesis.reproduction import PAGE
 
+    make_folder(arguments.out)
     reproduction = reproduce()
     reproduction.write(arguments.out)
     if arguments.json:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from harness.catalogue import BLOCK_SAMPLES, LAYOUTS
 
@@ -304,17 +304,15 @@ def exchange_load(
 
 
 def load_of(run: Run) -> BusLoad | None:
-    """Of a run as it was described; None: it was on no CAN bus, or on one of unknown bit rate."""
+    """Of a run; None: it was on no CAN bus, or on one of unknown bit rate."""
     ran = run.conditions
-    dut: Mapping[str, Any] = ran.dut
-    bitrate = dut.get("bitrate")
-    if not isinstance(bitrate, int) or isinstance(bitrate, bool):
+    if "bitrate" not in ran.line:
         return None
     return exchange_load(
-        bitrate=bitrate,
-        data_bitrate=dut.get("data_bitrate"),
-        in_blocks=dut.get("exchange", "sample") != "sample" and bool(dut.get("fd")),
+        bitrate=ran.line["bitrate"],
+        data_bitrate=ran.line.get("data_bitrate"),
+        in_blocks=ran.line.get("samples_per_message", 1) > 1,
         parameters=run.theta.shape[1],
-        report_interval_n=int(dut.get("report_interval_n", 1)),
+        report_interval_n=int(ran.dut.get("report_interval_n", 1)),
         period_s=ran.sample_period_s * (ran.real_time or 1.0),
     )

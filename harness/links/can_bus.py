@@ -6,19 +6,20 @@ python-can's exceptions end here: what they mean is one line that names the bus,
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
+import importlib
+import inspect
 import logging
 import os
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
-import can
-from can.interfaces.slcan import slcanBus
-
 from harness.errors import ConfigurationError, LinkClosed, LinkError
 from harness.links.child import Child
 from harness.links.line import CanLine
+from harness.links.python_can import BACKENDS, BitTimingDict, BitTimingFdDict, can, slcanBus
 from harness.links.wire import WRITE_TIMEOUT_S, Clock
 
 RECEIVED_AHEAD_N = 200
@@ -87,13 +88,12 @@ class PythonCanBus:
 
     unread_n = RECEIVED_AHEAD_N
 
-    def __init__(self, asked: Mapping[str, Any], *, name: str | None = None) -> None:
-        """Open what ``asked`` says in the words of ``can.Bus``; python-can's own configuration says the rest.
+    def __init__(self, config: Mapping[str, Any], *, name: str | None = None) -> None:
+        """Open what ``config`` says in the words of ``can.Bus``, with interface and channel, and nothing else.
 
         :raises ConfigurationError: there is no such kind of interface, or it cannot be as it is asked to be.
         :raises LinkError: it cannot be opened.
         """
-        config = _complete(asked)
         interface, self.channel = str(config["interface"]), config["channel"]
         where = interface if self.channel is None else f"{interface}/{self.channel}"
         self.name = where if name is None else name
@@ -102,8 +102,7 @@ class PythonCanBus:
         self._never_echoes = is_socket and not config.get("receive_own_messages")
         self.clock: Clock = time.monotonic
         self.is_fd = bool(config.get("fd"))
-        bitrate, data_bitrate = config.get("bitrate"), config.get("data_bitrate")
-        self.line = CanLine(bitrate, data_bitrate) if isinstance(bitrate, int) else None
+        self.line = _line(config)
         self.damaged = 0
         self._bus = self._open(config)
 
@@ -199,21 +198,78 @@ def _is_sound(frame: can.Message) -> bool:
     )
 
 
-def _complete(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """With what python-can's files and environment say."""
+def _line(config: Mapping[str, Any]) -> CanLine | None:
+    """The bit rates, whichever way they are said; None: they are not."""
+    timing = config.get("timing")
+    if isinstance(timing, can.BitTimingFd):
+        return CanLine(timing.nom_bitrate, timing.data_bitrate)
+    bitrate = timing.bitrate if isinstance(timing, can.BitTiming) else config.get("bitrate")
+    return CanLine(bitrate, config.get("data_bitrate")) if isinstance(bitrate, int) else None
+
+
+# --------------------------------------------------------------------------------------- python-can's own configuration
+
+_OF_ANY = frozenset({"interface", "channel", "fd", "bitrate", "data_bitrate", "timing"})
+"""Keys that may describe a bus also where an interface has no use for them."""
+_TIMING = frozenset(BitTimingDict.__annotations__) | frozenset(BitTimingFdDict.__annotations__)
+"""Of what ``timing`` is made."""
+
+
+def completed(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """All that ``can.Bus`` is to be told: ``asked``, and what python-can's files and environment say besides.
+
+    ``config_context`` in ``asked`` is the section of theirs that comes first. What they say that is of no use to the
+    interface is left out.
+
+    :raises ConfigurationError: there is no such kind of interface, or it has not heard of a key that was asked for.
+    """
+    said = dict(asked)
+    context = said.pop("config_context", None)
+    config = _loaded(said, None if context is None else str(context))
+    interface = str(config["interface"])
+    known = _keys(interface)
+    if known is None:
+        return config
+    for key in said:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, 1)
+            meant = f": is {near[0]!r} meant?" if near else ""
+            raise ConfigurationError(f"can:{interface}: python-can's {interface} has no key {key!r}{meant}")
+    return {key: value for key, value in config.items() if key in known}
+
+
+def _loaded(asked: dict[str, Any], context: str | None) -> dict[str, Any]:
     try:
-        return dict(can.util.load_config(config=dict(asked)))
+        return dict(can.util.load_config(config=asked, context=context))
     except can.CanInterfaceNotImplementedError as error:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         interface = asked.get("interface")
-        if interface is None:
-            raise ConfigurationError(
-                "can: say which interface, can:virtual or can:socketcan/can0, or name it in python-can's own"
-                f" configuration (CAN_INTERFACE, ~/can.conf); python-can knows {known}"
-            ) from error
-        raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
+        if interface is not None:
+            raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
+        suffix, section = ("", "") if context is None else (f"_{context}", f" [{context}]")
+        raise ConfigurationError(
+            "can: say which interface, can:virtual or can:socketcan/can0, or name it in python-can's own"
+            f" configuration (CAN_INTERFACE{suffix}, ~/can.conf{section}); python-can knows {known}"
+        ) from error
     except Exception as error:  # of a configuration file, whatever is wrong with it
         raise ConfigurationError(f"can: python-can's configuration: {_words(error)}") from error
+
+
+def _keys(interface: str) -> set[str] | None:
+    """What the constructor of an interface names: its parameters, and what it looks up in those without a name, which
+    takes any; None: its driver is not there, so that nobody knows."""
+    module, name = BACKENDS[interface]
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except Exception:  # noqa: BLE001 - the opening says what the driver has to say
+        return None
+    keys = set(_OF_ANY | _TIMING)
+    for each in set(kind.__mro__) - {can.BusABC}:
+        code = getattr(inspect.unwrap(vars(each).get("__init__", each)), "__code__", None)
+        if code is not None:
+            keys.update(code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount])
+            keys.update(value for value in code.co_consts if isinstance(value, str) and value.isidentifier())
+    return keys
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -8,12 +8,11 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
-import can
-
 from harness.catalogue import CATALOGUE_HASH, FirmwareId
 from harness.errors import LinkClosed
 from harness.links.can_bus import CanBus
 from harness.links.line import CanLine
+from harness.links.python_can import can
 from harness.links.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
 
 MOST_BYTES = 64

@@ -10,13 +10,12 @@ import copy
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-import can
-
 from harness.catalogue import LAYOUTS, Message, pack, unpack
 from harness.errors import LinkError
 from harness.links.bus_load import CLASSIC_BYTES
 from harness.links.can_bus import CanBus
 from harness.links.link import CanListener
+from harness.links.python_can import can
 
 _OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
 _DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}

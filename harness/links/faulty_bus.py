@@ -7,14 +7,13 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import can
-
 from harness.catalogue import LAYOUTS, Hello, pack, unpack
 from harness.links.can_bus import CanBus
 from harness.links.can_device import MemoryBus
 from harness.links.can_link import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
 from harness.links.faulty_wire import STRANGERS_HASH
 from harness.links.line import CanLine
+from harness.links.python_can import can
 from harness.links.wire import VirtualClock
 from harness.links.wire_faults import LONGEST_DELAY_S, Direction, FaultyLine, Lane, WireFaults
 

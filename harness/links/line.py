@@ -28,6 +28,9 @@ class Line(Protocol):
     def speed(self) -> str:
         """In words, for errors."""
 
+    def rates(self) -> dict[str, int]:
+        """By name, for the record [bit/s]."""
+
     def message_s(self, kind: type[Message]) -> float:
         """How long one message takes, at most [s]."""
 
@@ -44,6 +47,9 @@ class SerialLine:
     @property
     def speed(self) -> str:
         return f"{self.baud} baud"
+
+    def rates(self) -> dict[str, int]:
+        return {"baud": self.baud}
 
     def bytes_s(self, n: int) -> float:
         """How long so many bytes take [s]."""
@@ -68,6 +74,10 @@ class CanLine:
     def speed(self) -> str:
         faster = "" if self.data_bitrate is None else f", data {self.data_bitrate} bit/s"
         return f"{self.bitrate} bit/s{faster}"
+
+    def rates(self) -> dict[str, int]:
+        faster = {} if self.data_bitrate is None else {"data_bitrate": self.data_bitrate}
+        return {"bitrate": self.bitrate, **faster}
 
     def frame_s(self, frame: can.Message) -> float:
         """How long this very frame takes, with the space after it [s]."""

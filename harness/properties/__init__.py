@@ -10,15 +10,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from harness.errors import ConfigurationError
 from harness.played import Finding, Played
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario
 
-__all__ = ["TRIES", "Play", "with_some_seed"]
+__all__ = ["TRIES", "Play", "is_playable", "with_some_seed"]
 
 Play = Callable[..., Played]
 
 TRIES = 5
 """What chance may spoil has failed when it did so with as many seeds, one after the other."""
+
+
+def is_playable(rig: Rig, scenario: Scenario) -> bool:
+    """Whether the rig has the waveform and the pots; one that has next to none fails hypothesis's health check."""
+    try:
+        rig.perform(scenario, 0)
+    except ConfigurationError:
+        return False
+    return True
 
 
 def with_some_seed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from harness.properties import Play, with_some_seed
 from harness.properties.test_detection import SURELY, passes, stays_quiet
 from harness.rare import false_alarm_rate
 from harness.rigs.emulator import EmulatorRig
+from harness.rigs.recording import RecordingRig
 from harness.rigs.rig import Rig
 from harness.scenario import PlantChoice, Scenario
 from harness.statistics import Design, lower_rate, mean_bounds
@@ -62,9 +64,10 @@ def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
     if not isinstance(described, InprocDevice) and described.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {described.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
     clean = Bench(rig, dut).play(SHORT, seed)
+    again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
     try:
         with open_dut(dut.name, wire_faults=faults) as spoiled:
-            run = Bench(rig, spoiled).play(SHORT, seed)
+            run = Bench(again, spoiled).play(again.scenario(), seed)
     except AnalogrigError:
         return  # refused before the run, with the cause
     assert judge(run).outcome == "inconclusive" or run.theta_hash() == clean.theta_hash()

@@ -14,7 +14,8 @@ from hypothesis import assume, given
 from emulator.excitation import Excitation
 from harness.information import detectable
 from harness.played import Finding, Played
-from harness.properties import Play, with_some_seed
+from harness.properties import Play, is_playable, with_some_seed
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario, Tweak
 from harness.statistics import Decision, SequentialTest, lower_rate
 from harness.strategies import WARM_UP_N, profile, scenarios, seeds
@@ -68,7 +69,8 @@ def stays_quiet(played: Played) -> Finding:
 @pytest.mark.needs("tweak", "excite")
 @profile()
 @given(scenario=scenarios(expect=PATIENT), seed=seeds())
-def test_every_change_that_can_be_seen_is_found_once(play: Play, scenario: Scenario, seed: int) -> None:
+def test_every_change_that_can_be_seen_is_found_once(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
     assume(detectable(scenario, ARL0**MOST_INFORMATION))
     assert with_some_seed(play, scenario, seed, passes)
 
@@ -76,7 +78,8 @@ def test_every_change_that_can_be_seen_is_found_once(play: Play, scenario: Scena
 @pytest.mark.needs("excite")
 @profile()
 @given(scenario=scenarios(most_changes=0), seed=seeds())
-def test_a_plant_that_does_not_change_raises_no_alarm(play: Play, scenario: Scenario, seed: int) -> None:
+def test_a_plant_that_does_not_change_raises_no_alarm(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
     assert with_some_seed(play, scenario, seed, stays_quiet)
 
 

@@ -6,14 +6,15 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 
 from emulator.excitation import Excitation
 from harness.bench import Bench
 from harness.dut import Dut
 from harness.played import Finding, Played
-from harness.properties import Play, with_some_seed
+from harness.properties import Play, is_playable, with_some_seed
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
+from harness.rigs.rig import Rig
 from harness.scenario import Scenario
 from harness.strategies import profile, rigs, scenarios, seeds
 from harness.verdict import judge
@@ -40,7 +41,8 @@ def estimates(played: Played) -> Finding:
 @pytest.mark.needs("excite")
 @profile()
 @given(scenario=scenarios(most_changes=0), seed=seeds())
-def test_estimates_come_to_the_truth(play: Play, scenario: Scenario, seed: int) -> None:
+def test_estimates_come_to_the_truth(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
     assert with_some_seed(play, scenario, seed, estimates)
 
 

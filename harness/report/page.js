@@ -3,13 +3,10 @@
   const HEIGHT_PX = 210;
   const LEFT_PX = 84;
   const RIGHT_PX = 80;
-  const FONT = "12px system-ui, sans-serif";
-  const PRINT_WIDTH_PX = 700; // an A4 page between its margins
   const ROBUST_TAIL = 0.15; // of the estimates in view, on either side, may lie outside the plot ...
   const ROBUST_SPREAD = 0.6; // ... and nothing farther than this from the truth widens it
   const CEILINGS_SHOWN = 2;
-  const DENSE_PX = 10; // false alarms that are nearer to each other than this ...
-  const DENSE_ALPHA = 0.2; // ... fade, at most to this
+  const { alarms, begin, cursor, curve, inks, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf } = plotting;
 
   const run = JSON.parse(document.getElementById("run").textContent);
   const last = run.samples - 1;
@@ -17,10 +14,7 @@
   const view = { min: 0, max: last };
   let plots = [];
 
-  async function decoded() {
-    const bytes = Uint8Array.from(atob(run.deflated), (c) => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const buffer = await new Response(stream).arrayBuffer();
+  function decoded(buffer) {
     const types = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
     const signals = {};
     let at = 0;
@@ -59,11 +53,6 @@
     return values.slice(first, Math.min(last, Math.floor(view.max)) + 1).filter((v) => v !== null);
   }
 
-  function padded(low, high) {
-    const margin = Math.max(0.1 * (high - low), 0.01 * Math.abs(high), 1e-12);
-    return [low - margin, high + margin];
-  }
-
   function extent(values) {
     return values.reduce(([low, high], v) => [Math.min(low, v), Math.max(high, v)], [Infinity, -Infinity]);
   }
@@ -97,103 +86,28 @@
 
   // Marks
 
-  // Lines lie under the signals, flags and labels above them.
-  function marks(u, ink) {
-    const px = devicePixelRatio;
-    const seen = (mark) => mark.sample >= view.min && mark.sample <= view.max;
-    const noticed = run.alarms.filter((alarm) => seen(alarm) && !alarm.false);
-    const wrong = run.alarms.filter((alarm) => seen(alarm) && alarm.false);
-    const room_px = u.bbox.width / px / Math.max(1, wrong.length);
-    const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
-    return {
-      lines() {
-        verticals(u, run.overloads.filter(seen), { colour: ink("truth"), width: 2, dash: [1, 3], alpha: 1 });
-        verticals(u, run.tweaks.filter(seen), { colour: ink("ink"), width: 1.25, dash: [], alpha: 1 });
-        verticals(u, wrong, { colour: ink("false"), width: 2.25, dash: [2, 3], alpha });
-        verticals(u, noticed, { colour: ink("alarm"), width: 1.75, dash: [6, 4], alpha: 1 });
-      },
-      flags() {
-        flags(u, wrong, ink("false"));
-        flags(u, noticed, ink("alarm"));
-        labels(u, run.tweaks.filter(seen), ink);
-        lamps(u, run.overloads.filter(seen), ink);
-      },
-    };
-  }
-
-  function position(u, sample) {
-    return Math.round(u.valToPos(sample, "x", true)) + 0.5;
-  }
-
-  function verticals(u, marked, { colour, width, dash, alpha }) {
-    const { ctx, bbox } = u;
-    const px = devicePixelRatio;
-    ctx.save();
-    ctx.strokeStyle = colour;
-    ctx.globalAlpha = alpha;
-    ctx.lineWidth = width * px;
-    ctx.setLineDash(dash.map((d) => d * px));
-    ctx.beginPath();
-    for (const { sample } of marked) {
-      ctx.moveTo(position(u, sample), bbox.top);
-      ctx.lineTo(position(u, sample), bbox.top + bbox.height);
-    }
-    ctx.stroke();
-    ctx.restore();
-  }
-
-  function flags(u, marked, colour) {
-    const { ctx, bbox } = u;
-    const [size, bottom] = [5 * devicePixelRatio, bbox.top + bbox.height];
-    ctx.save();
-    ctx.fillStyle = colour;
-    for (const { sample } of marked) {
-      ctx.beginPath();
-      ctx.moveTo(position(u, sample), bottom - 2 * size);
-      ctx.lineTo(position(u, sample) + size, bottom);
-      ctx.lineTo(position(u, sample) - size, bottom);
-      ctx.fill();
-    }
-    ctx.restore();
-  }
-
-  function labels(u, tweaks, ink) {
-    const { ctx, bbox } = u;
-    const px = devicePixelRatio;
-    lettered(u, ink("ink"), "center", "bottom");
-    let free = -Infinity;
-    for (const tweak of tweaks) {
-      const x = position(u, tweak.sample);
-      const half = ctx.measureText(tweak.label).width / 2;
-      if (x - half < free) continue; // it would cover its neighbour; zooming in makes room
-      ctx.fillText(tweak.label, x, bbox.top - 2 * px);
-      free = x + half + 6 * px;
-    }
-    ctx.restore();
-  }
+  const marked = (all) => all.map((mark) => ({ ...mark, at: mark.sample }));
+  const changes = marked(run.tweaks);
+  const lit = marked(run.overloads);
+  const noticed = marked(run.alarms.filter((alarm) => !alarm.false));
+  const wrong = marked(run.alarms.filter((alarm) => alarm.false));
+  const marks = { changes, noticed, wrong };
 
   // A lit lamp and the name of its amplifier, inside the plot: those of one sample below one another.
-  function lamps(u, overloads, ink) {
+  function lamps(u, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
     lettered(u, ink("truth"), "left", "middle");
-    overloads.forEach((lamp, k) => {
-      const above = overloads.slice(0, k).filter((other) => other.sample === lamp.sample).length;
-      const [x, y] = [position(u, lamp.sample), bbox.top + (8 + 14 * above) * px];
+    const seen = lit.filter(({ at }) => at >= view.min && at <= view.max);
+    seen.forEach((lamp, k) => {
+      const above = seen.slice(0, k).filter((other) => other.at === lamp.at).length;
+      const [x, y] = [position(u, lamp.at), bbox.top + (8 + 14 * above) * px];
       ctx.beginPath();
       ctx.arc(x, y, 4 * px, 0, 2 * Math.PI);
       ctx.fill();
       ctx.fillText(lamp.label, x + 7 * px, y);
     });
     ctx.restore();
-  }
-
-  function lettered({ ctx }, colour, align, baseline) {
-    ctx.save();
-    ctx.font = FONT.replace(/^\d+/, (size) => String(size * devicePixelRatio));
-    ctx.fillStyle = colour;
-    ctx.textAlign = align;
-    ctx.textBaseline = baseline;
   }
 
   function missingBand(u, stretches, ink) {
@@ -214,7 +128,7 @@
 
   function line(label, ink, colour, unit, more) {
     const value = (u, v) => (v === null || v === undefined ? "–" : `${v.toPrecision(5)}${unit ? " " + unit : ""}`);
-    return { label, stroke: ink(colour), width: 1.5, points: { show: false }, value, ...more };
+    return curve(label, ink(colour), { value, ...more });
   }
 
   // Circles around the values at which the channel's bit of `clipped` is set.
@@ -232,23 +146,13 @@
   }
 
   function axis(scale, label, side, ink, colour = "muted") {
-    return {
-      scale,
-      side,
-      label,
-      size: (side === 3 ? LEFT_PX : RIGHT_PX) - 22,
-      labelSize: 22,
-      labelGap: 0,
-      font: FONT,
-      labelFont: FONT,
-      stroke: ink(colour),
-      grid: { show: side === 3, stroke: ink("line"), width: 1 },
-      ticks: { stroke: ink("line"), width: 1, size: 5 },
-    };
+    const size = (side === 3 ? LEFT_PX : RIGHT_PX) - 22;
+    const grid = { show: side === 3, stroke: ink("line"), width: 1 };
+    return plotting.axis(scale, label, side, ink, { size, labelSize: 22, stroke: ink(colour), grid });
   }
 
   function sampleAxis(ink) {
-    return { ...axis("x", "sample", 2, ink), size: 26, labelSize: 18, grid: { stroke: ink("line"), width: 1 } };
+    return plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 });
   }
 
   function pair(signals, ink, caption, left, right) {
@@ -302,7 +206,7 @@
       width,
       height: HEIGHT_PX,
       padding: [20, rightAxis ? 0 : RIGHT_PX, 0, 0],
-      cursor: { y: false, sync: { key: "run", scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
+      cursor: cursor("run"),
       scales: {
         x: {
           time: false,
@@ -317,8 +221,8 @@
       axes: [sampleAxis(ink), ...plot.axes],
       series: [{ label: "sample" }, ...plot.series],
       hooks: {
-        drawAxes: [(u) => marks(u, ink).lines()],
-        draw: [(u) => missingBand(u, stretches, ink), (u) => marks(u, ink).flags()],
+        drawAxes: [(u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }), (u) => alarms(u, marks, ink).lines()],
+        draw: [(u) => missingBand(u, stretches, ink), (u) => alarms(u, marks, ink).flags(), (u) => lamps(u, ink)],
       },
     };
   }
@@ -328,10 +232,9 @@
   }
 
   function draw(signals) {
-    const style = getComputedStyle(document.documentElement);
-    const ink = (name) => style.getPropertyValue(`--${name}`).trim();
+    const ink = inks();
     const place = document.getElementById("plots");
-    const width = document.documentElement.classList.contains("printing") ? PRINT_WIDTH_PX : place.clientWidth;
+    const width = widthOf(place);
     const stretches = missingStretches(signals.missing.raw);
     const samples = Array.from({ length: run.samples }, (_, k) => k);
     const kept = { ...view };
@@ -351,30 +254,10 @@
       caption.textContent = plot.caption;
       figure.append(caption);
       place.append(figure);
-      const drawn = new uPlot(options(plot, width, ink, stretches), [samples, ...plot.data], figure);
-      const canvas = drawn.root.querySelector("canvas");
-      canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", `${plot.caption}, samples 0 to ${last}`);
-      return drawn;
+      const name = `${plot.caption}, samples 0 to ${last}`;
+      return plotted(options(plot, width, ink, stretches), [samples, ...plot.data], figure, name);
     });
     show(kept.min, kept.max);
-  }
-
-  function redrawn(signals) {
-    const again = () => draw(signals);
-    const printing = (on) => () => {
-      document.documentElement.classList.toggle("printing", on);
-      again();
-    };
-    addEventListener("beforeprint", printing(true));
-    addEventListener("afterprint", printing(false));
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
-    const place = document.getElementById("plots");
-    new ResizeObserver(() => {
-      const width = place.clientWidth;
-      if (document.documentElement.classList.contains("printing") || plots[0].width === width) return;
-      for (const plot of plots) plot.setSize({ width, height: HEIGHT_PX });
-    }).observe(place);
   }
 
   function controlled() {
@@ -391,24 +274,14 @@
     }
   }
 
-  function trouble(text) {
-    const place = document.getElementById("trouble");
-    place.textContent = text;
-    place.hidden = false;
-  }
-
-  async function main() {
-    if (!run.samples) return trouble("The run ended before its first sample: there is nothing to plot.");
-    if (typeof DecompressionStream === "undefined") return trouble("This browser is too old for the plots: it has no DecompressionStream.");
-    const signals = await decoded();
+  function shown(buffer) {
+    const signals = decoded(buffer);
     draw(signals);
-    redrawn(signals);
+    redrawn(() => draw(signals), document.getElementById("plots"), () => plots, HEIGHT_PX);
     controlled();
-    document.documentElement.dataset.drawn = String(plots.length);
+    return plots.length;
   }
 
-  main().catch((error) => {
-    trouble(`The plots could not be drawn: ${error.message}`);
-    throw error;
-  });
+  if (run.samples) begin(run.deflated, shown);
+  else trouble("The run ended before its first sample: there is nothing to plot.");
 })();

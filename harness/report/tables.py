@@ -10,7 +10,7 @@ from harness.advice import advice
 from harness.links.bus_load import load_of
 from harness.plant import PARAMETERS, UNITS
 from harness.run import Run
-from harness.summary import lamps_text, load_text
+from harness.summary import lamps_text, latency_text, load_text
 from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
 
 _MAX_FALSE_ALARMS = 20
@@ -73,6 +73,8 @@ def tweaks(verdict: Verdict) -> str:
         return "<p>The plant did not change in this run.</p>"
     assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
     caption = f"Latency and bound in samples from the change; {assumed}"
+    if any(tweak.others for tweak in verdict.tweaks):
+        caption += "; where the instant was learned from the samples, from the earliest to the latest"
     head = _row(
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
     )
@@ -95,6 +97,9 @@ def diagnoses(verdict: Verdict) -> str:
 def false_alarms(run: Run, verdict: Verdict) -> str:
     """Every alarm that belongs to no change."""
     count = len(verdict.false_alarms)
+    if not count and verdict.doubtful_alarms:
+        at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
+        return f"<p>None for certain; depending on when the changes came the alarms at {at} are such.</p>"
     if not count:
         return f"<p>None in {run.samples:,} samples.</p>"
     statistics = dict(zip(run.alarm_index.tolist(), run.alarm_statistic.tolist(), strict=True))
@@ -148,7 +153,7 @@ def _tally(run: Run, verdict: Verdict) -> str:
     """The figures in one sentence; none for a run that is not valid, since they would read like a result."""
     if not verdict.valid:
         return ""
-    noticed = sum(tweak.latency_n is not None for tweak in verdict.tweaks)
+    noticed = sum(tweak.result in {"noticed", "late"} for tweak in verdict.tweaks)
     count = len(verdict.tweaks)
     changes = f"{noticed} of {_plural(count, 'change')} noticed" if count else "No change to notice"
     false = _plural(len(verdict.false_alarms), "false alarm")
@@ -170,9 +175,12 @@ def _tweak_row(tweak: TweakVerdict) -> str:
     change = ", ".join(
         f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
     )
-    ratio = tweak.latency_n / tweak.bound_n if tweak.latency_n is not None and tweak.bound_n else None
+    exact = not tweak.others and tweak.latency_n is not None and tweak.bound_n
+    ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
-    cells = [_zoom(tweak.sample), _cell(change, "text"), _number(tweak.latency_n), _number(tweak.bound_n)]
+    low, high = tweak.between
+    instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
+    cells = [instant, _cell(change, "text"), f"<td class='number'>{_latency(tweak)}</td>", _number(tweak.bound_n)]
     return _row([*cells, _number(ratio, ".2f"), _cell(word, f"text {kind}")])
 
 
@@ -184,15 +192,20 @@ def _diagnosis_row(tweak: TweakVerdict, diagnosis: DiagnosisVerdict) -> str:
     return _row([*cells, _cell(word, f"text {kind}")])
 
 
+def _latency(tweak: TweakVerdict) -> str:
+    return "–" if tweak.latencies_n is None else _text(latency_text(tweak)).replace("-", "–")
+
+
 def _result(tweak: TweakVerdict) -> tuple[str, str]:
     """A word and a class of the style."""
-    if tweak.missed:
-        return "✗ MISSED", "bad"
-    if tweak.late:
-        return f"✗ LATE, after {tweak.deadline_n}", "bad"
-    if tweak.latency_n is None:
-        return "could not be seen", "neutral"
-    return "✓ noticed", "good"
+    return {
+        "missed": ("✗ MISSED", "bad"),
+        "late": (f"✗ LATE, after {tweak.deadline_n}", "bad"),
+        "unseeable": ("could not be seen", "neutral"),
+        "undecided": ("? depends on when it came", "neutral"),
+        "not judged": ("? not judged: not found in the samples", "neutral"),
+        "noticed": ("✓ noticed", "good"),
+    }[tweak.result]
 
 
 def _segment_row(segment: SegmentEstimate) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Self
@@ -15,15 +16,21 @@ from numpy.typing import NDArray
 from emulator import (
     CARDS,
     COMPONENTS,
+    IDEAL,
     OP_AMP_GRADES,
+    PROGRAMS,
+    Capacitor,
     Card,
     Components,
     EmulatorError,
     Excitation,
     NoisySuspension,
+    OpAmp,
     OpAmpGrade,
+    Pot,
     RampedTweak,
     RepeatedPlay,
+    Resistor,
     Sampler,
     SuspensionComputer,
     acquired,
@@ -40,6 +47,52 @@ from harness.scenario import Scenario
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
+MOST_DEVIATION = 0.9
+
+
+@dataclass(frozen=True)
+class MeasuredValues:
+    """The ``[computer.values]`` table: one machine as it was measured, by the names of its elements.
+
+    What is not named is as the diagram and the amplifiers' datasheet say; nothing is drawn. ``analogrig calibrate``
+    writes it.
+    """
+
+    deviation: Mapping[str, float] = field(default_factory=dict)
+    """Of a resistor, capacitor or track of a pot from the diagram's value, a fraction."""
+    offset_v: Mapping[str, float] = field(default_factory=dict)
+    """Of an amplifier."""
+    bandwidth: Mapping[str, float] = field(default_factory=dict)
+    """By which fraction an amplifier's is more than the model's."""
+    slew: Mapping[str, float] = field(default_factory=dict)
+    """Likewise."""
+
+    def __post_init__(self) -> None:
+        parts, amplifiers = _element_names()
+        for table, known, most in (
+            ("deviation", parts, MOST_DEVIATION),
+            ("offset_v", amplifiers, MOST_OFFSET_V),
+            ("bandwidth", amplifiers, MOST_DEVIATION),
+            ("slew", amplifiers, MOST_DEVIATION),
+        ):
+            for name, value in getattr(self, table).items():
+                if name not in known:
+                    raise ValueError(f"{table}: unknown key {name!r} (known: {', '.join(known)})")
+                if not abs(value) <= most:
+                    raise ValueError(f"{table}.{name} must be within +-{most:g}, not {value:g}")
+
+    def put_in(self, stock: Components) -> Components:
+        """The machine, of components that are otherwise those of the stock."""
+        given = {**self.deviation, **self.offset_v}
+        return dataclasses.replace(stock.undrawn(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew)
+
+
+@functools.cache
+def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Of the resistors, capacitors and pots, and of the amplifiers, of all programs, in the order of their diagrams."""
+    elements = [each for program in PROGRAMS.values() for each in program.netlist([IDEAL] * program.amplifiers)]
+    parts = dict.fromkeys(each.name for each in elements if isinstance(each, Resistor | Capacitor | Pot))
+    return tuple(parts), tuple(dict.fromkeys(each.name for each in elements if isinstance(each, OpAmp)))
 
 
 @dataclass(frozen=True)
@@ -51,6 +104,13 @@ class ComputerDescription:
     """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
     components: Literal["nominal", "polyester", "polypropylene"] = "nominal"
     """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
+    specimen: int | None = None
+    """The seed from which the machine is drawn, whatever that of a run: all runs are of the same machine then."""
+    pots: Literal["coefficient", "dial"] = "coefficient"
+    """To what they are set: to the coefficient, read under the real load (pot-set mode), or to the dial at which those
+    of a nominal machine would pass it (digital pots)."""
+    values: MeasuredValues | None = None
+    """What was measured of the machine; then nothing of it is drawn."""
     temperature_c: float = 25.0
     age_h: float = 0.0
     wiper_noise_ohm: float = 0.0
@@ -59,7 +119,7 @@ class ComputerDescription:
     """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
 
     def fitted(self, seed: int) -> Components:
-        """The components of the machine that the seed gives.
+        """The components of the machine: as measured, or those that the seed gives.
 
         :raises CircuitError: a value is out of range.
         """
@@ -71,11 +131,31 @@ class ComputerDescription:
                 stock, pots=dataclasses.replace(stock.pots, wiper_noise_ohm=self.wiper_noise_ohm)
             )
         graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
-        return dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
+        stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
+        return stock if self.values is None else self.values.put_in(stock)
+
+    def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+        """The machine that the seed of a run gives, wired as a program, its pots as that has them.
+
+        :raises EmulatorError: it cannot be.
+        """
+        specimen = seed if self.specimen is None else self.specimen
+        return SuspensionComputer(
+            program,
+            opamp=preset(self.op_amp),
+            rng=Stream.COMPONENTS.generator(specimen),
+            offset_v=self.offset_v,
+            components=self.fitted(specimen),
+            sample_rate_hz=sample_rate_hz,
+        )
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
             raise ValueError(f"offset_v must be 0 to {MOST_OFFSET_V:g}, not {self.offset_v:g}")
+        if self.specimen is not None and self.specimen < 0:
+            raise ValueError(f"specimen must be 0 to 2^63 - 1, not {self.specimen}")
+        if self.values is not None and (self.offset_v or self.specimen is not None):
+            raise ValueError("offset_v and specimen are for what is drawn: with values nothing is")
 
 
 @dataclass(frozen=True)
@@ -85,8 +165,8 @@ class CardDescription:
     range_v: Mapping[str, tuple[float, float]]
     bits: int = 12
     rate_hz: float = 20e3
-    noise_lsb: float | None = None
-    """rms on every channel, before quantisation; that of the model when it is not given."""
+    noise_lsb: float | Mapping[str, float] | None = None
+    """rms before quantisation, on every channel or by the channel's name; that of the model when it is not given."""
     model: Literal["ideal", "dt2821", "skewed"] = "ideal"
     faults: Mapping[str, Any] = field(default_factory=dict)
     """Fields of ``emulator.Card`` that differ from the model's: ``skew_s``, ``stuck_high``, ``clock_drift_ppm``, ..."""
@@ -105,19 +185,29 @@ class CardDescription:
                 )
         if not 1.0 <= self.rate_hz <= MOST_RATE_HZ:
             raise ValueError(f"rate_hz must be 1 to {MOST_RATE_HZ:g}, not {self.rate_hz:g}")
-        if self.noise_lsb is not None and not 0.0 <= self.noise_lsb <= MOST_NOISE_LSB:
-            raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {self.noise_lsb:g}")
+        if isinstance(self.noise_lsb, Mapping) and set(self.noise_lsb) != set(CHANNELS):
+            raise ValueError(f"noise_lsb must give the channels {', '.join(CHANNELS)}, not {', '.join(self.noise_lsb)}")
+        for noise_lsb in self._noises_lsb() or ():
+            if not 0.0 <= noise_lsb <= MOST_NOISE_LSB:
+                raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {noise_lsb:g}")
+
+    def _noises_lsb(self) -> tuple[float, ...] | None:
+        """Of each channel, if given."""
+        if isinstance(self.noise_lsb, Mapping):
+            return tuple(self.noise_lsb[channel] for channel in CHANNELS)
+        return None if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS)
 
     def card(self) -> Card:
         """:raises SamplerError: a value is out of range.
         :raises ConfigurationError: a fault is of the wrong type.
         """
         model = CARDS[self.model]
+        noises_lsb = self._noises_lsb()
         fields: dict[str, Any] = {
             "bits": self.bits,
             "rate_hz": self.rate_hz,
             "ranges_v": tuple(self.range_v[channel] for channel in CHANNELS),
-            "noise_lsb": model.noise_lsb if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS),
+            "noise_lsb": model.noise_lsb if noises_lsb is None else noises_lsb,
         }
         fields |= {name: tuple(value) if isinstance(value, list) else value for name, value in self.faults.items()}
         try:
@@ -137,7 +227,7 @@ class EmulatorDescription:
     name: str = ""
 
 
-class _Stream(enum.IntEnum):
+class Stream(enum.IntEnum):
     """Independent streams of random numbers that one seed gives: to draw more of one changes none of the others."""
 
     EXCITATION = 0
@@ -186,7 +276,7 @@ class EmulatorRig:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
         self._card = description.card.card()
-        self._amplifier = preset(description.computer.op_amp)
+        self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_stage: _Stage | None = None
 
     def description(self) -> Mapping[str, Any]:
@@ -209,11 +299,11 @@ class EmulatorRig:
         """
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
-            excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
+            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
         tweaks: list[RampedTweak] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = _settings(computer, tweak.given())
+                settings = self._settings(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             tweaks.append((tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(tweaks))
@@ -230,7 +320,7 @@ class EmulatorRig:
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
-            jitter = _Stream.APERTURE.generator(seed)
+            jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
             )
@@ -238,7 +328,7 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            blocks=_sampled(volts, self.sampler(_Stream.CARD.generator(seed))),
+            blocks=_sampled(volts, self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(
                 scenario.segments(), _lit(computer.machine.lamps, probes_per_sample(self._card))
             ),
@@ -259,12 +349,13 @@ class EmulatorRig:
     def _draws_offsets_alone(self) -> bool:
         drawn, card = self._description.computer, self._card
         is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
+        is_nominal &= drawn.specimen is None and drawn.values is None
         return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
 
     def _repeated(self, stage: _Stage, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
         count, offset_v = stage.computer.program.amplifiers, self._description.computer.offset_v
-        offsets_v = drawn_offsets_v(self._amplifier, count, _Stream.COMPONENTS.generator(seed), offset_v)
-        excitation = scenario.excitation_drawn(_Stream.EXCITATION.generator(seed))
+        offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
+        excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
         lit: dict[str, int] = {}
 
         def volts() -> Iterator[NDArray[np.float64]]:
@@ -276,29 +367,31 @@ class EmulatorRig:
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=stage.computer.scales.time,
             channels=stage.channels,
-            blocks=_sampled(volts(), self.sampler(_Stream.CARD.generator(seed))),
+            blocks=_sampled(volts(), self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(stage.segments, lit),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
-        drawn = self._description.computer
-        computer = SuspensionComputer(
-            scenario.plant.set,
-            opamp=self._amplifier,
-            rng=_Stream.COMPONENTS.generator(seed),
-            offset_v=drawn.offset_v,
-            components=drawn.fitted(seed),
-            sample_rate_hz=self._card.true_rate_hz * probes_per_sample(self._card),
-        )
-        computer.set(**_settings(computer, scenario.plant.given()))
+        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
+        computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
+        start = settings_of(computer, scenario.plant.given())
+        computer.set(**self._turned({**computer.program.values, **start}, scenario.plant.set))
         return computer
+
+    def _settings(self, computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+        return self._turned(settings_of(computer, given), computer.program.name)
+
+    def _turned(self, settings: dict[str, float], program: str) -> dict[str, float]:
+        """What an operator turns the pots to who wants those settings."""
+        if self._description.computer.pots == "coefficient":
+            return settings
+        dials = _nominal(program).dials_for(**settings)
+        return {f"{pot}_dial": dial for pot, dial in dials.items()}
 
     def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
         drawn = self._description.computer
         grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
-        return NoisySuspension(
-            computer, _Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c
-        )
+        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c)
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {
@@ -308,6 +401,7 @@ class EmulatorRig:
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=1.0 / computer.scales.volts(name),
                 noise_lsb=self._card.noise_lsb[i],
+                codes=1 << self._card.bits,
             )
             for i, name in enumerate(CHANNELS)
         }
@@ -342,7 +436,13 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
         raise as_error(f"{prefix}{error}") from error
 
 
-def _settings(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+@functools.cache
+def _nominal(program: str) -> SuspensionComputer:
+    """To be asked for dials, and never played."""
+    return SuspensionComputer(program, opamp="ideal")
+
+
+def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
     """The scenario's names of the parameters as the program has them."""
     names = {
         field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)

@@ -11,7 +11,7 @@ from harness.estimator_config import EstimatorConfig
 from harness.thesis.document import Chapter, Claim, Curve, Erratum, Figure, Mark, Panel, Signal
 from harness.thesis.model import square
 from harness.thesis.schemes import FORGETTING, HOLD_N, PLAIN
-from harness.thesis.tracking import CONVERGED, Track, settled, track
+from harness.thesis.tracking import Track, track
 
 N = 800
 AMPLITUDE = 10.0
@@ -19,12 +19,6 @@ CEILING = 0.3 * AMPLITUDE
 A1, A2 = 0.5, 0.8
 NOISE = 0.01 * AMPLITUDE
 SEED = 1995
-
-STRETCHES = ((0, 199), (199, 399), (399, N))
-"""From the last sample of the old b0 to that of the next: b0(k) acts on y(k)."""
-
-BEGUN_N = 10
-"""By then the first estimates have settled."""
 
 NAMES = ("a1", "a2", "b0")
 INKS = ("first", "second", "third")
@@ -48,7 +42,7 @@ def truth(*, changing: bool) -> Signal:
     return out
 
 
-def example(u: Signal, theta: Signal, noise: Signal | None = None) -> Signal:
+def follow(u: Signal, theta: Signal, noise: Signal | None = None) -> Signal:
     """y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) [+ e(k)] (section 3.5), from rest."""
     y, inputs = [0.0, 0.0], [0.0, *u.tolist()]
     for k, (a1, a2, b0) in enumerate(theta.tolist()):
@@ -56,15 +50,40 @@ def example(u: Signal, theta: Signal, noise: Signal | None = None) -> Signal:
     return np.array(y[2:])
 
 
-def chapter() -> Chapter:
-    """All of it; deterministic."""
-    u = square(N, -AMPLITUDE, AMPLITUDE)
-    steady, changing = truth(changing=False), truth(changing=True)
-    noise = np.random.default_rng(SEED).normal(0.0, NOISE, N)
-    first = track(PLAIN_3, u, example(u, steady))
-    clean = {key: track(config, u, example(u, changing)) for key, config in SCHEMES.items()}
-    noisy = {key: track(config, u, example(u, changing, noise)) for key, config in SCHEMES.items()}
-    eager = track(dataclasses.replace(SCHEMES["prediction-error"], hold_off_n=0), u, example(u, changing))
+@dataclasses.dataclass(frozen=True, eq=False)
+class Example:
+    """The system of section 3.5, and what each scheme makes of it."""
+
+    u: Signal
+    noise: Signal
+    steady: Signal
+    """(N, 3) the parameters if they do not change."""
+    changing: Signal
+    first: Track
+    """Plain RLS while nothing changes, without noise."""
+    clean: Mapping[str, Track]
+    """By scheme, while b0 changes; so ``noisy``."""
+    noisy: Mapping[str, Track]
+
+    @classmethod
+    def play(cls) -> Example:
+        """Deterministic."""
+        u = square(N, -AMPLITUDE, AMPLITUDE)
+        steady, changing = truth(changing=False), truth(changing=True)
+        noise = np.random.default_rng(SEED).normal(0.0, NOISE, N)
+        return cls(
+            u,
+            noise,
+            steady,
+            changing,
+            first=track(PLAIN_3, u, follow(u, steady)),
+            clean={key: track(config, u, follow(u, changing)) for key, config in SCHEMES.items()},
+            noisy={key: track(config, u, follow(u, changing, noise)) for key, config in SCHEMES.items()},
+        )
+
+
+def chapter(example: Example, claims: tuple[Claim, ...]) -> Chapter:
+    """All of it."""
     return Chapter(
         3,
         "System identification and parameter estimation",
@@ -72,17 +91,17 @@ def chapter() -> Chapter:
         f" text gives no amplitude and no rate: assumed are ±{AMPLITUDE:g}, 100 samples a second as in chapter 4, θ ="
         " 0 and P = 10 I at the start. With ±1 that P is no longer vague, and the first convergence takes 62 samples"
         " instead of 5.",
-        figures=_figures(u, first, clean, steady, changing),
+        figures=_figures(example),
         numbers=(),
         errata=_ERRATA,
-        claims=_claims(first, clean, noisy, steady, changing, eager),
+        claims=claims,
     )
 
 
 def recorded() -> dict[str, Signal]:
     """The data, by figure."""
     u = square(N, -AMPLITUDE, AMPLITUDE)
-    steady, changing = example(u, truth(changing=False)), example(u, truth(changing=True))
+    steady, changing = follow(u, truth(changing=False)), follow(u, truth(changing=True))
     return {"fig-3.5-u": u, "fig-3.5-y": steady, "fig-3.6-u": u, "fig-3.6-y": changing}
 
 
@@ -138,22 +157,21 @@ _ERRATA = (
 )
 
 
-def _figures(
-    u: Signal, first: Track, clean: Mapping[str, Track], steady: Signal, changing: Signal
-) -> tuple[Figure, ...]:
+def _figures(example: Example) -> tuple[Figure, ...]:
+    u, steady, changing, clean = example.u, example.steady, example.changing, example.clean
     marks = (Mark(200.0, "change", "b0 −0.9 → −0.5"), Mark(400.0, "change", "b0 −0.5 → −0.9"))
     shown = slice(0, 400)
     data = Panel(
         "(a) Identification data",
         "u, y",
-        (Curve("input u", u[shown], "third", "step"), Curve("output y", example(u, steady)[shown], "first")),
+        (Curve("input u", u[shown], "third", "step"), Curve("output y", follow(u, steady)[shown], "first")),
     )
     alarms = tuple(Mark(float(k), "alarm") for k in clean["prediction-error"].alarms)
     return (
         Figure(
             "3.5",
             "(a) Identification data, (b) Parameter estimates using R.L.S.",
-            (data, _estimates(first.theta[shown], steady[shown], "(b) Parameter estimates")),
+            (data, _estimates(example.first.theta[shown], steady[shown], "(b) Parameter estimates")),
             "The first 400 samples. The system is deterministic, and four equations determine three parameters.",
         ),
         Figure(
@@ -190,119 +208,3 @@ def _estimates(theta: Signal, known: Signal, title: str) -> Panel:
     for i, name in enumerate(NAMES):
         curves.append(Curve(name, theta[:, i], inks[name]))  # type: ignore[arg-type]  # mypy widens the literals
     return Panel(title, "parameters", tuple(curves), shown=(-1.5, 1.5))
-
-
-def _reconverged(each: Track, known: Signal) -> list[int | None]:
-    error = each.theta / known - 1.0
-    return [settled(error[start + 1 : end], CONVERGED) for start, end in STRETCHES[1:]]
-
-
-def _spread(each: Track, known: Signal) -> float:
-    """The largest standard deviation of a parameter over its truth in the last half of the first stretch."""
-    return float((each.theta[100:200] / known[100:200]).std(axis=0).max())
-
-
-def _claims(
-    first: Track, clean: Mapping[str, Track], noisy: Mapping[str, Track], steady: Signal, changing: Signal, eager: Track
-) -> tuple[Claim, ...]:
-    quick = settled(first.theta / steady - 1.0, 0.01)
-    back = {key: _reconverged(each, changing) for key, each in clean.items()}
-    spread = {key: _spread(each, changing) for key, each in clean.items()}
-    spread_noisy = {key: _spread(each, changing) for key, each in noisy.items()}
-    varied, steady_varied = (each.theta[BEGUN_N:, :2].var(axis=0).tolist() for each in (clean["forgetting"], first))
-    off = float(np.abs(clean["rls"].theta[399] / changing[399] - 1.0).max())
-    return (
-        Claim(
-            "3.5-converges",
-            "3.5, Fig. 3.5",
-            "Since the above system is deterministic these estimates are quick to converge and have excellent variance"
-            " properties.",
-            "holds",
-            f"All three are within 1 % after {quick} samples and stay there.",
-            {"within_1_percent_after_n": quick, "spread": _spread(first, steady)},
-            ("3.5",),
-        ),
-        Claim(
-            "3.5-slow",
-            "3.5",
-            "Although the ordinary R.L.S. algorithm does possess a certain innate tracking capability its rate of"
-            " convergence is too slow.",
-            "holds",
-            f"200 samples after b0 rose to −0.5 one of the three is still wrong by {off:.0%}; all come within 5 %"
-            " after neither change.",
-            {"largest_error_200_samples_after": off, "reconverged_n": back["rls"]},
-        ),
-        Claim(
-            "3.6-sluggish",
-            "3.6, Fig. 3.6",
-            "the forgetting factor algorithm works insofar as it is capable of tracking system parameters … the"
-            " tracking of the parameters is rather sluggish.",
-            "holds",
-            f"Within 5 % again after {_join(back['forgetting'])} samples: {1 / (1 - FORGETTING):.0f} samples of"
-            " memory, and hardly any excitation between two edges.",
-            {"reconverged_n": back["forgetting"]},
-            ("3.6",),
-        ),
-        Claim(
-            "3.6-variance",
-            "3.6, Fig. 3.6",
-            "the overall variance of the parameters has increased",
-            "holds",
-            f"Over the whole of Fig. 3.6, from sample {BEGUN_N} on, a1 and a2, which do not change, have variances of"
-            f" {varied[0]:.4f} and {varied[1]:.4f}; in the experiment of Fig. 3.5 they have {steady_varied[0]:.1e} and"
-            f" {steady_varied[1]:.1e}. Before the first change, without noise, λ = 0.97 scatters"
-            f" {spread['forgetting']:.1e} against {spread['rls']:.1e} of plain RLS, less and not more; with noise of"
-            f" 1 % of the amplitude {spread_noisy['forgetting']:.1e} against {spread_noisy['rls']:.1e}.",
-            {
-                "variances_of_a1_a2": varied,
-                "variances_of_a1_a2_in_fig_3.5": steady_varied,
-                "spread_without_noise": spread,
-                "spread_with_noise": spread_noisy,
-            },
-            ("3.6",),
-        ),
-        Claim(
-            "3.7-quicker",
-            "3.7.2, Fig. 3.7",
-            "the Kalman filter responds quicker than the forgetting factor algorithm (see Fig. 3.6) to changes in"
-            " system parameters.",
-            "holds",
-            f"{_join(back['random-walk'])} samples against {_join(back['forgetting'])}.",
-            {"reconverged_n": {"random-walk": back["random-walk"], "forgetting": back["forgetting"]}},
-            ("3.6", "3.7"),
-        ),
-        Claim(
-            "3.7-variance",
-            "3.7.2, Fig. 3.7",
-            "there is a severe degradation in the variance properties of the resulting estimates",
-            "holds with a reading",
-            f"Reading: of noisy data. Without noise R = I scatters {spread['random-walk']:.1e}, which is rounding."
-            f" With noise of 1 % of the amplitude it scatters {spread_noisy['random-walk']:.1e},"
-            f" {spread_noisy['random-walk'] / spread_noisy['forgetting']:.0f} times as much as λ = 0.97.",
-            {"spread_without_noise": spread["random-walk"], "spread_with_noise": spread_noisy["random-walk"]},
-            ("3.7",),
-        ),
-        Claim(
-            "3.8-better",
-            "3.8, Fig. 3.8",
-            "It tracks the system parameters with better variance properties than those produced by the Kalman"
-            " filter and reconverges to the correct parameter estimates faster than the forgetting factor algorithm.",
-            "holds with a reading",
-            f"Reading: {HOLD_N} samples of hold-off after a reset. It is back after {_join(back['prediction-error'])}"
-            f" samples (forgetting: {_join(back['forgetting'])}) and scatters {spread_noisy['prediction-error']:.1e}"
-            f" with 1 % of noise (Kalman: {spread_noisy['random-walk']:.1e}). Without a hold-off the error that the"
-            f" reset itself causes raises the next alarm: {len(eager.alarms)} alarms instead of"
-            f" {len(clean['prediction-error'].alarms)}.",
-            {
-                "reconverged_n": back["prediction-error"],
-                "spread_with_noise": spread_noisy["prediction-error"],
-                "alarms": len(clean["prediction-error"].alarms),
-                "alarms_without_hold_off": len(eager.alarms),
-            },
-            ("3.8",),
-        ),
-    )
-
-
-def _join(counts: list[int | None]) -> str:
-    return " and ".join("never" if each is None else str(each) for each in counts)

@@ -92,12 +92,12 @@ def square(n: int, low: float, high: float, period_n: int = 100) -> Signal:
     return np.where(np.arange(n) % period_n < period_n // 2, high, low)
 
 
-def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE) -> Signal:
+def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: float = PERIOD_S) -> Signal:
     """The displacement (n,) of a plant whose parameters jump in its physical state: position and velocity go on."""
     ends = [*(segment.start for segment in segments[1:]), len(u)]
     y, state = np.empty(len(u)), AT_REST
     for segment, end in zip(segments, ends, strict=True):
-        sampled = SampledPlant.of(segment.plant, PERIOD_S)
+        sampled = SampledPlant.of(segment.plant, period_s)
         for k in range(segment.start, end):
             y[k] = state[0]
             state = sampled.next(state, float(u[k]))

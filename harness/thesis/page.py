@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.report.page import PLOTTER, STYLES, assembled
+from harness.report.page import SCRIPTS, STYLES, assembled
 from harness.report.payload import as_script, deflated
 from harness.thesis.comparison import Comparison, Data
 from harness.thesis.document import Chapter, Claim, Figure, Number, Panel, Verdict
@@ -41,7 +41,8 @@ def render(chapters: Sequence[Chapter], comparison: Comparison) -> str:
     return assembled(
         _FOLDER / "page.html",
         (*STYLES, _FOLDER / "page.css"),
-        (PLOTTER, _FOLDER / "page.js"),
+        (*SCRIPTS, _FOLDER / "page.js"),
+        title="The thesis, reproduced",
         summary=_summary(claims),
         contents=_contents(chapters),
         chapters="\n".join(_chapter(chapter, order) for chapter in chapters),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.storage import replacing
-from harness.thesis import chapter3, chapter4, chapter5
+from harness.thesis import chapter3, chapter3_claims, chapter4, chapter4_claims, chapter5, chapter5_claims
 from harness.thesis.comparison import Comparison, as_json, compare
 from harness.thesis.document import Chapter, Signal
 from harness.thesis.page import render
@@ -75,10 +75,13 @@ def reproduce() -> Reproduction:
 
     :raises DeviceError, LinkError, RigError: the circuit could not be played.
     """
-    simulation = chapter4.simulate()
-    circuit = chapter5.play_circuit()
+    example, simulation, circuit = chapter3.Example.play(), chapter4.simulate(), chapter5.play_circuit()
     return Reproduction(
-        (chapter3.chapter(), chapter4.chapter(simulation), chapter5.chapter(circuit)),
+        (
+            chapter3.chapter(example, chapter3_claims.claims(example)),
+            chapter4.chapter(simulation, chapter4_claims.claims(simulation)),
+            chapter5.chapter(circuit, chapter5_claims.claims(circuit)),
+        ),
         compare(simulation, circuit),
         circuit,
         {**chapter3.recorded(), **chapter4.recorded(simulation)},

@@ -1,6 +1,6 @@
 """All benchmarks, or those named: prints one table and writes build/bench.json.
 
-python -m tests.benchmarks [engine] [link] [detection] [statistics] [isolation] [trials]
+python -m tests.benchmarks [NAME ...]
 
 bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
 """
@@ -13,7 +13,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from . import bench_detection, bench_engine, bench_isolation, bench_link, bench_statistics, bench_trials
+from . import (
+    bench_calibration,
+    bench_detection,
+    bench_engine,
+    bench_isolation,
+    bench_link,
+    bench_onset,
+    bench_self_test,
+    bench_statistics,
+    bench_trials,
+)
 from .figure import Figure
 
 RESULTS = Path("build/bench.json")
@@ -25,6 +35,9 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "statistics": bench_statistics.figures,
     "isolation": bench_isolation.figures,
     "trials": bench_trials.figures,
+    "calibration": bench_calibration.figures,
+    "self-test": bench_self_test.figures,
+    "onset": bench_onset.figures,
 }
 
 

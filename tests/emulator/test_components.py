@@ -116,6 +116,25 @@ def test_given_deviations_take_the_place_of_the_drawn() -> None:
     assert value(parts, "RL") != 100e3
 
 
+def test_given_bandwidth_and_slew_take_the_place_of_the_drawn_and_of_nothing_else() -> None:
+    netlist = (*NETLIST, OpAmp("U2", "0", "s", "out2", preset("tl07x")))
+    drawn = Components(op_amps=OpAmpGrade(offset_v=3e-3, bandwidth=0.2, slew=0.2), seed=5)
+    known = replace(drawn, given_bandwidth={"U2": 0.1}, given_slew={"U2": -0.05})
+    there, before = model(fitted(known, netlist), "U2"), model(fitted(drawn, netlist), "U2")
+    assert (there.gbw_hz, there.slew_v_per_s) == pytest.approx((3.3e6, 12.35e6))
+    assert there.vos_v == before.vos_v
+
+
+def test_what_is_undrawn_is_the_same_for_every_seed_and_keeps_what_all_specimens_share() -> None:
+    stock = replace(COMPONENTS["polyester"].undrawn(), temperature_c=35.0, age_h=1e4)
+    machines = [fitted(replace(stock, seed=seed)) for seed in (1, 2)]
+    assert machines[0] == machines[1]
+    assert value(machines[0], "R1") == 10e3
+    assert value(machines[0], "C1") == pytest.approx(1e-9 * (1 + 400e-6 * 10))
+    assert {"C1_leak", "C1_soak1", "P_wiper_ohm"} <= set(machines[0])
+    assert stock.pots.windings == 0
+
+
 def test_temperature_and_age_change_values_by_their_law() -> None:
     cold = Grade(temperature_per_k=100e-6)
     assert value(fitted(Components(capacitors=cold, temperature_c=35.0)), "C1") == pytest.approx(1e-9 * 1.001)
@@ -236,6 +255,8 @@ def test_a_real_machine_agrees_with_ngspice(ngspice: NgSpice, op_amp: str) -> No
         (lambda: PotGrade(wiper_ohm=-1.0), "pot: wiper_ohm"),
         (lambda: Components(temperature_c=400.0), "Components: temperature_c"),
         (lambda: Components(given={"R9": 0.1}).fitted(NETLIST), "no element is called 'R9'"),
+        (lambda: Components(given_slew={"R1": 0.1}).fitted(NETLIST), "given_slew: no op-amp is called 'R1'"),
+        (lambda: Components(given_bandwidth={"U9": 0.1}).fitted(NETLIST), "given_bandwidth: no op-amp is called 'U9'"),
         (lambda: Components(given={"R1": -1.0}).fitted(NETLIST), "R1 would have 0 times its nominal value"),
     ],
 )

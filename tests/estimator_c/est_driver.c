@@ -100,7 +100,7 @@ void driver_age_counters(void) {
 int driver_invariants_hold_if_damaged(int way) {
     const est_t  kept    = self;
     est_config_t invalid = config;
-    invalid.na           = 0U;
+    invalid.forgetting   = 2.0F;
     switch (way) {
     case 0: self.config = 0; break;
     case 1: self.config = &invalid; break;
@@ -109,9 +109,10 @@ int driver_invariants_hold_if_damaged(int way) {
     case 4: self.theta[0] = __builtin_nanf(""); break;
     case 5: self.trigger.statistic = -1.0F; break;
     case 6: self.noise_variance = 0.0F; break;
+    case 7: self.factors.d[1] = __builtin_inff(); break;
     default: break;
     }
-    const int held = est_invariants_hold((way == 7) ? 0 : &self) ? 1 : 0;
+    const int held = est_invariants_hold((way == 8) ? 0 : &self) ? 1 : 0;
     self           = kept;
     return held;
 }

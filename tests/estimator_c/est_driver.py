@@ -24,6 +24,7 @@ STRICT = [
     "-Werror",
     "-ffp-contract=off",
     "-DEST_NC_MAX=2U",
+    *("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"),  # an access outside an array ends the run
 ]
 COVERED = ("-O0", "--coverage", "-DNDEBUG", "-D__OPTIMIZE_SIZE__=1", "-DEST_NA_MAX=3U")
 """One copy of every line, and loops over EST_NA_MAX that are loops."""
@@ -149,7 +150,7 @@ class Estimator:
         self._c.driver_age_counters()
 
     def invariants_hold_if_damaged(self, way: int) -> bool:
-        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 7; 8: not at all."""
+        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 8; 9: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))
 
     def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
+import harness.estimator
+from harness.estimator_config import EstimatorConfig
+from harness.twin import Twin
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,
@@ -82,6 +86,22 @@ def test_prediction_error_beyond_the_ceiling_resets_everything(estimator: Estima
     assert (np.abs(result.innovation[50:first]) < 8.0).all()
     assert (result.theta[first] == 0.0).all()
     assert result.statistic[first] == np.abs(result.innovation[first])
+
+
+@pytest.mark.parametrize(("reset", "after_n"), [(1, 0), (0, 1)], ids=["theta and P", "P alone"])
+def test_after_an_alarm_everything_is_as_uncertain_as_at_the_start(
+    estimator: Estimator, reset: int, after_n: int
+) -> None:
+    """P alone is reset with the next sample, which has no equation and so time for it."""
+    u, y = suspension([(0, FRONT), (245, (115.0, 3021.0, 18000.0))], np.arange(10.0, 400.0, 50.0), 400, 0.0, 1)
+    settings = PLAIN | {"kind": PREDICTION_ERROR, "ceiling": 8.0, "warm_up_n": 50, "reset": reset, "p0": 10.0}
+    assert estimator.init(**settings)
+    first = estimator.run(u, y - 410.0).alarms[0]
+    assert estimator.init(**settings)
+    assert (estimator.run(u[:first], y[:first] - 410.0).variance < 1.0).all()
+    assert estimator.init(**settings)
+    end = first + 1 + after_n
+    assert (estimator.run(u[:end], y[:end] - 410.0).variance == 10.0).all()
 
 
 def test_mean_between_faults_follows_the_thesis(estimator: Estimator) -> None:
@@ -197,6 +217,28 @@ def test_gap_ends_the_doubt_in_favour_of_the_reading_that_explains_most(estimato
     assert result.statistic[913] > 1000.0
     assert result.statistic[915] < 1.0
     assert result.counters["slips"] == 0
+
+
+@pytest.mark.parametrize("lag_n", [1, 2, 3, 5, 11])
+@pytest.mark.parametrize(("nb", "nk"), [(2, 0), (3, 0), (1, 1), (2, 1)])
+@pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])
+def test_each_reading_of_an_edge_is_that_of_the_twin(slip: int, nb: int, nk: int, lag_n: int) -> None:
+    """Where it rests, u scatters by 40 codes, so that it matters which of its steps a reading moves. A gap ends the
+    doubt while another reading than the recorded one explains the edge, and its sum becomes the statistic."""
+    n, at = 460, 400
+    rng = np.random.default_rng(0)
+    felt = 200.0 * (np.arange(n + 2) // 20 % 2) + np.round(rng.uniform(-40.0, 40.0, n + 2))
+    u = felt[1:-1].copy()
+    u[at:] = felt[at:-2] if slip == 1 else felt[at + 2 :]
+    y = np.round(lfilter([0.0, -0.9], [1.0, 0.5, 0.8], felt[1:-1]) + rng.normal(0.0, 1.0, n))
+    valid = np.ones(n, bool)
+    valid[at + np.flatnonzero(np.abs(np.diff(u[at:])) > 100.0)[0] + 1 + lag_n] = False
+    config = EstimatorConfig(
+        nb=nb, nk=nk, refresh_n=0, warm_up_n=30, arl0=1e300, noise_variance=100.0, c=(), edge_codes=100.0
+    )
+    expected = [step.statistic for step in Twin(config).run(u.tolist(), y.tolist(), valid.tolist())]
+    statistic = harness.estimator.Estimator(config).run(u, y, valid).statistic
+    assert statistic[valid] == pytest.approx(np.array(expected)[valid], abs=0.3)
 
 
 @pytest.mark.parametrize("slip", [1, -1], ids=["late", "early"])

@@ -58,6 +58,18 @@ def test_a_gap_ends_the_doubt_about_an_edge(estimator: Estimator) -> None:
     assert refreshes == [0, 1]
 
 
+@pytest.mark.parametrize("refresh_n", [9, 10])
+def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refresh_n: int) -> None:
+    """EST_DOUBT_N of est_edges.h. C, due before, is taken with the first equation after them."""
+    u, y = front()
+    edge = 10
+    refreshes = []
+    for samples in (edge + 12, edge + 13):
+        assert estimator.init(refresh_n=refresh_n)
+        refreshes.append(estimator.run(u[:samples], y[:samples]).counters["refreshes"])
+    assert refreshes == [0, 1]
+
+
 def test_c_stays_as_it_is_where_the_last_edge_is_long_past(estimator: Estimator) -> None:
     """A forgetting of 0.99 remembers 100 samples; after twice that A comes from noise, and would lead C anywhere."""
     u, y = suspension([(0, FRONT)], np.arange(10.0, 400.0, 50.0), 1400, 1.0, 3)
@@ -113,6 +125,23 @@ def test_lost_excitation_is_reported_and_its_return(estimator: Estimator) -> Non
     last, back = 360, 710  # the edges before and after
     assert not idle[:last].any()
     assert np.flatnonzero(idle).tolist() == list(range(last + 100, back))
+
+
+@pytest.mark.parametrize("step", [64.0, -64.0])
+def test_a_step_of_just_so_many_codes_is_an_edge(estimator: Estimator, step: float) -> None:
+    """Only an edge makes the excitation return."""
+    idle = []
+    for part in (1.0, 0.99):
+        u = np.where(np.arange(60) < 50, 0.0, part * step)
+        assert estimator.init(edge_codes=64.0, idle_n=5, kind=NONE, stuck_n=0, refresh_n=0)
+        idle.append(estimator.run(u, np.full(60, 410.0)).idle[48:51].tolist())
+    assert idle == [[1, 1, 0], [1, 1, 1]]
+
+
+def test_excitation_may_be_wanted_in_every_sample(estimator: Estimator) -> None:
+    u = np.where(np.arange(60) < 50, 0.0, 1000.0)
+    assert estimator.init(idle_n=1, kind=NONE, stuck_n=0, refresh_n=0)
+    assert np.flatnonzero(estimator.run(u, np.full(60, 410.0)).idle == 0).tolist() == [50]
 
 
 def test_own_trigger_is_asked_at_every_innovation_and_told_when_it_begins_anew(estimator: Estimator) -> None:
@@ -180,4 +209,4 @@ def test_damaged_state_is_noticed(estimator: Estimator) -> None:
     assert estimator.init()
     u, y = front()
     estimator.run(u, y)
-    assert [estimator.invariants_hold_if_damaged(way) for way in range(9)] == [False] * 8 + [True]
+    assert [estimator.invariants_hold_if_damaged(way) for way in range(10)] == [False] * 9 + [True]

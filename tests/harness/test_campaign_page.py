@@ -13,9 +13,7 @@ from harness.campaign.report import render, write_page
 from harness.campaign.results import Results
 from harness.campaign.spec import CampaignSpec, Grid, Plan
 from harness.campaign.trial import Row
-from tests.harness.test_report_browser import Watched, browser
-
-__all__ = ["browser"]
+from tests.browser import Watched
 
 
 def results(name: str = "made") -> Results:

@@ -13,7 +13,8 @@ import can
 import pytest
 
 from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.links.can_bus import PythonCanBus
+from harness.links.can_bus import PythonCanBus, completed
+from harness.links.line import CanLine
 
 FRAME = can.Message(arbitration_id=0x18, is_extended_id=False, data=bytes(8))
 
@@ -34,8 +35,8 @@ def bus(channel: str) -> Iterator[PythonCanBus]:
 @pytest.fixture(autouse=True)
 def _no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whoever runs the tests."""
-    for name in ("CAN_INTERFACE", "CAN_CHANNEL", "CAN_BITRATE", "CAN_CONFIG"):
-        monkeypatch.delenv(name, raising=False)
+    for name in [name for name in os.environ if name.startswith("CAN_")]:
+        monkeypatch.delenv(name)
     monkeypatch.setattr("can.util.CONFIG_FILES", [])
 
 
@@ -63,7 +64,7 @@ def test_environment_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, chan
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
     monkeypatch.setenv("CAN_CHANNEL", channel)
     monkeypatch.setenv("CAN_CONFIG", '{"fd": true, "bitrate": 500000, "data_bitrate": 2000000}')
-    bus = PythonCanBus({})
+    bus = PythonCanBus(completed({}))
     assert (bus.name, bus.is_fd) == (f"virtual/{channel}", True)
     assert bus.line is not None and bus.line.speed == "500000 bit/s, data 2000000 bit/s"
     bus.close()
@@ -72,10 +73,50 @@ def test_environment_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, chan
 def test_file_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, channel: str) -> None:
     (tmp_path / "can.conf").write_text(f"[default]\ninterface = virtual\nchannel = {channel}\nbitrate = 250000\n")
     monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
-    bus = PythonCanBus({"bitrate": 125_000})
+    bus = PythonCanBus(completed({"bitrate": 125_000}))
     assert bus.name == f"virtual/{channel}"
     assert bus.line is not None and bus.line.bitrate == 125_000
     bus.close()
+
+
+def test_section_that_is_asked_for_comes_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "can.conf").write_text(
+        "[default]\ninterface = virtual\nchannel = a\nbitrate = 250000\n[bench]\nchannel = b\n"
+    )
+    monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
+    assert completed({}) == {"interface": "virtual", "channel": "a", "bitrate": 250_000}
+    assert completed({"config_context": "bench"}) == {"interface": "virtual", "channel": "b", "bitrate": 250_000}
+
+
+def test_what_the_configuration_says_for_other_interfaces_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAN_CONFIG", '{"interface": "virtual", "app_name": "bench", "preserve_timestamps": true}')
+    assert completed({}) == {"interface": "virtual", "channel": None, "preserve_timestamps": True}
+
+
+@pytest.mark.parametrize(
+    ("interface", "key"),
+    [
+        ("kvaser", "single_handle"),
+        ("slcan", "btr"),
+        ("vector", "app_name"),
+        ("pcan", "nom_tseg1"),
+        ("virtual", "protocol"),
+    ],
+)
+def test_key_that_a_constructor_looks_up_is_known(interface: str, key: str) -> None:
+    """python-can's documentation has it, whether or not it is among the parameters."""
+    assert completed({"interface": interface, key: 1})[key] == 1
+
+
+def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
+    """8 MHz through 1, and 16 quanta a bit: 500 kbit/s; 80 MHz and 160, and 20 of the data: 500 kbit/s and 4 Mbit/s."""
+    classic = {"f_clock": 8_000_000, "brp": 1, "tseg1": 11, "tseg2": 4, "sjw": 1, "nof_samples": 1}
+    fd = {"f_clock": 80_000_000, "nom_brp": 1, "nom_tseg1": 119, "nom_tseg2": 40, "nom_sjw": 1}
+    fd |= {"data_brp": 1, "data_tseg1": 14, "data_tseg2": 5, "data_sjw": 1}
+    for timing, rates in ((classic, (500_000, None)), (fd, (500_000, 4_000_000))):
+        bus = PythonCanBus(completed({"interface": "virtual", "channel": channel, **timing}))
+        assert bus.line == CanLine(*rates)
+        bus.close()
 
 
 @pytest.mark.parametrize(
@@ -90,11 +131,26 @@ def test_file_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, tmp_path: P
             "cannot open can:slcan//dev/absent: No such file or directory",
         ),
         ({"interface": "virtual", "foo": 1, "state": "odd"}, ConfigurationError, "can: .*State config not valid!"),
+        (
+            {"config_context": "bench"},
+            ConfigurationError,
+            r"can: say which .*CAN_INTERFACE_bench, ~/can.conf \[bench\]",
+        ),
+        (
+            {"interface": "virtual", "nope": 1},
+            ConfigurationError,
+            "can:virtual: python-can's virtual has no key 'nope'$",
+        ),
+        (
+            {"interface": "virtual", "rx_queue": 1},
+            ConfigurationError,
+            ".* no key 'rx_queue': is 'rx_queue_size' meant[?]",
+        ),
     ],
 )
 def test_what_cannot_be_opened_is_named(asked: dict[str, Any], kind: type[Exception], said: str) -> None:
     with pytest.raises(kind, match=f"^{said}") as caught:
-        PythonCanBus(asked)
+        PythonCanBus(completed(asked))
     assert "\n" not in str(caught.value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import signal
@@ -20,9 +21,11 @@ from harness.cli import main
 from harness.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
 from harness.dut import Dut, connect, open_dut, reopen_dut
 from harness.errors import ConfigurationError, LinkClosed, LinkError
+from harness.links.bus_load import load_of
 from harness.rigs.description import open_rig
 from harness.run import Run
 from harness.scenario import Scenario
+from harness.summary import summary
 from harness.verdict import judge
 from tests.harness.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
 from tests.harness.firmware import needs_firmware
@@ -51,6 +54,7 @@ from tests.harness.processes import children
             },
         ),
         ("can:udp_multicast/239.74.163.2", {"interface": "udp_multicast", "channel": "239.74.163.2"}),
+        ("can:?interface=kvaser&channel=0", {"interface": "kvaser", "channel": "0"}),
     ],
 )
 def test_bus_is_named_with_what_python_can_is_to_be_told(name: str, expected: dict[str, Any]) -> None:
@@ -77,6 +81,18 @@ def test_bus_is_named_with_what_python_can_is_to_be_told(name: str, expected: di
         ("host?foo=1", "unknown key 'foo'"),
         ("host:there", "a device of the kind host has no 'there'"),
         ("can:virtual?wire_faults=flip@to:1", "'flip@to:1' is not KIND@to:FRAME"),
+        ("can:virtual?fd=1&fd=0", "can:virtual?fd=1&fd=0: fd is said twice"),
+        ("can:virtual?interface=slcan", "interface is said twice"),
+        ("can:virtual/a?channel=b", "channel is said twice"),
+        ("inproc:./a.so?library=./b.so", "library is said twice"),
+        ("host?name=bob", "name is said twice"),
+        *(
+            (
+                f"can:{each}//dev/ttyACM0?device=inproc",
+                f"inproc needs a connection of its own, and {each} is an adapter",
+            )
+            for each in ("slcan", "serial", "robotell")
+        ),
     ],
 )
 def test_wrong_name_is_one_line(name: str, said: str) -> None:
@@ -96,8 +112,65 @@ def test_option_that_a_device_has_not_is_named(capsys: pytest.CaptureFixture[str
 
 def test_device_on_a_bus_is_not_opened_again_on_the_word_of_a_recording() -> None:
     recorded = CanDevice(name="bob", interface="socketcan", channel="can0").as_table()
-    with pytest.raises(ConfigurationError, match="was can:socketcan/can0: say --dut can:socketcan/can0, or another"):
+    with pytest.raises(ConfigurationError, match="was can:socketcan/can0, .* say --dut can:socketcan/can0, or an"):
         reopen_dut(recorded)
+
+
+# ---- python-can's own configuration
+
+
+@pytest.fixture
+def _configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """By a file, with a section that is not the first."""
+    for name in [name for name in os.environ if name.startswith("CAN_")]:
+        monkeypatch.delenv(name)
+    (tmp_path / "can.conf").write_text(
+        "[default]\ninterface = virtual\nbitrate = 250000\n[desert]\nchannel = dunes\n[board]\ninterface = slcan\n"
+    )
+    monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
+
+
+@pytest.mark.usefixtures("_configured")
+def test_virtual_bus_of_the_configuration_has_the_device_of_this_process_on_it() -> None:
+    with open_dut("can:") as dut:
+        assert dut.handshake().firmware == "LIBRARY"
+
+
+@pytest.mark.usefixtures("_configured")
+def test_silent_bus_of_the_configuration_is_named() -> None:
+    with pytest.raises(LinkError, match="the bus was opened as can:virtual/dunes: is the device on it"):
+        open_dut("can:?config_context=desert&device=none", timeout_s=0.01)
+
+
+@pytest.mark.usefixtures("_configured")
+def test_device_that_cannot_be_on_the_bus_of_the_configuration_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="a host process answers on SocketCAN, not on virtual: say inproc"):
+        open_dut("can:?device=host")
+    with pytest.raises(ConfigurationError, match="inproc needs a connection of its own, and slcan is an adapter"):
+        open_dut("can:/dev/ttyACM0?config_context=board&device=inproc")
+
+
+@pytest.mark.usefixtures("_configured")
+def test_bit_rate_of_the_configuration_is_in_the_record_and_in_the_load() -> None:
+    """At most 135 bits a frame (Davis et al. 2007), nine of them for each of 20,000 samples/s."""
+    run = play(describe("can:"), scenario=dataclasses.replace(THESIS, samples=56, tweaks=()))
+    assert run.conditions.line == {"bitrate": 250_000, "samples_per_message": 1, "window": 1}
+    load = load_of(run)
+    assert load is not None and load.utilisation == pytest.approx(9 * 135 / 250_000 * 20_000)
+    assert "  bus: 250000 bit/s: 97.2 times what it carries," in summary(run, judge(run))
+
+
+@pytest.mark.usefixtures("_configured")
+def test_real_time_that_does_not_fit_the_bus_of_the_configuration_is_refused() -> None:
+    said = "are 97.2 times what 250000 bit/s carry"
+    with open_rig("emulator") as rig, open_dut("can:") as dut, pytest.raises(ConfigurationError, match=said):
+        Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
+
+
+@pytest.mark.usefixtures("_configured")
+def test_device_at_a_terminal_does_not_mind_the_configuration_of_other_buses() -> None:
+    with open_dut("host?link=slcan") as dut:
+        assert "bitrate" not in dut.line
 
 
 # ---- the same to the bit

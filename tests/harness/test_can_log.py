@@ -8,6 +8,7 @@ import random
 import struct
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import pytest
 
 from harness.bench import Bench
 from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
-from harness.catalogue import LAYOUTS, Hello, Key, pack, unpack
+from harness.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
 from harness.cli import main
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
@@ -81,6 +82,14 @@ def nth(frames: Sequence[can.Message], name: str, n: int) -> int:
     return [i for i, frame in enumerate(frames) if frame.arbitration_id == identifier(name)][n]
 
 
+def contradicting(frame: can.Message, *, later: int = 0) -> can.Message:
+    """It says something else of the same thing, with a sequence number that is so much later."""
+    other = copy.copy(frame)
+    seq, *between, changed, last = frame.data
+    other.data = bytearray(((seq + later) % 256, *between, changed ^ 1, last))
+    return other
+
+
 def without(frames: list[can.Message], *places: int) -> list[can.Message]:
     return [frame for i, frame in enumerate(frames) if i not in places]
 
@@ -127,6 +136,29 @@ def test_asammdf_decodes_a_measurement_with_our_dbc(tmp_path: Path, traffic: tup
     with asammdf.MDF(log) as raw, raw.extract_bus_logging({"CAN": [(str(DBC), 0)]}) as decoded:
         force = decoded.get("Force").samples
     np.testing.assert_array_equal(force, run.codes[:, 0])
+
+
+def test_asammdf_is_not_imported_before_a_measurement_is_written(tmp_path: Path) -> None:
+    """Its pandas takes longer than a run."""
+    pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
+    told = """
+import sys
+from pathlib import Path
+from harness.links.python_can import can
+from harness.can_log import CanLog, CapturedFrames
+frame = can.Message(arbitration_id=0x18, is_extended_id=False, data=b"12345678", is_rx=False)
+def is_there():
+    return not {"asammdf", "pandas"}.isdisjoint(sys.modules)
+for suffix in ("log", "mf4"):
+    print(is_there())
+    log = CanLog(Path(sys.argv[1], f"can.{suffix}"))
+    log.begin()
+    log(frame)
+    log.close()
+with can.LogReader(log.path) as users:
+    print(*(bytes(each.data) for each in [*CapturedFrames(log.path), *users]), is_there())
+"""
+    assert ran("-c", told, str(tmp_path)).splitlines() == ["False", "False", "b'12345678' b'12345678' True"]
 
 
 # ------------------------------------------------------------------------------------------------------- what it was
@@ -331,8 +363,7 @@ def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconc
 ) -> None:
     frames = list(traffic[1])
     at = nth(frames, name, 0)
-    other = copy.copy(frames[at])
-    other.data = other.data[:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    other = contradicting(frames[at])
     twice = written(tmp_path / "twice.log", [*frames[:at], frames[at], *frames[at:]])
     assert judge(captured(twice)).outcome == "passed"
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]])))
@@ -346,10 +377,7 @@ def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
 ) -> None:
     frames = list(traffic[1])
     at = nth(frames, name, 40)
-    other = copy.copy(frames[at])
-    other.data = (
-        bytearray(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
-    )
+    other = contradicting(frames[at], later=50)
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].endswith("twice, and not the same")
@@ -459,6 +487,21 @@ def outcome_or_error(path: Path) -> str:
         return judge(captured(path)).outcome
     except RecordingError as error:
         return str(error)
+
+
+def test_runs_without_samples_take_no_room(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    """A device that is started over and over, which a hostile log may say hundreds of thousands of times."""
+    log = written(tmp_path / "can.log", traffic[1][: nth(traffic[1], "Sample", 0)])
+    with log.open("a") as file:
+        for i in range(5000):
+            started = pack(Controlled(i % 256, Command.START, 0, Result.APPLIED, i % 8))
+            file.write(f"({i}.0) can0 {started[0]:03X}#{started[1:].hex()}\n")
+    tracemalloc.start()
+    with pytest.raises(RecordingError, match="holds no run of a device"):
+        captured(log)
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 5000 * 200
 
 
 def test_several_runs_in_a_log_are_told_apart(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, sync_playwright
+from playwright.sync_api import Browser
 
 from harness.report import write_report
 from harness.run import Run
 from harness.verdict import Verdict, judge
+from tests.browser import Watched
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
 from tests.harness.runs import with_fault
 
@@ -22,79 +22,10 @@ FORCE, MASS, STIFFNESS, STATISTIC = 0, 2, 4, 5
 ALARM, FALSE_ALARM, MISSING = (0, 158, 115), (213, 94, 0), (86, 180, 233)
 """Bluish green, vermilion and sky blue of Okabe and Ito."""
 
-COUNT_PIXELS = """(canvas, [r, g, b]) => {
-    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-    let count = 0;
-    for (let i = 0; i < data.length; i += 4) count += data[i] === r && data[i + 1] === g && data[i + 2] === b;
-    return count;
-}"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("needs a browser: apt-get install chromium")
-    with sync_playwright() as playwright:
-        # Without a sandbox, since tests may run as root; the page under test is our own.
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
 
 @pytest.fixture(scope="module")
 def run() -> Run:
     return reported_run()
-
-
-class Watched:
-    """A page of the browser, with everything it complained of and asked for."""
-
-    def __init__(self, browser: Browser, path: Path) -> None:
-        self.page: Page = browser.new_page(viewport={"width": 1200, "height": 1000})
-        self.complaints: list[str] = []
-        self.requests: list[str] = []
-        self.page.on("console", lambda message: self.complaints.append(message.text))
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(path.as_uri())
-
-    def plots(self) -> list[Locator]:
-        self.page.wait_for_selector("html[data-drawn]")
-        return self.page.locator("#plots canvas").all()
-
-    def images(self) -> list[str]:
-        """What each plot shows, after the browser has painted."""
-        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-        return [plot.evaluate("(canvas) => canvas.toDataURL()") for plot in self.plots()]
-
-    def pixels(self, colour: tuple[int, int, int]) -> list[int]:
-        """How many pixels of exactly this colour each plot has."""
-        return [plot.evaluate(COUNT_PIXELS, list(colour)) for plot in self.plots()]
-
-    def drag(self, plot: int, start: float, end: float) -> None:
-        """Drag across a plot, between two fractions of its width."""
-        x, y, width = self._area(plot)
-        self.page.mouse.move(x + start * width, y)
-        self.page.mouse.down()
-        self.page.mouse.move(x + end * width, y, steps=3)
-        self.page.mouse.up()
-        self.page.mouse.move(0, 0)
-
-    def point_at(self, plot: int, fraction: float) -> None:
-        x, y, width = self._area(plot)
-        self.page.mouse.move(x + fraction * width, y)
-
-    def values(self, plot: int) -> list[str]:
-        """What the legend of a plot says of the sample under the pointer."""
-        return self.page.locator(".u-legend").nth(plot).locator(".u-value").all_inner_texts()
-
-    def _area(self, plot: int) -> tuple[float, float, float]:
-        area = self.page.locator(".u-over").nth(plot)
-        area.scroll_into_view_if_needed()
-        box = area.bounding_box()
-        assert box is not None
-        return box["x"], box["y"] + box["height"] / 2, box["width"]
 
 
 @pytest.fixture

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from emulator import Capacitor, OpAmp, Resistor
 from harness import config
 from harness.errors import ConfigurationError
 from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
 from harness.run import CHANNELS
-from harness.scenario import Scenario
+from harness.scenario import Scenario, Tweak
 
 NEEDED = "[card.range_v]"
 
@@ -71,3 +74,93 @@ def test_noise_of_the_machine_moves_a_code_now_and_then_by_one(tmp_path: Path) -
 def test_a_wrong_fault_is_refused_by_name(tmp_path: Path, fault: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         open_rig(described(tmp_path, fault))
+
+
+# ---- a machine that was measured
+
+VALUES = """
+[computer.values]
+deviation = { RF = 0.01, C1 = -0.02 }
+offset_v = { U1 = 2e-3 }
+bandwidth = { U1 = 0.1 }
+slew = { U1 = -0.1 }
+
+[card]"""
+
+
+def own(folder: Path, computer: str, name: str = "own") -> str:
+    """The rig "emulator" with another [computer]."""
+    path = folder / f"{name}.toml"
+    card = config.locate("rigs", "emulator").read_text().partition("[card]")[2]
+    path.write_text(f"[computer]\n{computer}\n[card]{card}")
+    return str(path)
+
+
+def elements(rig: str, seed: int) -> dict[str, object]:
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        return {each.name: each for each in opened.set_up(Scenario.load("healthy"), seed).computer.circuit.elements}
+
+
+def test_measured_values_are_those_of_the_machine_whatever_the_seed(tmp_path: Path) -> None:
+    rig = own(tmp_path, 'components = "polyester"' + VALUES.removesuffix("[card]"))
+    there = elements(rig, 1)
+    assert there == elements(rig, 2)
+    force, capacitor, summer = there["RF"], there["C1"], there["U1"]
+    assert isinstance(force, Resistor) and force.ohm == pytest.approx(101e3)
+    assert isinstance(capacitor, Capacitor) and capacitor.farad == pytest.approx(0.98e-9)
+    assert isinstance(summer, OpAmp)
+    assert (summer.model.vos_v, summer.model.gbw_hz) == pytest.approx((2e-3, 3.3e6))
+    assert summer.model.slew_v_per_s == pytest.approx(11.7e6)
+    other = there["RB"]
+    assert isinstance(other, Resistor) and other.ohm == 33.2e3
+
+
+def test_runs_of_one_specimen_are_of_the_same_machine_with_other_noise(tmp_path: Path) -> None:
+    drawn = 'components = "polyester"\noffset_v = 0.003'
+    one = own(tmp_path, f"{drawn}\nspecimen = 7", "one")
+    assert elements(one, 1) == elements(one, 2) == elements(own(tmp_path, drawn, "drawn"), 7)
+    assert not np.array_equal(codes(one, 1), codes(one, 2))
+
+
+def test_noise_can_be_given_channel_by_channel(tmp_path: Path) -> None:
+    text = config.locate("rigs", "emulator").read_text()
+    by_name = "noise_lsb = { force = 0.0, displacement = 1.0, velocity = 1.0, net_force = 1.0 }"
+    path = tmp_path / "own.toml"
+    path.write_text(text.replace("noise_lsb = 1.0", by_name))
+    assert len(np.unique(codes(str(path))[:, CHANNELS.index("force")])) == 2
+    assert np.array_equal(codes(str(path))[:, 1:], codes("emulator")[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("computer", "message"),
+    [
+        ("values = { deviation = { R99 = 0.1 } }", "values: deviation: unknown key 'R99'"),
+        ("values = { deviation = { U1 = 0.1 } }", "values: deviation: unknown key 'U1'"),
+        ("values = { offset_v = { RF = 0.1 } }", r"values: offset_v: unknown key 'RF' \(known: U1, U2"),
+        ("values = { offsets = { U1 = 0.1 } }", "values: unknown key 'offsets'"),
+        ("values = { deviation = { RF = -1.0 } }", r"values: deviation.RF must be within \+-0.9, not -1"),
+        ("values = { slew = { U1 = nan } }", "values: slew.U1: must be a number"),
+        ("specimen = 3\nvalues = { }", "offset_v and specimen are for what is drawn"),
+        ("specimen = -3", "specimen must be 0 to"),
+    ],
+)
+def test_wrong_measured_values_are_refused_by_name(tmp_path: Path, computer: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"own.toml: computer.*{message}"):
+        open_rig(own(tmp_path, computer))
+
+
+@pytest.mark.parametrize(("pots", "at_start", "after"), [("coefficient", 0.83, 0.6098), ("dial", 0.8199, 0.5966)])
+def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
+    tmp_path: Path, pots: str, at_start: float, after: float
+) -> None:
+    """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
+    into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
+    rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
+    scenario = replace(Scenario.load("healthy"), tweaks=(Tweak(100, stiffness_n_per_m=18000.0),))
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        computer, _, tweaks = opened.set_up(scenario, 1)
+    assert computer.coefficients["K"] == pytest.approx(at_start, abs=1e-4)
+    computer.set(**tweaks[0][1])
+    assert computer.coefficients["K"] == pytest.approx(after, abs=1e-4)

@@ -52,12 +52,43 @@ def suspension(u: Signal) -> Signal:
     y, state = np.empty(len(u)), np.zeros(2)
     for k in range(len(u)):
         if k in PROFILE:
-            mass, damping, stiffness = PROFILE[k]
-            a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
-            phi, gamma, *_ = cont2discrete((a, np.array([[0.0], [1.0 / mass]]), np.eye(2), np.zeros((2, 1))), PERIOD_S)
+            phi, gamma, *_ = cont2discrete(state_space(*PROFILE[k]), PERIOD_S)
         y[k] = state[0]
         state = phi @ state + gamma[:, 0] * u[k]
     return y
+
+
+def state_space(mass_kg: float, damping_n_s_per_m: float, stiffness_n_per_m: float) -> tuple[Signal, ...]:
+    """Of position and velocity, driven by the force."""
+    a = np.array([[0.0, 1.0], [-stiffness_n_per_m / mass_kg, -damping_n_s_per_m / mass_kg]])
+    return a, np.array([[0.0], [1.0 / mass_kg]]), np.eye(2), np.zeros((2, 1))
+
+
+def lighter_for_a_while(u: Signal, at: int, apart: int, period_s: float) -> Signal:
+    """The displacement of the first plant of the profile, which from ``at`` on is the last for ``apart`` samples."""
+    first, *_, last = (cont2discrete(state_space(*plant), period_s) for plant in PROFILE.values())
+    y, state = np.empty(len(u)), np.zeros(2)
+    for k in range(len(u)):
+        phi, gamma, *_ = last if at <= k < at + apart else first
+        y[k] = state[0]
+        state = phi @ state + gamma[:, 0] * u[k]
+    return y
+
+
+def kalman(u: Signal, y: Signal, walk: float, nb: int) -> Signal:
+    """The filter of a state theta(k+1) = theta(k) + w(k), E(w w') = walk I, measured by phi' theta with noise 1, in its
+    textbook form: time update, gain, measurement update by Joseph's formula. (n, p) estimates."""
+    n = 2 + nb
+    theta, p = np.zeros(n), 10.0 * np.eye(n)
+    out = np.zeros((len(u), n))
+    for k in range(2, len(u)):
+        phi = np.array([-y[k - 1], -y[k - 2], *(u[k - 1 - i] for i in range(nb))])
+        gain = p @ phi / (phi @ p @ phi + 1.0)
+        theta = theta + gain * (y[k] - phi @ theta)
+        left = np.eye(n) - np.outer(gain, phi)
+        p = left @ p @ left.T + np.outer(gain, gain) + walk * np.eye(n)
+        out[k] = theta
+    return out
 
 
 class Rls:

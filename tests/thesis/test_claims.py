@@ -29,12 +29,15 @@ from tests.thesis.oracle import (
     discrete,
     errors_of,
     excursions,
+    kalman,
     late_scatter,
     latencies,
     least_squares,
+    lighter_for_a_while,
     physical,
     reconverged,
     square,
+    state_space,
     suspension,
 )
 
@@ -64,7 +67,7 @@ def test_every_figure_of_the_thesis_is_there(claims: Claims) -> None:
 
 
 def test_every_claim_names_figures_that_exist_and_has_a_verdict(claims: Claims) -> None:
-    assert len({each["ident"] for each in claims["claims"]}) == len(claims["claims"]) >= 29
+    assert len({each["ident"] for each in claims["claims"]}) == len(claims["claims"]) >= 34
     for each in claims["claims"]:
         assert each["verdict"] in ("holds", "holds with a reading", "does not hold", "not reproduced")
         assert set(each["figures"]) <= set(claims["figures"])
@@ -209,9 +212,17 @@ def test_filtered_data_raise_the_alarms_of_the_printed_algorithm(claims: Claims,
     ]
     _, alarms = Rls("mean-between-faults", 500.0).run(*filtered)
     first = [next((k - a for k in alarms if a < k <= a + 200), None) for a in (200, 400, 600, 800)]
-    rows = claim(claims, "5.5-tracking")["measured"]["filtered_and_detrended_off_line"]["5 Hz"]
+    measured = claim(claims, "5.5-tracking")["measured"]
+    rows = measured["filtered_and_detrended_off_line"]["5 Hz"]
     assert rows["mean-between-faults"]["latency_n"] == first
     assert rows["mean-between-faults"]["extra_alarms"] == len(alarms) - 4 + first.count(None)
+    best = measured["best_ceilings"]["conditioned prediction-error e"]
+    _, alarms = Rls("prediction-error", best["ceiling_lsb"] * 1e7 * run.conditions.channels["displacement"].lsb).run(
+        *filtered
+    )
+    found = [any(a < k <= a + 200 for k in alarms) for a in (200, 400, 600, 800)]
+    assert best["missed"] == found.count(False) == 0
+    assert abs(best["extra_alarms"] - (len(alarms) - found.count(True))) <= 1
 
 
 class Oracle:
@@ -239,16 +250,24 @@ class Oracle:
         theta, self.alarms = Rls(nb=1, **variant).run(u, y[2:])
         return theta / truth - 1.0, theta
 
+    def noisy_example(self, *, silent: bool = False) -> tuple[Signal, Signal]:
+        """Chapter 3, nothing changes: u, which may be off from 200 to 600, and y."""
+        u = square(800, 10.0, -10.0)
+        u[200:600] *= not silent
+        e = np.random.default_rng(1995).normal(0.0, 0.1, 800)
+        return u, lfilter([0.0, -0.9], [1.0, 0.5, 0.8], u) + lfilter([1.0], [1.0, 0.5, 0.8], e)
+
     def scatter(self, **variant: Any) -> float:
         """Of chapter 3, in the second half of the first stretch."""
         errors, _ = self.example(**variant)
         return float(errors[100:200].std(axis=0).max())
 
     @cached_property
-    def simulated(self) -> dict[str, tuple[Signal, list[int], Signal]]:
-        """Chapter 4: errors of M, B, K, alarms, errors of prediction in 0.1 um."""
+    def simulated(self) -> dict[str, tuple[Signal, list[int], Signal, Signal]]:
+        """Chapter 4: errors of M, B, K, alarms, errors of prediction in 0.1 um, errors of a1, a2, b0, b1."""
         u = square(800, 2940.0, -2940.0)
         y = 1e7 * suspension(u)
+        theta_truth = np.repeat([discrete(*plant) for plant in PROFILE.values()], (200, 200, 100, 100, 200), axis=0)
         out = {}
         for key, rls in {
             "rls": Rls(),
@@ -257,11 +276,21 @@ class Oracle:
             "mean-between-faults": Rls("mean-between-faults", 300.0),
         }.items():
             theta, alarms = rls.run(u, y)
-            out[key] = errors_of(physical(theta, 1e7), (0, *CHANGES)), alarms, rls.errors
+            of_theta = theta / [1.0, 1.0, 1e7, 1e7] / theta_truth - 1.0
+            out[key] = errors_of(physical(theta, 1e7), (0, *CHANGES)), alarms, rls.errors, of_theta
         return out
 
     def converged(self, key: str) -> list[int | None]:
         return reconverged(self.simulated[key][0], CHANGES)
+
+    def theta_converged(self, key: str) -> list[int | None]:
+        return reconverged(self.simulated[key][3], CHANGES)
+
+    def disturbed(self, kind: str, disturbance: Signal) -> list[int]:
+        """Alarms of chapter 4 with so much more on y [0.1 um]."""
+        u, ceiling = square(800, 2940.0, -2940.0), {"prediction-error": 1500.0, "mean-between-faults": 300.0}[kind]
+        n = len(disturbance)
+        return Rls(kind, ceiling).run(u[:n], 1e7 * suspension(u[:n]) + disturbance)[1]
 
     def stationary(self) -> float:
         """The largest error of prediction if nothing changes, after sample 50."""
@@ -303,6 +332,14 @@ class Oracle:
         parameters = physical(self.runs[name].theta.astype(float), 1.0 / m, 1.0 / n)
         return excursions(errors_of(parameters, (0, *self.CIRCUIT)), self.CIRCUIT)
 
+    def circuit_theta_converged(self, key: str) -> list[int | None]:
+        """Against batch least squares over each stretch, from the first sample that the new plant alone has made."""
+        u, y = self.runs["noisy"].codes[:, :2].astype(float).T
+        theta, starts = self.on_circuit[key][0][:, :4], (0, *self.CIRCUIT)
+        ends = (*self.CIRCUIT, len(u))
+        batch = [least_squares(u[a + 1 : b], y[a + 1 : b])[:4] for a, b in zip(starts, ends, strict=True)]
+        return reconverged(theta / np.repeat(batch, np.subtract(ends, starts), axis=0) - 1.0, self.CIRCUIT)
+
     def circuit_converged(self, key: str) -> list[int | None]:
         m, n = self.units()
         parameters = physical(self.on_circuit[key][0], 1.0 / m, 1.0 / n)
@@ -341,6 +378,78 @@ def _settled_in_front(y_per_m: float) -> int | None:
     return found
 
 
+def _theta_settled_in_front(y_per_m: float) -> int | None:
+    u, plant = square(400, 2940.0, -2940.0), np.array(discrete(115.0, 3021.0, 24500.0))
+    error = Rls().run(u, y_per_m * arx(u, plant.tolist()))[0] / [1.0, 1.0, y_per_m, y_per_m] / plant - 1.0
+    (found,) = reconverged(np.vstack([error[:1], error]), (0,))
+    return found
+
+
+def _wound_up(m: Claims, o: Oracle) -> bool:
+    """P grows by 1 / 0.97 a sample; what the recursion as printed, which has no limit, scatters in the silence."""
+    theta, _ = Rls(nb=1, forgetting=0.97).run(*o.noisy_example(silent=True))
+    error = theta / [0.5, 0.8, -0.9] - 1.0
+    assert near(m["growth_of_p_in_100"], 0.97**-100, 1e-3)
+    assert near(m["spread_before"], error[100:200].std(axis=0).max())
+    assert near(m["bias_in_silence"], np.abs(error[300:600].mean(axis=0)).max(), 0.05)
+    return near(m["spread_in_silence"], error[300:600].std(axis=0).max(), 0.05) and m["bias_in_silence"] < 0.01
+
+
+def _equivalent(m: Claims, o: Oracle) -> bool:
+    """The filter in another form, with and without a walk."""
+    u, y = o.noisy_example()
+    plain = Rls(nb=1).run(u, y)[0]
+    assert np.allclose(kalman(u, y, 0.0, nb=1), plain, atol=1e-9)
+    apart = {
+        key: float(np.abs(kalman(u, y, float(key), nb=1) - plain).max())
+        for key in ("1", "0.01", "0.0001", "1e-06", "1e-08")
+    }
+    falls = list(m["largest_difference_by_r"].values())
+    found = {key: m["largest_difference_by_r"][key] for key in apart}
+    return bool(falls == sorted(falls, reverse=True)) and falls[-1] == 0.0 and near(found, apart, 0.05)
+
+
+def _least_outliers(m: Claims, o: Oracle, kind: str) -> bool:
+    """One per cent less raises no alarm, one more does."""
+    for at, least in m["least_outlier"].items():
+        spot = np.arange(int(at) + 10) == int(at)
+        if o.disturbed(kind, 0.99 * least * spot) or not o.disturbed(kind, 1.01 * least * spot):
+            return False
+    return bool(m["least_outlier"])
+
+
+def _noise_alarms(m: Claims, o: Oracle, kind: str) -> bool:
+    """Of 100 units rms; an alarm more or less is rounding. Single precision has more of them."""
+    extra = []
+    for seed in range(5):
+        alarms = o.disturbed(kind, np.random.default_rng(seed).normal(0.0, 100.0, 800))
+        extra.append(len(alarms) - 4 + latencies(alarms, 800).count(None))
+    single, double = m["extra_alarms_by_noise"].values()
+    assert single["0"] == double["0"] and all(single[rms] >= double[rms] for rms in single)
+    return bool(abs(double["100"] - float(np.mean(extra))) <= 0.5)
+
+
+def _second_alarms(rate: int, ceiling: float) -> list[int | None]:
+    """From the first alarm to the second, the mass being lighter for 1 to 12 samples."""
+    n, at = 300 * rate, 200 * rate
+    u = np.where(np.arange(n) % (100 * rate) < 50 * rate, 2940.0, -2940.0)
+    out: list[int | None] = []
+    for apart in range(1, 13):
+        y = 1e7 * lighter_for_a_while(u, at, apart, PERIOD_S / rate)
+        _, alarms = Rls("mean-between-faults", ceiling, warm_up_n=50 * rate).run(u, y)
+        found = [k for k in alarms if at < k < at + 50 * rate]
+        out.append(found[1] - found[0] if len(found) > 1 else None)
+    return out
+
+
+def _sample_rate(m: Claims, _: Oracle) -> bool:
+    return (
+        nearly(list(m["second_alarm_after_n"].values()), _second_alarms(1, 300.0))
+        and list(m["at_200_hz"].values()) == _second_alarms(2, 300.0) == [None] * 12
+        and nearly(list(m["at_200_hz_with_a_quarter_of_the_ceiling"].values()), _second_alarms(2, 75.0))
+    )
+
+
 def _variances(run: Run) -> Signal:
     """s^2 (Phi' Phi)^-1 of a1, a2, b0, b1 in newtons and 1e-5 m."""
     u, y = run.channel("force")[:1000], 1e5 * run.channel("displacement")[:1000]
@@ -372,11 +481,6 @@ def _spread_of_simulation(o: Oracle) -> list[float]:
     return list(late_scatter(o.simulated["forgetting"][0], (0, *CHANGES)))
 
 
-def _state_space(mass: float, damping: float, stiffness: float) -> tuple[Signal, ...]:
-    a = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
-    return a, np.array([[0.0], [1.0 / mass]]), np.eye(2), np.zeros((2, 1))
-
-
 def _rms(values: NDArray[Any]) -> float:
     return math.sqrt(float(np.mean(np.asarray(values, float) ** 2)))
 
@@ -384,7 +488,7 @@ def _rms(values: NDArray[Any]) -> float:
 def _skewed(m: Claims, o: Oracle) -> bool:
     """The mean over the seeds is as near as promised, and sampling at once with an early edge gives the same data."""
     exact = np.array([-1.5628, 0.1817e-5, 0.0766e-5])
-    step = [cont2discrete(_state_space(30.5, 1505.0, 24500.0), part * PERIOD_S)[:2] for part in (0.8, 0.2)]
+    step = [cont2discrete(state_space(30.5, 1505.0, 24500.0), part * PERIOD_S)[:2] for part in (0.8, 0.2)]
     u, y, x = np.where(np.arange(1000) % 200 < 100, 2940.0, 0.0), np.empty(1000), np.zeros(2)
     for k in range(1000):
         for (phi, gamma), force in zip(step, (u[k - 1] if k else 0.0, u[k]), strict=True):
@@ -421,6 +525,8 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
             and near(m["spread_with_noise"]["rls"], o.scatter(noise=0.1))
         ),
     ),
+    "3.6-wind-up": ("holds with a reading", _wound_up),
+    "3.7-equivalent": ("holds", _equivalent),
     "3.7-quicker": (
         "holds",
         lambda m, o: (
@@ -443,7 +549,10 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "4.4-30-samples": (
         "holds with a reading",
         lambda m, _: (
-            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3) and m["largest_error"] < 1e-4
+            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3)
+            and m["theta_within_5_percent_after_n"]["mm"] == _theta_settled_in_front(1e3)
+            and m["theta_within_5_percent_after_n"]["m × 5"] == _theta_settled_in_front(5.0)
+            and m["largest_error"] < 1e-4
         ),
     ),
     "4.5-biased": ("holds", lambda m, o: m["reconverged_n"] == o.converged("rls") == [None] * 4),
@@ -451,10 +560,20 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         "holds with a reading",
         lambda m, o: (
             m["reconverged_n"] == o.converged("prediction-error")
+            and nearly(m["theta_reconverged_n"], o.theta_converged("prediction-error"))
             and m["latency_n"] == latencies(o.simulated["prediction-error"][1], 800)
         ),
     ),
     "4.6-theory": ("holds with a reading", lambda m, o: m["samples_from_the_alarm"] == _from_the_alarm(o)),
+    "4.4-outliers": (
+        "holds",
+        lambda m, o: _least_outliers(m, o, "prediction-error") and _noise_alarms(m, o, "prediction-error"),
+    ),
+    "4.5-robust": (
+        "holds with a reading",
+        lambda m, o: _least_outliers(m, o, "mean-between-faults") and _noise_alarms(m, o, "mean-between-faults"),
+    ),
+    "4.9-sample-rate": ("holds with a reading", _sample_rate),
     "4.8-never-zero": (
         "holds with a reading",
         lambda m, o: (
@@ -488,6 +607,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         "holds with a reading",
         lambda m, o: (
             all(nearly(m["reconverged_n"][key], o.converged(key)) for key in m["reconverged_n"])
+            and all(nearly(m["theta_reconverged_n"][key], o.theta_converged(key)) for key in m["reconverged_n"])
             and near(m["spread_of_M_B_K"]["forgetting"], _spread_of_simulation(o))
             and max(m["spread_of_M_B_K"]["mean-between-faults"]) < 5e-4
         ),
@@ -502,7 +622,10 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "5.6-agreement": ("holds with a reading", lambda m, _: m["of_span"] < 0.001 and m["as_printed_1_m_after_n"] < 15),
     "5.5-tracking": (
         "does not hold",
-        lambda m, o: m["forgetting"]["reconverged_n"] == o.circuit_converged("forgetting"),
+        lambda m, o: (
+            m["forgetting"]["reconverged_n"] == o.circuit_converged("forgetting")
+            and nearly(m["theta_reconverged_n"]["forgetting"], o.circuit_theta_converged("forgetting"))
+        ),
     ),
     "5.9-forgetting": (
         "does not hold",

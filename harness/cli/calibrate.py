@@ -1,0 +1,154 @@
+"""``analogrig calibrate``: the emulator becomes the twin of a rig."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from harness.cli.options import seed
+from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+
+if TYPE_CHECKING:
+    from harness.calibration.fit import Calibration, Estimate
+
+MOST_LSB = 1.0
+"""rms between rig and twin, on what the fit has not seen, beyond which it is none."""
+
+_SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, "LSB")}
+"""By the unit of an estimate."""
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("calibrate", help="fit the emulator to a rig's recordings, and keep it as its twin")
+    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", "emulator"), metavar="NAME", help="the rig")
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("build/twin.toml"),
+        metavar="FILE.toml",
+        help="the twin, for --rig (default: %(default)s)",
+    )
+    command.add_argument(
+        "--program", choices=("front", "shock"), default="front", help="what is patched on it (%(default)s)"
+    )
+    command.add_argument("--op-amp", default="tl07x", choices=("tl07x", "741", "opa627", "ideal"), help="(%(default)s)")
+    command.add_argument(
+        "--components",
+        choices=("nominal", "polyester", "polypropylene"),
+        help="its capacitors (default: the likeliest)",
+    )
+    command.add_argument(
+        "--pots", choices=("coefficient", "dial"), help="what its pots are set by (default: the likelier)"
+    )
+    command.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="of what is drawn of an emulated rig (%(default)d)"
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from harness.calibration.check import difference_lsb
+    from harness.calibration.fit import POTS, STOCKS, calibrate
+    from harness.calibration.plan import check_scenario, scenarios
+    from harness.calibration.recordings import record
+    from harness.errors import ConfigurationError, RigError
+    from harness.rigs.description import open_rig
+    from harness.storage import replacing
+
+    if arguments.out.suffix != ".toml":
+        raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    try:
+        with open_rig(arguments.rig) as rig:
+            recordings = [record(rig, each, arguments.seed) for each in scenarios(arguments.program)]
+            check = record(rig, check_scenario(arguments.program), arguments.seed)
+        found = calibrate(
+            recordings,
+            op_amp=arguments.op_amp,
+            stocks=(arguments.components,) if arguments.components else STOCKS,
+            pots=(arguments.pots,) if arguments.pots else POTS,
+        )
+        check_lsb = difference_lsb(check, found.twin, found.estimate("displacement noise").value)
+    except RigError as error:
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+    if check_lsb <= MOST_LSB:
+        with replacing(arguments.out) as file:
+            file.write(_toml(found, arguments.rig, arguments.program, check_lsb).encode("utf-8"))
+    show(json.dumps(_as_json(found, check_lsb, arguments)) if arguments.json else _table(found, check_lsb, arguments))
+    return PASSED if check_lsb <= MOST_LSB else FAILED
+
+
+def _table(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> str:
+    kept = f"kept as {arguments.out}" if check_lsb <= MOST_LSB else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
+    lines = [f"{'':20} {'fitted':>10}    {'std error':>9}       stands for"]
+    lines += [f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates]
+    return "\n".join([*lines, "", *_said(found, check_lsb), kept])
+
+
+def _value(estimate: Estimate) -> str:
+    factor, unit = _SHOWN_AS[estimate.unit]
+    return f"{factor * estimate.value:10.4f} +- {factor * estimate.standard_error:9.4f} {unit:3}"
+
+
+def _said(found: Calibration, check_lsb: float) -> list[str]:
+    """How good it is and what it does not know, a line each."""
+    computer = found.twin.computer
+    others = [
+        f"{stock}, by {pots} {chi_square - found.chi_square:+.0f}"
+        for (stock, pots), chi_square in found.chi_squares.items()
+        if (stock, pots) != (computer.components, computer.pots)
+    ]
+    lines = [f"likeliest: {computer.components} capacitors, pots set by {computer.pots}"]
+    lines += [f"chi-square of others: {'; '.join(others)}"] if others else []
+    lines += [f"hardly told apart: {a} and {b} (correlation {c:+.2f})" for a, b, c in found.alike]
+    lines += [f"known no better than by the datasheet: {', '.join(found.unseen)}"] if found.unseen else []
+    return [
+        *lines,
+        f"recordings: within {found.residual_lsb:.2f} LSB rms, chi-square {found.chi_square:.0f} of {found.freedom}",
+        f"on a scenario that was not fitted: within {check_lsb:.2f} LSB rms",
+    ]
+
+
+def _toml(found: Calibration, rig: str, program: str, check_lsb: float) -> str:
+    """The description, which ``open_rig`` gives back; what it is and how sure, as comments."""
+    from dataclasses import asdict, replace
+
+    from harness.config import to_toml
+
+    heading = [
+        f"Twin of the rig {rig!r}, program {program}: the emulator as analogrig calibrate fitted it.",
+        "A value stands for all that acts as it does; the parts that are not named are as in the diagram.",
+        *(f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates),
+        *_said(found, check_lsb),
+    ]
+    described = asdict(replace(found.twin, description=f"twin of {rig}"))
+    del described["name"]
+    return "".join(f"# {line}\n" for line in heading) + "\n" + to_toml(described)
+
+
+def _as_json(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> dict[str, Any]:
+    from math import isfinite
+
+    return {
+        "rig": arguments.rig,
+        "program": arguments.program,
+        "file": str(arguments.out) if check_lsb <= MOST_LSB else None,
+        "components": found.twin.computer.components,
+        "pots": found.twin.computer.pots,
+        "estimates": [
+            {**vars(each), "known_to": each.known_to if isfinite(each.known_to) else None} for each in found.estimates
+        ],
+        "chi_square": found.chi_square,
+        "freedom": found.freedom,
+        "tried": [
+            {"components": stock, "pots": pots, "chi_square": value}
+            for (stock, pots), value in found.chi_squares.items()
+        ],
+        "alike": found.alike,
+        "unseen": found.unseen,
+        "residual_lsb": found.residual_lsb,
+        "check_lsb": check_lsb,
+    }

@@ -1,0 +1,1 @@
+"""The emulator as an instrument on a TCP port."""

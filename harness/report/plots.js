@@ -1,0 +1,187 @@
+"use strict";
+// What the pages with plots have in common: data unpacked, marks over the signals, print and dark scheme, troubles told.
+const plotting = (() => {
+  const FONT = "12px system-ui, sans-serif";
+  const PRINT_WIDTH_PX = 700; // an A4 page between its margins
+  const DENSE_PX = 10; // wrong alarms that are nearer to each other than this ...
+  const DENSE_ALPHA = 0.2; // ... fade, at most to this
+
+  async function inflated(deflated) {
+    const bytes = Uint8Array.from(atob(deflated), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    return new Response(stream).arrayBuffer();
+  }
+
+  function padded(low, high) {
+    const margin = Math.max(0.1 * (high - low), 0.01 * Math.abs(high), 1e-12);
+    return [low - margin, high + margin];
+  }
+
+  // Marks: each is `at` a place of the x axis.
+
+  function position(u, at) {
+    return Math.round(u.valToPos(at, "x", true)) + 0.5;
+  }
+
+  function verticals(u, marks, { colour, width, dash = [], alpha = 1 }) {
+    const { ctx, bbox } = u;
+    const px = devicePixelRatio;
+    ctx.save();
+    ctx.strokeStyle = colour;
+    ctx.globalAlpha = alpha;
+    ctx.lineWidth = width * px;
+    ctx.setLineDash(dash.map((d) => d * px));
+    ctx.beginPath();
+    for (const { at } of marks) {
+      ctx.moveTo(position(u, at), bbox.top);
+      ctx.lineTo(position(u, at), bbox.top + bbox.height);
+    }
+    ctx.stroke();
+    ctx.restore();
+  }
+
+  function flags(u, marks, colour) {
+    const { ctx, bbox } = u;
+    const [size, bottom] = [5 * devicePixelRatio, bbox.top + bbox.height];
+    ctx.save();
+    ctx.fillStyle = colour;
+    for (const { at } of marks) {
+      ctx.beginPath();
+      ctx.moveTo(position(u, at), bottom - 2 * size);
+      ctx.lineTo(position(u, at) + size, bottom);
+      ctx.lineTo(position(u, at) - size, bottom);
+      ctx.fill();
+    }
+    ctx.restore();
+  }
+
+  // The context ready for letters; to be restored.
+  function lettered({ ctx }, colour, align, baseline) {
+    ctx.save();
+    ctx.font = FONT.replace(/^\d+/, (size) => String(size * devicePixelRatio));
+    ctx.fillStyle = colour;
+    ctx.textAlign = align;
+    ctx.textBaseline = baseline;
+  }
+
+  function labels(u, marks, colour) {
+    const { ctx, bbox } = u;
+    const px = devicePixelRatio;
+    lettered(u, colour, "center", "bottom");
+    let free = -Infinity;
+    for (const mark of marks) {
+      const x = position(u, mark.at);
+      const half = ctx.measureText(mark.label).width / 2;
+      if (x - half < free) continue; // it would cover its neighbour; zooming in makes room
+      ctx.fillText(mark.label, x, bbox.top - 2 * px);
+      free = x + half + 6 * px;
+    }
+    ctx.restore();
+  }
+
+  // Changes of the plant and alarms, as far as they are in view. Lines lie under the signals, flags and labels above.
+  function alarms(u, { changes, noticed, wrong }, ink) {
+    const { min, max } = u.scales.x;
+    const [moved, right, other] = [changes, noticed, wrong].map((all) => all.filter(({ at }) => at >= min && at <= max));
+    const room_px = u.bbox.width / devicePixelRatio / Math.max(1, other.length);
+    const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
+    return {
+      lines() {
+        verticals(u, moved, { colour: ink("ink"), width: 1.25 });
+        verticals(u, other, { colour: ink("false"), width: 2, dash: [2, 3], alpha });
+        verticals(u, right, { colour: ink("alarm"), width: 1.75, dash: [6, 4] });
+      },
+      flags() {
+        flags(u, other, ink("false"));
+        flags(u, right, ink("alarm"));
+        labels(u, moved, ink("ink"));
+      },
+    };
+  }
+
+  // Curves, axes, and where they are drawn
+
+  function curve(label, stroke, more) {
+    const value = (u, v) => (v === null || v === undefined ? "–" : v.toPrecision(5));
+    return { label, stroke, width: 1.5, points: { show: false }, value, ...more };
+  }
+
+  function axis(scale, label, side, ink, more) {
+    const line = { stroke: ink("line"), width: 1 };
+    return {
+      scale,
+      side,
+      label,
+      labelGap: 0,
+      font: FONT,
+      labelFont: FONT,
+      stroke: ink("muted"),
+      grid: line,
+      ticks: { ...line, size: 5 },
+      ...more,
+    };
+  }
+
+  // The pointer reads all plots with the same key, and drags across them zoom.
+  function cursor(key) {
+    return { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } };
+  }
+
+  function plotted(options, data, place, name) {
+    const plot = new uPlot(options, data, place);
+    const canvas = plot.root.querySelector("canvas");
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", name);
+    return plot;
+  }
+
+  function inks() {
+    const style = getComputedStyle(document.documentElement);
+    return (name) => style.getPropertyValue(`--${name}`).trim();
+  }
+
+  function isPrinting() {
+    return document.documentElement.classList.contains("printing");
+  }
+
+  function widthOf(place) {
+    return isPrinting() ? PRINT_WIDTH_PX : place.clientWidth;
+  }
+
+  // Draws again for print and another scheme, and fits the plots when the width of their place changes.
+  function redrawn(draw, place, plots, height) {
+    const printing = (on) => () => {
+      document.documentElement.classList.toggle("printing", on);
+      draw();
+    };
+    addEventListener("beforeprint", printing(true));
+    addEventListener("afterprint", printing(false));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    new ResizeObserver(() => {
+      const width = place.clientWidth;
+      if (!width || isPrinting() || plots()[0].width === width) return;
+      for (const plot of plots()) plot.setSize({ width, height });
+    }).observe(place);
+  }
+
+  function trouble(text) {
+    const place = document.getElementById("trouble");
+    place.textContent = text;
+    place.hidden = false;
+  }
+
+  // `show` draws what was unpacked, and returns how many plots that are.
+  async function begin(deflated, show) {
+    if (typeof DecompressionStream === "undefined") {
+      return trouble("This browser is too old for the plots: it has no DecompressionStream.");
+    }
+    try {
+      document.documentElement.dataset.drawn = String(show(await inflated(deflated)));
+    } catch (error) {
+      trouble(`The plots could not be drawn: ${error.message}`);
+      throw error;
+    }
+  }
+
+  return { alarms, axis, begin, cursor, curve, inks, isPrinting, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf };
+})();

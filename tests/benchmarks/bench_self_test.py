@@ -1,0 +1,45 @@
+"""How often the self-test finds something wrong with a machine that is within tolerance, and how near it comes to that.
+
+python -m tests.benchmarks self-test
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from harness.run import CHANNELS
+from harness.self_test.conduct import self_test
+from harness.statistics import upper_rate
+
+from .figure import Figure
+
+MACHINES = 200
+"""Of each program, drawn from the seeds from 0 on."""
+
+CONFIDENCE = 0.95
+
+
+def figures() -> Iterator[Figure]:
+    """Machines that are found wrong; the largest part of its limit that each quantity takes."""
+    card = CardDescription(range_v=dict.fromkeys(CHANNELS, (-10.0, 10.0)), noise_lsb=1.0)
+    rig = EmulatorRig(EmulatorDescription(card, computer=ComputerDescription(components="polyester"), name="drawn"))
+    for program in ("front", "shock"):
+        found = [self_test(rig, seed, program) for seed in range(MACHINES)]
+        wrong = sum(not findings.well for findings in found)
+        yield Figure(
+            f"self-test, {program}: machines of 1 % and 5 % parts that are found wrong, of {MACHINES}",
+            wrong,
+            "",
+            bounds=(0.0, MACHINES * upper_rate(wrong, MACHINES, CONFIDENCE)),
+        )
+        for i, check in enumerate(found[0].checks):
+            if check.error:
+                values = np.array([findings.checks[i].value for findings in found])
+                yield Figure(
+                    f"self-test, {program}: {check.title}",
+                    float(np.abs(values).max()),
+                    f"{check.unit}, limit {check.most:.3g}",
+                )

@@ -1,0 +1,67 @@
+"""Pages in a real browser, for the tests of all that only a browser can tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from playwright.sync_api import Browser, Locator, Page
+
+COUNT_PIXELS = """(canvas, [r, g, b]) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) count += data[i] === r && data[i + 1] === g && data[i + 2] === b;
+    return count;
+}"""
+
+
+class Watched:
+    """A page of the browser, with everything it complained of and asked for."""
+
+    def __init__(self, browser: Browser, path: Path) -> None:
+        """Open a file."""
+        self.page: Page = browser.new_page(viewport={"width": 1200, "height": 1000})
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda message: self.complaints.append(message.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+
+    def plots(self, within: str = "") -> list[Locator]:
+        """Those of the page, or of an element."""
+        self.page.wait_for_selector("html[data-drawn]")
+        return self.page.locator(f"{within} .u-wrap canvas").all()
+
+    def images(self, within: str = "") -> list[str]:
+        """What each plot shows, after the browser has painted."""
+        self.page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        return [plot.evaluate("(canvas) => canvas.toDataURL()") for plot in self.plots(within)]
+
+    def pixels(self, colour: tuple[int, int, int]) -> list[int]:
+        """How many pixels of exactly this colour each plot has."""
+        return [plot.evaluate(COUNT_PIXELS, list(colour)) for plot in self.plots()]
+
+    def drag(self, plot: int, start: float, end: float, within: str = "") -> None:
+        """Drag across a plot, between two fractions of its width."""
+        x, y, width = self._area(plot, within)
+        self.page.mouse.move(x + start * width, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + end * width, y, steps=3)
+        self.page.mouse.up()
+        self.page.mouse.move(0, 0)
+
+    def point_at(self, plot: int, fraction: float) -> None:
+        x, y, width = self._area(plot)
+        self.page.mouse.move(x + fraction * width, y)
+
+    def values(self, plot: int) -> list[str]:
+        """What the legend of a plot says of the sample under the pointer."""
+        return self.page.locator(".u-legend").nth(plot).locator(".u-value").all_inner_texts()
+
+    def _area(self, plot: int, within: str = "") -> tuple[float, float, float]:
+        area = self.page.locator(f"{within} .u-over").nth(plot)
+        area.scroll_into_view_if_needed()
+        box = area.bounding_box()
+        assert box is not None
+        return box["x"], box["y"] + box["height"] / 2, box["width"]

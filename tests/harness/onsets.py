@@ -1,0 +1,154 @@
+"""Turns of the pots at instants that nobody told, on emulated machines of real components, for ``harness.onset``."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator import Excitation
+from harness import config, information
+from harness.onset import NoOnset, Onset, onset
+from harness.plant import PARAMETERS, Plant, SampledPlant
+from harness.rigs.emulator import EmulatorDescription, EmulatorRig
+from harness.scenario import PLANTS, Scenario, Tweak
+from harness.turn import Turn, turn
+from harness.two_filter import Record
+
+FRONT = PLANTS["front"]
+
+FIELDS = dict(zip(PARAMETERS, (field.name for field in dataclasses.fields(Plant)), strict=True))
+
+Clock = Literal["card", "free"]
+
+LARGEST_UP = {"M": 0.5, "B": 0.3, "K": 0.15}
+"""Relative changes beyond which a pot comes to its end; down there is always room for half."""
+
+QUIET_N = 900
+"""Samples before the first instant of a change."""
+
+
+@functools.cache
+def machines() -> EmulatorRig:
+    """Of polyester capacitors and resistors of 1 %, drawn from the seed, amplifiers of the grade, noise of 1 LSB."""
+    table = config.read_toml(config.locate("rigs", "emulator"))
+    described = config.build(EmulatorDescription, {"name": "polyester", **table}, "emulator")
+    computer = dataclasses.replace(described.computer, components="polyester")
+    return EmulatorRig(dataclasses.replace(described, computer=computer))
+
+
+def played(scenario: Scenario, seed: int) -> Record:
+    """What the card takes of it."""
+    performance = machines().perform(scenario, seed)
+    blocks = list(performance.blocks)
+    codes, clipped = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("codes", "clipped"))
+    return Record.of(codes, clipped, performance.channels, performance.sample_period_s * performance.time_scale)
+
+
+def scenario_of(
+    samples: int, clock: Clock, frequency_hz: float, plant: Plant = FRONT, sample: int = 0, ramp_n: int = 0
+) -> Scenario:
+    """The front suspension, which becomes ``plant`` at a sample."""
+    changed = {FIELDS[name]: new for name, (_, new) in FRONT.changes_to(plant).items()}
+    return Scenario(
+        samples=samples,
+        excitation=Excitation(
+            low_v=0.1, high_v=9.9, frequency_hz=frequency_hz, clock=clock, drift_ppm=20.0 if clock == "free" else 0.0
+        ),
+        random_phase=True,
+        tweaks=(Tweak(sample, ramp_n=ramp_n, **changed),) if changed else (),
+        name="onset",
+    )
+
+
+def changed(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
+    """The front suspension with so many of M, B, K changed, by factors from 1 +- least to 1 +- most."""
+    plant = FRONT
+    for name in rng.choice(PARAMETERS, size=together, replace=False).tolist():
+        size = math.exp(rng.uniform(math.log(least), math.log(most)))
+        up = rng.uniform() < 0.5 and size <= LARGEST_UP[name]
+        plant = plant.scaled(name, 1.0 + size if up else 1.0 - size)
+    return plant
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A change of the front suspension at an instant that only the trial knows."""
+
+    record: Record
+    after: Plant
+    sample: int
+    ramp_n: int
+    search: range
+    known: bool
+    """The harness is told what the plant is to become."""
+
+    @classmethod
+    def jump(cls, seed: int, clock: Clock) -> Trial:
+        """5 to 50 % of one or two parameters, edges every 50 or 100 samples, in a range of 600; what it becomes is told
+        in five of six trials."""
+        rng = np.random.default_rng([9, seed])
+        after = changed(rng, 0.05, 0.5, together=int(rng.integers(1, 3)))
+        sample = QUIET_N + int(rng.integers(200))
+        first = sample - int(rng.integers(50, 550))
+        scenario = scenario_of(2200, clock, float(rng.choice([100.0, 200.0])), after, sample)
+        return cls(played(scenario, seed), after, sample, 0, range(first, first + 600), bool(rng.uniform() < 5.0 / 6.0))
+
+    @classmethod
+    def ramp(cls, seed: int, clock: Clock) -> Trial:
+        """10 to 50 % of one parameter within 20 to 600 samples, 50 to 300 samples on both sides of the range."""
+        rng = np.random.default_rng([10, seed])
+        after = changed(rng, 0.1, 0.5, together=1)
+        sample, ramp_n = QUIET_N + int(rng.integers(200)), int(math.exp(rng.uniform(math.log(20.0), math.log(600.0))))
+        search = range(sample - int(rng.integers(50, 300)), sample + ramp_n + int(rng.integers(50, 300)))
+        scenario = scenario_of(3000, clock, 200.0, after, sample, ramp_n)
+        return cls(played(scenario, seed), after, sample, ramp_n, search, known=True)
+
+    def found(self) -> Onset | NoOnset:
+        return onset(self.record, FRONT, self.after if self.known else None, self.search)
+
+    def turned(self) -> Turn | NoOnset:
+        return turn(self.record, FRONT, self.after if self.known else None, self.search)
+
+    def width_bound(self) -> int:
+        """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the
+        information between the courses that the displacement then takes is below ln 20, as in harness.information."""
+        first = max(0, self.sample - 400)
+        samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
+        courses_m = self._courses(first, samples)
+        true_m = courses_m[samples == self.sample]
+        gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.record.noise_m**2)
+        return int((gathered < information.LN_CERTAIN).sum())
+
+    def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(m, 800) metres from a sample on, the plant changing at each of these samples (m,)."""
+        before, after = (SampledPlant.of(plant, self.record.period_s) for plant in (FRONT, self.after))
+        x, v = np.zeros(len(samples)), np.zeros(len(samples))
+        out = []
+        for k, force in enumerate(self.record.force_n[first : first + 800].tolist(), start=first):
+            out.append(x)
+            (xa, va), (xb, vb) = (_next(plant, x, v, force) for plant in (before, after))
+            changed = k >= samples
+            x, v = np.where(changed, xb, xa), np.where(changed, vb, va)
+        return np.array(out).T
+
+
+def _next(
+    plant: SampledPlant, x: NDArray[np.float64], v: NDArray[np.float64], force_n: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """SampledPlant.next for many states."""
+    xx, xv, vx, vv = plant.transition
+    xf, vf = plant.response
+    return xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n
+
+
+def still(seed: int, clock: Clock) -> Trial:
+    """A pot that was to be turned and was not: nothing has changed."""
+    rng = np.random.default_rng([11, seed])
+    record = played(scenario_of(2200, clock, 200.0), seed)
+    return Trial(record, changed(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0))

@@ -1,0 +1,127 @@
+"""Tweaks that pots without exact instants made while a record was taken, dated by its samples."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from harness.links.wire import VirtualClock
+from harness.plant import Plant
+from harness.rigs.by_hand import ByHand, Tweak
+from harness.scenario import Tweak as PlayedTweak
+from harness.two_filter import Record
+from tests.harness.onsets import FRONT, played, scenario_of
+
+RATE_HZ = 20e3
+
+
+@dataclasses.dataclass
+class Hand:
+    """Whoever needs so long for each turn."""
+
+    clock: VirtualClock
+    takes_s: float
+    slow: bool = False
+    exact: bool = False
+
+    def settle(self, dials: Mapping[str, float], words: str) -> None:
+        raise NotImplementedError
+
+    def turn(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - it is told what to turn, and does
+        self.clock.advance(self.takes_s)
+
+    def close(self) -> None:
+        pass
+
+
+def turned(tweaks: Sequence[Tweak], takes_s: float, *, slow: bool = False) -> ByHand:
+    """By a hand in virtual time: each asked for when it was to be."""
+    clock = VirtualClock()
+    by_hand = ByHand(Hand(clock, takes_s, slow), tweaks, RATE_HZ, clock, clock.advance)
+    by_hand.turn_all()
+    return by_hand
+
+
+def taken(samples: int, *changes: PlayedTweak) -> Record:
+    """By the card of a machine of real components."""
+    return played(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
+
+
+def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) -> Tweak:
+    return Tweak(sample, dials, before, after)
+
+
+def test_jump_is_dated_wherever_the_pot_was_between_question_and_answer() -> None:
+    soft = FRONT.scaled("K", 0.7)
+    record = taken(4000, PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(record, first=5000)
+    assert segment.plant == soft and not segment.unseen
+    assert segment.start_low is not None and segment.start_high is not None
+    assert segment.start_low <= 6630 <= segment.start_high
+    assert segment.start_high - segment.start_low < 60
+
+
+def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_the_second() -> None:
+    after = FRONT.scaled("B", 0.7).scaled("K", 0.75)
+    dials = {"K": 0.6, "B": 0.5}  # in this order
+    record = taken(
+        4000,
+        PlayedTweak(1630, stiffness_n_per_m=after.stiffness_n_per_m),
+        PlayedTweak(1700, damping_n_s_per_m=after.damping_n_s_per_m),
+    )
+    (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).dated(record, first=0)
+    assert not segment.unseen, segment.unseen
+    earliest, latest = segment.earliest(), segment.latest()
+    assert earliest.start <= 1630 <= latest.start
+    assert earliest.start + earliest.ramp_n <= 1700 <= latest.start + latest.ramp_n
+
+
+def test_slow_hand_is_dated_from_begin_to_end() -> None:
+    soft = FRONT.scaled("K", 0.6)
+    change = PlayedTweak(1700, stiffness_n_per_m=soft.stiffness_n_per_m, ramp_n=400)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.04, slow=True).dated(taken(5000, change), 0)
+    assert not segment.unseen, segment.unseen
+    earliest, latest = segment.earliest(), segment.latest()
+    assert earliest.start <= 1700 <= latest.start
+    assert earliest.start + earliest.ramp_n <= 2100 <= latest.start + latest.ramp_n
+    assert 300 < segment.ramp_n < 550
+
+
+def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
+    """Asked for 2000 samples apart; a search of the one never looks at samples in which the other may have been."""
+    soft = FRONT.scaled("K", 0.7)
+    light = soft.scaled("M", 0.6)
+    record = taken(
+        6000,
+        PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m),
+        PlayedTweak(3250, mass_kg=light.mass_kg),
+    )
+    tweaks = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
+    first, second = turned(tweaks, takes_s=0.01).dated(record, first=0)
+    for segment, sample in ((first, 1630), (second, 3250)):
+        assert not segment.unseen, segment.unseen
+        assert segment.earliest().start <= sample <= segment.latest().start
+
+
+def test_pot_that_did_not_move_is_a_change_that_nobody_has_seen() -> None:
+    soft = FRONT.scaled("K", 0.7)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(taken(4000), first=0)
+    assert "shows that the plant has changed" in segment.unseen
+    assert segment.start <= 1500 and segment.start + segment.ramp_n >= 1700
+
+
+def test_pot_that_is_turned_when_the_record_is_over_is_one_too() -> None:
+    soft = FRONT.scaled("K", 0.7)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(taken(1100), first=0)
+    assert "when the record was over" in segment.unseen
+    assert segment.start < 1100
+
+
+def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
+    after = FRONT.scaled("B", 0.7).scaled("K", 0.75)
+    assert asked(0, {"K": 0.6, "B": 0.5}, FRONT, after).middle == FRONT.scaled("K", 0.75)
+    assert asked(0, {"B": 0.5, "K": 0.6}, FRONT, after).middle == FRONT.scaled("B", 0.7)
+    assert asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).middle is None
+    assert np.isclose(asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).after.stiffness_n_per_m, 18375.0)

@@ -1,0 +1,371 @@
+"""The same scenarios on a real rig: proven against the emulator served as the instrument, in another process."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.excitation import Excitation
+from harness.bench import Bench
+from harness.dut import open_dut
+from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigTimeout
+from harness.rigs.description import open_rig
+from harness.rigs.real import LEAD_N, records
+from harness.rigs.rig import Performance
+from harness.run import Run
+from harness.scenario import PlantChoice, Scenario, Tweak
+from harness.verdict import judge
+from tests.harness.processes import LONG_S
+from tests.harness.served import RIG, ROOT, Served, served
+
+THESIS = Scenario.load("thesis")
+SHORT = dataclasses.replace(THESIS, samples=300, tweaks=())
+
+
+@pytest.fixture(scope="module")
+def ideal() -> Iterator[Served]:
+    with served("--rig", "emulator-ideal") as instrument:
+        yield instrument
+
+
+@pytest.fixture
+def bench(ideal: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a rig at the ideal instrument."""
+    monkeypatch.setenv("ANALOGRIG_RIGS", str(ideal.rigs_file(tmp_path)))
+    return "bench"
+
+
+def played(rig: str, scenario: Scenario, seed: int) -> Run:
+    with open_rig(rig) as opened, open_dut("inproc") as dut:
+        return Bench(opened, dut).play(scenario, seed)
+
+
+def volts(performance: Performance) -> np.ndarray:
+    return np.concatenate([block.volts[:, :2] for block in performance.blocks])
+
+
+# ---- the same as the emulator
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_signals_are_those_of_the_emulated_rig_to_the_converters_step(bench: str, seed: int) -> None:
+    with open_rig(bench) as real, open_rig("emulator-ideal") as emulated:
+        measured, exact = volts(real.perform(THESIS, seed)), volts(emulated.perform(THESIS, seed))
+    half_step_v = 0.5 * 40.0 / (1 << 14)
+    # 0.05 samples between sample and pot, as the tweak of a real machine comes between two; so much x moves meanwhile
+    np.testing.assert_allclose(measured[:1200], exact[:1200], atol=half_step_v + 1e-4)
+    np.testing.assert_allclose(measured, exact, atol=half_step_v + 0.03)
+
+
+def test_verdicts_are_those_of_the_emulated_rig(bench: str) -> None:
+    for seed in range(6):
+        real, emulated = judge(played(bench, THESIS, seed)), judge(played("emulator-ideal", THESIS, seed))
+        assert real.outcome == emulated.outcome == "passed"
+        for mine, other in zip(real.tweaks, emulated.tweaks, strict=True):
+            assert (mine.sample, mine.what) == (other.sample, other.what)
+            assert mine.latency_n is not None
+            assert other.latency_n is not None
+            assert abs(mine.latency_n - other.latency_n) <= 2
+
+
+def test_each_play_begins_with_the_pots_of_its_scenario(bench: str) -> None:
+    with open_rig(bench) as rig:
+        first, again = (volts(rig.perform(THESIS, 1)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
+def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
+    tweaks = (Tweak(5000, stiffness_n_per_m=18000.0), Tweak(16_500, damping_n_s_per_m=3453.0))
+    run = played(bench, dataclasses.replace(THESIS, samples=20_000, tweaks=tweaks), 1)
+    assert run.conditions.records == (0, 16_384 - (16_384 - (16_500 - LEAD_N)))
+    assert run.samples == 20_000
+    verdict = judge(run)
+    assert verdict.outcome == "passed", verdict.reasons
+    assert [tweak.sample for tweak in verdict.tweaks] == [5000, 16_500]
+    assert verdict.estimates[-1].error["B"] == pytest.approx(0.0, abs=0.02)
+
+
+def test_records_keep_their_distance_from_tweaks() -> None:
+    assert records(1000, 16_384, [500]) == [(0, 1000)]
+    assert records(20_000, 16_384, []) == [(0, 16_384), (16_384, 20_000)]
+    assert records(20_000, 16_384, [16_380]) == [(0, 16_380 - LEAD_N), (16_380 - LEAD_N, 20_000)]
+    assert records(20_000, 16_384, [16_384 + LEAD_N + 1]) == [(0, 16_384), (16_384, 20_000)]
+
+
+WAVEFORMS = [
+    Excitation("pulse", 0.5, 9.0, 100.0, duty=0.2),
+    Excitation(clock="free", phase=0.3, low_v=0.1, high_v=9.0, drift_ppm=20.0),
+]
+
+
+@pytest.mark.parametrize("excitation", WAVEFORMS)
+def test_waveforms_are_those_that_were_asked_for(bench: str, excitation: Excitation) -> None:
+    scenario = Scenario(600, excitation, name="waveform")
+    with open_rig(bench) as real, open_rig("emulator-ideal") as emulated:
+        measured, exact = volts(real.perform(scenario, 1)), volts(emulated.perform(scenario, 1))
+    np.testing.assert_allclose(measured, exact, atol=0.002)
+
+
+def test_stages_between_instrument_and_computer_are_taken_out(tmp_path: Path) -> None:
+    stages = {"generator": (-10.0, 0.5), "force": (0.5, 0.0), "displacement": (-1.0, 0.25)}
+    defects = [
+        part
+        for name, (gain, offset_v) in stages.items()
+        for part in ("--defect", f"wiring.{name}.gain={gain}", "--defect", f"wiring.{name}.offset_v={offset_v}")
+    ]
+    wired = """
+[rig.other]
+kind = "real"
+instrument = "redpitaya://{address}"
+generator = {{ gain = -10.0, offset_v = 0.5 }}
+inputs.force = {{ input = 1, range = "HV", gain = 0.5 }}
+inputs.displacement = {{ input = 2, range = "HV", gain = -1.0, offset_v = 0.25 }}
+pots.kind = "instrument"
+self_test = false
+"""
+    with served("--rig", "emulator-ideal", *defects) as instrument:
+        file = tmp_path / "rigs.toml"
+        file.write_text(wired.format(address=instrument.address))
+        with open_rig(f"{file}:other") as real, open_rig("emulator-ideal") as emulated:
+            measured, exact = volts(real.perform(SHORT, 1)), volts(emulated.perform(SHORT, 1))
+    np.testing.assert_allclose(measured[0], [exact[0, 0], 0.5 * 0.6], atol=0.005)  # at rest under the stage's offset
+    np.testing.assert_allclose(measured[200:], exact[200:], atol=0.005)
+
+
+# ---- what goes wrong
+
+
+FAILURES = {
+    "acquisition.half_filled=true": RecordIncomplete,
+    'acquisition.drop_out="zeros"': RecordIncomplete,
+    'acquisition.drop_out="hang up"': RigClosed,
+    'acquisition.drop_out="silence"': RigTimeout,
+    "acquisition.never_filled=true": RigTimeout,
+}
+
+
+@pytest.mark.parametrize("defect", FAILURES)
+def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclusive(
+    defect: str, tmp_path: Path
+) -> None:
+    second = ("--defect", "acquisition.drop_out_record=2")  # the first one is taken while the computer comes to rest
+    with served("--defect", defect, *second) as instrument:
+        file = instrument.rigs_file(tmp_path)
+        if "drop_out" in defect:
+            file.write_text(file.read_text().replace("timeout_s = 2.0", "timeout_s = 0.5"))
+        with open_rig(str(file)) as rig:
+            blocks = rig.perform(SHORT, 1).blocks
+            with pytest.raises(FAILURES[defect], match=instrument.address):
+                next(blocks)
+        if "drop_out" not in defect:
+            verdict = judge(played(str(file), SHORT, 1))
+            assert verdict.outcome == "inconclusive"
+            assert instrument.address in verdict.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("answer", "error"),
+    [(None, RigTimeout), (b"", RigClosed), (b"nonsense" * 300_000, RigError), (b"\n\n#9\n\xff\xff\n" * 50, RigError)],
+    ids=["says nothing", "hangs up", "an answer without end", "nonsense"],
+)
+def test_what_is_no_instrument_is_a_named_error(answer: bytes | None, error: type[RigError], tmp_path: Path) -> None:
+    def answers(listening: socket.socket) -> None:
+        connection, _ = listening.accept()
+        with connection:
+            if answer is None:
+                done.wait(LONG_S)
+            connection.sendall(answer or b"")
+
+    done = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=answers, args=(listening,), daemon=True)
+        thread.start()
+        file = tmp_path / "rigs.toml"
+        file.write_text(
+            RIG.format(address=f"127.0.0.1:{listening.getsockname()[1]}", self_test="false").replace("2.0", "0.2")
+        )
+        with open_rig(str(file)) as rig, pytest.raises(error):
+            next(rig.perform(SHORT, 1).blocks)
+        done.set()
+        thread.join(LONG_S)
+
+
+def test_nobody_there_is_one_clear_line_and_inconclusive(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+    file = tmp_path / "rigs.toml"
+    file.write_text(RIG.format(address=address, self_test="false"))
+    verdict = judge(played(str(file), SHORT, 1))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0] == f"instrument {address}: cannot be reached: Connection refused"
+
+
+def output_state(address: str) -> str:
+    host, _, port = address.rpartition(":")
+    with socket.create_connection((host, int(port)), LONG_S) as connection, connection.makefile("rwb") as lines:
+        lines.write(b"OUTPUT1:STATE?\r\n")
+        lines.flush()
+        return lines.readline().decode().strip()
+
+
+def test_generator_is_off_while_the_device_works_and_afterwards(bench: str, ideal: Served) -> None:
+    with open_rig(bench) as rig:
+        for _ in rig.perform(SHORT, 1).blocks:
+            assert output_state(ideal.address) == "OFF"
+    assert output_state(ideal.address) == "OFF"
+
+
+def test_interrupted_run_leaves_the_generator_off(tmp_path: Path) -> None:
+    silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
+    with served(*silent) as instrument:
+        file = instrument.rigs_file(tmp_path)
+        file.write_text(file.read_text().replace("timeout_s = 2.0", "timeout_s = 60.0"))
+        command = [sys.executable, "-m", "harness.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
+        with subprocess.Popen(
+            [*command, "--rig", str(file)], cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+            while output_state(instrument.address) != "ON":  # as soon as it plays; it then waits for its record
+                assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+            assert process.wait(LONG_S) == 130
+        assert output_state(instrument.address) == "OFF"
+
+
+# ---- descriptions
+
+
+def described(folder: Path, change: Callable[[str], str]) -> str:
+    file = folder / "rigs.toml"
+    file.write_text(change(RIG.format(address="127.0.0.1:1", self_test="false")))
+    return str(file)
+
+
+WRONG = {
+    "input = 2": ("input = 1", "force and displacement cannot both be at input 1"),
+    'range = "HV" }\npots': ('range = "XV" }\npots', "inputs.displacement: range must be 'LV' or 'HV', not 'XV'"),
+    "input = 1": ("input = 3", "inputs.force: input must be 1 and 2, not 3"),
+    "inputs.displacement": ("inputs.velocity", "inputs must be force and displacement, not force, velocity"),
+    "generator.gain = 10.0": ("generator.gain = 0.0", "gain must be within"),
+    "gain = 10.0": ("gain = 10.0\ngenerator.offset_v = 50.0", "limits.force_v"),
+    "redpitaya://": ("picoscope://", "give it as redpitaya://NAME"),
+    "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
+    'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
+    "[rig.bench]": ("[rig.bench]\nlimits.dials.M = [0.5, 2.0]", "dials.M must be"),
+}
+
+
+@pytest.mark.parametrize("right", WRONG)
+def test_contradictory_description_is_one_line_with_file_and_key(right: str, tmp_path: Path) -> None:
+    wrong, said = WRONG[right]
+    name = described(tmp_path, lambda text: text.replace(right, wrong, 1))
+    with pytest.raises(ConfigurationError) as caught:
+        open_rig(name)
+    assert said in str(caught.value)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    name = described(tmp_path, lambda text: text + "limits.force_v = [0.0, 8.0]\nlimits.dials.M = [0.0, 0.5]\n")
+    with open_rig(name) as rig:  # there is no instrument: nothing is sent
+        with pytest.raises(ConfigurationError, match=r"force of 0.1 V to 9.9 V exceeds limits.force_v"):
+            rig.perform(THESIS, 1)
+        mild = dataclasses.replace(THESIS, excitation=dataclasses.replace(THESIS.excitation, high_v=7.0))
+        with pytest.raises(ConfigurationError, match=r"tweaks\[3\] at sample 1600: pot M would stand at"):
+            rig.perform(mild, 1)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "said"),
+    [
+        (dataclasses.replace(SHORT, excitation=Excitation("prbs", 0.1, 9.9)), "no prbs"),
+        (dataclasses.replace(SHORT, excitation=Excitation(frequency_hz=123.0)), "whole samples"),
+        (dataclasses.replace(SHORT, plant=PlantChoice(set="shock")), "program 'shock'"),
+        (dataclasses.replace(SHORT, tweaks=(Tweak(100, mass_kg=50.0, ramp_n=20),)), "ramp_n"),
+        (dataclasses.replace(SHORT, excitation=Excitation(low_v=0.1, high_v=10.5)), "1.05 V"),
+    ],
+)
+def test_scenario_that_the_rig_cannot_play_is_refused(scenario: Scenario, said: str, tmp_path: Path) -> None:
+    with open_rig(described(tmp_path, str)) as rig, pytest.raises(ConfigurationError, match=said):
+        rig.perform(scenario, 1)
+
+
+def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = RIG + RIG.replace("rig.bench", "rig.shock").replace("pots", 'plant = "shock"\npots')
+    file = tmp_path / "rigs.toml"
+    file.write_text(both.format(address="127.0.0.1:1", self_test="false"))
+    monkeypatch.delenv("ANALOGRIG_RIGS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    with open_rig("bench") as rig:
+        assert rig.description()["name"] == "bench"
+    with open_rig(f"{file}:shock") as rig:
+        assert rig.description()["plant"] == "shock"
+    with open_rig("emulator") as rig:
+        assert rig.description()["kind"] == "emulator"
+    with pytest.raises(ConfigurationError, match=r"holds 2 rigs: say .*:NAME, one of bench, shock"):
+        open_rig(str(file))
+    with pytest.raises(ConfigurationError, match=r"no rig is called 'bank' .* there are bench, shock, emulator"):
+        open_rig("bank")
+    monkeypatch.setenv("ANALOGRIG_RIGS", str(tmp_path / "absent.toml"))
+    with pytest.raises(ConfigurationError, match=r"ANALOGRIG_RIGS: .*absent.toml: no such file"):
+        open_rig("bench")
+
+
+# ---- the self-test comes before any verdict
+
+
+SICK = {
+    "inputs.skew_s=2e-5": "skew",
+    "wiring.swapped=true": "identity",
+    "inputs.gain_error=[0.0, 0.12]": "gain of displacement",
+    "inputs.offset_v=[0.0, 0.15]": "offset of displacement",
+    "wiring.displacement.gain=-1.0": "polarity of displacement",
+    "acquisition.clock_ppm=120.0": "clock ratio",
+    "inputs.noise_v=[0.0, 0.02]": "noise of displacement",
+}
+
+
+@pytest.mark.parametrize("defect", SICK)
+def test_run_on_a_rig_that_is_not_well_is_inconclusive_and_says_why(defect: str, tmp_path: Path) -> None:
+    with served("--defect", defect) as instrument:
+        verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
+
+
+def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) -> None:
+    with served("--rig", "emulator-real") as instrument:
+        run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
+    assert judge(run).outcome == "passed", judge(run).reasons
+
+
+# ---- the shipped tests
+
+
+def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
+    with served() as instrument:
+        environment = {**os.environ, "ANALOGRIG_RIGS": str(instrument.rigs_file(tmp_path))}
+        result = subprocess.run(
+            [
+                *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0"),
+                *("--pyargs", "harness.properties", "--rig", "bench", "--dut", "inproc"),
+                *("--runs-dir", str(tmp_path / "runs")),
+            ],
+            cwd=tmp_path,
+            env={**environment, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert result.returncode == 0, result.stdout[-3000:]
+    assert "11 passed, 2 skipped" in result.stdout

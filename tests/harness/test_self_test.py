@@ -1,0 +1,522 @@
+"""The self-test: what is wrong with a rig is found by its name, and nothing else; what is well is left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter, step
+from scipy.stats import chi2
+
+from harness.cli import main
+from harness.errors import ConfigurationError, RigError, SelfTestError
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from harness.rigs.rig import Block, Performance, Rig
+from harness.run import CHANNELS
+from harness.scenario import Scenario
+from harness.self_test import checks
+from harness.self_test.conduct import self_test
+from harness.self_test.findings import Check, Findings
+from harness.self_test.response import SecondOrder
+from harness.self_test.timing import Edges, Levels, Line, averaged_n, lateness
+
+WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
+BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))
+IDEAL = ComputerDescription(op_amp="ideal")
+
+Codes = NDArray[np.uint16]
+
+
+def emulated(
+    computer: ComputerDescription = IDEAL,
+    ranges: Mapping[str, tuple[float, float]] = WIDE,
+    noise_lsb: float = 1.0,
+    bits: int = 12,
+    rate_hz: float = 20e3,
+    **faults: Any,
+) -> EmulatorRig:
+    card = CardDescription(range_v=ranges, bits=bits, rate_hz=rate_hz, noise_lsb=noise_lsb, faults=faults)
+    return EmulatorRig(EmulatorDescription(card, computer=computer, name="drawn"))
+
+
+class Altered:
+    """A rig with something between its card and us."""
+
+    def __init__(
+        self,
+        rig: EmulatorRig,
+        codes: Callable[[Codes], Codes] = lambda codes: codes,
+        play: Callable[[Scenario], Scenario] = lambda played: played,
+    ) -> None:
+        """``codes`` is given all codes (n, 4)."""
+        self.capabilities = rig.capabilities
+        self._rig, self._codes, self._play = rig, codes, play
+
+    def description(self) -> Mapping[str, Any]:
+        return self._rig.description()
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        performance = self._rig.perform(self._play(scenario), seed)
+        return dataclasses.replace(performance, blocks=self._blocks(performance.blocks))
+
+    def _blocks(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        whole = list(blocks)
+        volts, codes, clipped = (
+            np.concatenate([getattr(block, name) for block in whole]) for name in ("volts", "codes", "clipped")
+        )
+        codes = self._codes(codes.copy())
+        yield Block(0, volts[: len(codes)], codes, clipped[: len(codes)])
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def wrong(rig: Rig, program: str = "front", seed: int = 1) -> list[str]:
+    return [check.title for check in self_test(rig, seed, program).having("wrong")]
+
+
+def value(findings: Findings, title: str) -> Check:
+    return next(check for check in findings.checks if check.title == title)
+
+
+# ------------------------------------------------------------------------------------------------------------ all well
+
+
+@pytest.mark.parametrize("program", ["front", "shock"])
+def test_an_ideal_rig_is_well(program: str) -> None:
+    assert self_test(emulated(noise_lsb=0.0), 1, program).well
+
+
+@pytest.mark.parametrize("name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
+def test_shipped_rigs_are_well(name: str) -> None:
+    with open_rig(name) as rig:
+        assert self_test(rig, 1).reasons == ()
+
+
+def test_twenty_machines_within_tolerance_are_well() -> None:
+    """1 % resistors, 5 % polyester, 3 mV of offset. `make bench ARGS=self-test` tries hundreds."""
+    rig = emulated(ComputerDescription(components="polyester"))
+    found = {
+        (seed, program): self_test(rig, seed, program).reasons
+        for seed in range(20)
+        for program in (("front",) if seed % 4 else ("front", "shock"))
+    }
+    assert {key: reasons for key, reasons in found.items() if reasons} == {}
+
+
+# ------------------------------------------------------------------------------------- each fault, at twice its limit
+
+
+def swapped(codes: Codes) -> Codes:
+    return codes[:, [1, 0, 2, 3]]
+
+
+def inverted(channel: str) -> Callable[[Codes], Codes]:
+    """On a range from -12.5 to 12.5 V."""
+    column = CHANNELS.index(channel)
+
+    def invert(codes: Codes) -> Codes:
+        codes[:, column] = 4096 - codes[:, column]
+        return codes
+
+    return invert
+
+
+def noisier(channel: str, lsb: float) -> Callable[[Codes], Codes]:
+    column = CHANNELS.index(channel)
+
+    def add(codes: Codes) -> Codes:
+        noise = lsb * np.random.default_rng(1).standard_normal(len(codes))
+        codes[:, column] = np.rint(codes[:, column] + noise).astype(np.uint16)
+        return codes
+
+    return add
+
+
+def stuck_bit(codes: Codes) -> Codes:
+    codes[:, CHANNELS.index("displacement")] |= 32
+    return codes
+
+
+def soaked(codes: Codes) -> Codes:
+    """A part of 1 % follows with a lag of 60 samples: 0.06 % of the swing that no second-order response has."""
+    column = CHANNELS.index("displacement")
+    values = codes[:, column].astype(np.float64)
+    slow = lfilter([1.0 / 60.0], [1.0, 1.0 / 60.0 - 1.0], values)
+    codes[:, column] = np.rint(values + 0.011 * (slow - values)).astype(np.uint16)
+    return codes
+
+
+def pots(**settings: Any) -> Callable[[Scenario], Scenario]:
+    return lambda played: dataclasses.replace(played, plant=dataclasses.replace(played.plant, **settings))
+
+
+def ranges(**changed: tuple[float, float]) -> dict[str, tuple[float, float]]:
+    return {**WIDE, **changed}
+
+
+TWICE_FORCE_LSB = 2.0 * checks.MOST_OFFSET_V / (12.0 / 4096)
+TWICE_LSB = 2.0 * checks.MOST_OFFSET_V / (10.0 / 4096)
+SWING_LSB = 9.0 / (12.0 / 4096), 5.43 / (10.0 / 4096)
+
+FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
+    "leads swapped": (lambda: Altered(emulated(), swapped), ["identity"]),
+    "force inverted": (lambda: Altered(emulated(ranges=BIPOLAR), inverted("force")), ["polarity of force"]),
+    "displacement inverted": (
+        lambda: Altered(emulated(ranges=BIPOLAR), inverted("displacement")),
+        ["polarity of displacement"],
+    ),
+    "force clips": (lambda: emulated(ranges=ranges(force=(-1.0, 9.0))), ["clipping of force"]),
+    "displacement clips": (
+        lambda: emulated(ranges=ranges(displacement=(-1.0, 5.6))),
+        ["clipping of displacement"],
+    ),
+    "force takes an eighth of the range": (
+        lambda: emulated(ranges=ranges(force=(-37.0, 37.0)), noise_lsb=0.2),
+        ["range use of force"],
+    ),
+    "displacement takes an eighth of the range": (
+        lambda: emulated(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
+        ["range use of displacement"],
+    ),
+    "gain of force": (lambda: emulated(gain_error=[-2 * checks.MOST_FORCE_GAIN, 0, 0, 0]), ["gain of force"]),
+    "gain of displacement": (lambda: emulated(gain_error=[0, 2 * checks.MOST_GAIN, 0, 0]), ["gain of displacement"]),
+    "offset of force": (lambda: emulated(offset_lsb=[TWICE_FORCE_LSB, 0, 0, 0]), ["offset of force"]),
+    "offset of displacement": (lambda: emulated(offset_lsb=[0, -TWICE_LSB, 0, 0]), ["offset of displacement"]),
+    "displacement late": (lambda: emulated(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
+    "force late": (lambda: emulated(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
+    "force noisy": (
+        lambda: Altered(emulated(), noisier("force", 2 * checks.MOST_NOISE * SWING_LSB[0])),
+        ["noise of force"],
+    ),
+    "displacement noisy": (
+        lambda: Altered(emulated(), noisier("displacement", 2 * checks.MOST_NOISE * SWING_LSB[1])),
+        ["noise of displacement"],
+    ),
+    "card fast": (lambda: emulated(clock_drift_ppm=2 * checks.MOST_CLOCK_PPM), ["clock ratio"]),
+    "card slow": (lambda: emulated(clock_drift_ppm=-2 * checks.MOST_CLOCK_PPM), ["clock ratio"]),
+    "pot of M": (lambda: Altered(emulated(), play=pots(mass_kg=115.0 * (1 + 2 * checks.MOST_MASS))), ["mass"]),
+    "pot of B": (
+        lambda: Altered(emulated(), play=pots(damping_n_s_per_m=3021.0 * (1 - 2 * checks.MOST_DAMPING))),
+        ["damping"],
+    ),
+    "a dielectric that soaks": (lambda: Altered(emulated(), soaked), ["shape of displacement"]),
+    "a bit of displacement stuck": (lambda: Altered(emulated(), stuck_bit), ["shape of displacement"]),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_one_fault_is_found_by_its_name_and_no_other(fault: str) -> None:
+    rig, names = FAULTS[fault]
+    assert wrong(rig()) == names
+
+
+def test_an_inverted_signal_on_a_range_of_one_sign_is_off_scale() -> None:
+    rig = emulated(ranges=ranges(displacement=(-10.0, 0.0)))
+    assert wrong(rig) == ["clipping of displacement"]
+
+
+def test_swapped_leads_are_told_from_one_signal_on_both() -> None:
+    def both(codes: Codes) -> Codes:
+        return codes[:, [0, 0, 2, 3]]
+
+    found = {}
+    for alter in (swapped, both):
+        (check,) = self_test(Altered(emulated(), alter), 1, "shock").having("wrong")
+        assert check.title == "identity"
+        found[alter] = check.advice
+    assert "swapped" in found[swapped]
+    assert "wrong jack" in found[both]
+
+
+def test_several_faults_are_all_found() -> None:
+    rig = emulated(skew_s=[0, 15e-6, 0, 0], clock_drift_ppm=-150.0, gain_error=[0.05, 0, 0, 0])
+    assert wrong(rig) == ["gain of force", "skew", "clock ratio"]
+
+
+def test_an_error_of_the_generator_is_told_from_one_of_the_input() -> None:
+    """The generator's amplifier gives 3 % more: the displacement follows. If only the input reads so, it does not."""
+
+    def louder(played: Scenario) -> Scenario:
+        wave = dataclasses.replace(played.excitation, low_v=0.515, high_v=9.785)
+        return dataclasses.replace(played, excitation=wave)
+
+    generator = self_test(Altered(emulated(), play=louder), 1).having("wrong")
+    card = self_test(emulated(gain_error=[0.03, 0, 0, 0]), 1).having("wrong")
+    assert [check.title for check in (*generator, *card)] == ["gain of force"] * 2
+    assert "generator" in generator[0].advice
+    assert "generator" not in card[0].advice
+
+
+# --------------------------------------------------------------------------------------------- how much, how surely
+
+DRAWN = 32
+TAIL = 1e-3
+
+
+def test_standard_errors_are_those_of_the_estimates() -> None:
+    """Truth drawn anew for each seed: the squares of deviations by standard errors are chi-squared, beyond either bound
+    with a probability of 1e-3. The skew's error holds what amplifiers may do as well."""
+    rng = np.random.default_rng(9)
+    scores: dict[str, list[float]] = {}
+    for seed in range(DRAWN):
+        gains, offsets = rng.uniform(-0.005, 0.005, 2), rng.uniform(-10, 10, 2)
+        late_n, ppm = int(rng.integers(0, 10)) / 10, float(rng.uniform(-200, 200))
+        rig = emulated(
+            noise_lsb=1.5,
+            gain_error=[*gains, 0, 0],
+            offset_lsb=[*offsets, 0, 0],
+            skew_s=[0.0, late_n / 20e3, 0, 0],
+            clock_drift_ppm=ppm,
+        )
+        lsb_v = np.array([12.0, 10.0]) / 4096
+        # A card takes its range's low end for zero volts of its amplifier: v = low + lsb code.
+        truth = {
+            "gain of force": gains[0],
+            "offset of force": offsets[0] * lsb_v[0],
+            "clock ratio": 1e6 * (1.0 / (1.0 + 1e-6 * ppm) - 1.0),
+            # By the samples, which are closer when the card is fast.
+            "mass": (1.0 + 1e-6 * ppm) ** 2 - 1.0,
+            "damping": 1e-6 * ppm,
+        }
+        findings = self_test(rig, seed)
+        for title, true in truth.items():
+            check = value(findings, title)
+            scores.setdefault(title, []).append((check.value - true) / check.error)
+        for channel in ("force", "displacement"):
+            check = value(findings, f"noise of {channel}")
+            scores.setdefault(check.title, []).append((check.value - math.hypot(1.5, 12**-0.5)) / check.error)
+        skew = value(findings, "skew")
+        assert abs(skew.value - late_n) < 3.0 * skew.error
+    low, high = chi2.ppf([TAIL, 1.0 - TAIL], DRAWN)
+    sums = {title: float(np.square(each).sum()) for title, each in scores.items()}
+    assert {title: total for title, total in sums.items() if not low < total < high} == {}
+
+
+def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
+    """The truth is always among the instants that are left: half a width is sqrt(3) standard errors."""
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        line = Line(*(rng.uniform(190.0, 210.0) + np.array([0.0, *rng.uniform(0, 1, 1), 100.0])))
+        late_n = float(rng.uniform(-0.5, 0.5))
+        codes = square_wave(line, late_n, averaged=0.0)
+        levels = Levels.of(codes)
+        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        found_n, error_n = lateness(codes, levels, edges, numbered(line, edges), 0.0)
+        assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
+
+
+def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
+    rng = np.random.default_rng(6)
+    for averaged in (0.3, 1.0):
+        line, late_n = Line(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
+        codes = square_wave(line, late_n, averaged)
+        levels = Levels.of(codes)
+        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        assert averaged_n(edges) == pytest.approx(averaged, abs=0.03)
+        found_n, _ = lateness(codes, levels, edges, numbered(line, edges), 0.0)
+        assert found_n == pytest.approx(late_n, abs=5e-3)
+
+
+def square_wave(line: Line, late_n: float, averaged: float) -> Codes:
+    """16,384 codes of a wave that is high from rising to falling edges, each that much later than the line."""
+    parts = []
+    for window in (0.5, -0.5) if averaged else (0.0,):
+        # High time until t is a ramp in every period: its difference over the window is the average.
+        t = np.arange(16_384) + window * averaged - late_n
+        since = (t - line.rising_n) % line.period_n
+        high_n = (line.falling_n - line.rising_n) % line.period_n
+        turns = np.floor((t - line.rising_n) / line.period_n)
+        parts.append(turns * high_n + np.minimum(since, high_n) if averaged else since < high_n)
+    upper = (parts[0] - parts[1]) / averaged if averaged else parts[0]
+    return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
+
+
+def numbered(line: Line, edges: Edges) -> Line:
+    """The same line, its instants those next to the middle edge as the edges have them."""
+    turns = np.rint((edges.line().rising_n - line.rising_n) / line.period_n)
+    rising = line.rising_n + turns * line.period_n
+    turns = np.rint((edges.line().falling_n - line.falling_n) / line.period_n)
+    return Line(line.period_n, rising, line.falling_n + turns * line.period_n)
+
+
+@pytest.mark.parametrize(("mass", "damping"), [(46.0, 12.3), (0.0163, 0.0735), (4.0, 4.0)])
+def test_step_response_is_that_of_scipy(mass: float, damping: float) -> None:
+    """The front suspension, the shock absorber by the sample, and two equal poles."""
+    t = np.linspace(0.0, 12.0 * damping, 500)
+    _, expected = step(([1.0], [mass, damping, 1.0]), T=t)
+    plant = SecondOrder(mass, damping)
+    assert plant.step(t) == pytest.approx(expected, abs=1e-4)
+    width = 0.5 * damping
+    fine = np.linspace(-0.5, 0.5, 2001)[:, None] * width
+    assert plant.step(t, width) == pytest.approx(plant.step(t + fine).mean(axis=0), abs=1e-3)
+
+
+def test_rig_that_averages_over_its_sample_period_has_no_skew_by_that() -> None:
+    """Eight looks a sample, as the emulated Red Pitaya takes them; 0.25 of a sample between the channels is found."""
+
+    def averages(codes: Codes) -> Codes:
+        return np.asarray(np.rint(codes.reshape(-1, 8, 4).mean(axis=1)), dtype=np.uint16)
+
+    class Averaging(Altered):
+        def perform(self, scenario: Scenario, seed: int) -> Performance:
+            performance = super().perform(dataclasses.replace(scenario, samples=8 * scenario.samples), seed)
+            return dataclasses.replace(performance, sample_period_s=8.0 * performance.sample_period_s)
+
+    assert self_test(Averaging(emulated(rate_hz=160e3), averages), 1).reasons == ()
+    late = self_test(Averaging(emulated(rate_hz=160e3, skew_s=[0.0, 2e-6, 0, 0]), averages), 1)
+    assert value(late, "skew").value == pytest.approx(0.04, abs=0.03)
+    later = emulated(rate_hz=160e3)
+    shifted = Averaging(
+        later, lambda codes: averages(np.stack([codes[:, 0], np.roll(codes[:, 1], -2), *codes.T[2:]], 1))
+    )
+    assert [check.title for check in self_test(shifted, 1).having("wrong")] == ["skew"]
+
+
+# ------------------------------------------------------------------------------------ what it says, and when it cannot
+
+
+def checked(number: float, error: float) -> Check:
+    return Check("skew", "", number, error, -0.1, 0.1, "samples", "advice")
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "state"),
+    [
+        (0.0, 0.01, "well"),
+        (0.12, 0.01, "well"),  # not surely beyond
+        (0.14, 0.01, "wrong"),
+        (-0.14, 0.01, "wrong"),
+        (0.0, 0.02, "not measured"),
+        (0.2, 0.02, "wrong"),
+        (math.nan, math.nan, "not measured"),
+    ],
+)
+def test_wrong_is_what_is_beyond_its_limit_by_three_standard_errors(number: float, error: float, state: str) -> None:
+    assert checked(number, error).state == state
+
+
+def zero_from(first: int, column: int | None = None) -> Callable[[Codes], Codes]:
+    def cut(codes: Codes) -> Codes:
+        codes[first:, slice(None) if column is None else column] = 341
+        return codes
+
+    return cut
+
+
+def glitch(codes: Codes) -> Codes:
+    codes[5000:5020, 0] = 4096 - codes[5000:5020, 0]
+    return codes
+
+
+@pytest.mark.parametrize(
+    ("alter", "says"),
+    [
+        (zero_from(0), "no signal on force"),
+        (zero_from(0, CHANNELS.index("displacement")), "no signal on displacement"),
+        (zero_from(8192), "broken after sample"),
+        (zero_from(16_000), "broken after sample"),
+        (glitch, "broken after sample"),
+        (lambda codes: codes[:-1], "16383 of 16384 samples"),
+    ],
+)
+def test_record_with_no_signal_or_a_drop_out_is_no_self_test(alter: Callable[[Codes], Codes], says: str) -> None:
+    with pytest.raises(SelfTestError, match=says):
+        self_test(Altered(emulated(noise_lsb=0.0), alter), 1)
+
+
+def test_rig_that_fails_is_no_self_test() -> None:
+    def fails(_: Codes) -> Codes:
+        raise RigError("the instrument is gone")
+
+    with pytest.raises(RigError, match="the instrument is gone"):
+        self_test(Altered(emulated(), fails), 1)
+
+
+def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
+    with open_rig(f"recording:{recorded_thesis}") as rig, pytest.raises(ConfigurationError, match="can play no other"):
+        self_test(rig, 3)
+
+
+def test_other_programs_cannot_be_tested() -> None:
+    with pytest.raises(SelfTestError, match="two-mass"):
+        self_test(emulated(), 1, "two-mass")
+
+
+RIG_FILE = """
+[card]
+noise_lsb = 1.0
+faults = {{ {faults} }}
+[card.range_v]
+force = [-1.0, 11.0]
+displacement = [-1.0, 9.0]
+velocity = [-10.0, 10.0]
+net_force = [-12.5, 12.5]
+"""
+
+
+def described(tmp_path: Path, faults: str) -> str:
+    path = tmp_path / "bench.toml"
+    path.write_text(RIG_FILE.format(faults=faults))
+    return str(path)
+
+
+def test_doctor_of_a_rig_that_is_well(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--rig", "emulator", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["rig"], said["well"], said["reasons"]) == ("emulator", True, [])
+    assert {check["state"] for check in said["checks"]} == {"well"}
+
+
+def test_doctor_says_of_what_is_wrong_how_much_the_limit_and_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = described(tmp_path, "clock_drift_ppm = 120.0, skew_s = [0.0, 10e-6, 0.0, 0.0]")
+    assert main(["doctor", "--rig", rig]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "self-test of bench, program front: 2 WRONG"
+    skew = next(i for i, line in enumerate(lines) if line.split()[:2] == ["wrong", "skew"])
+    assert lines[skew].split()[2] in ("0.19", "0.20", "0.21")
+    assert "-0.1 to 0.1" in lines[skew]
+    assert "have the card sample both at one instant" in lines[skew + 1]
+    clock = next(line for line in lines if line.split()[:3] == ["wrong", "clock", "ratio"])
+    assert "-119.9" in clock or "-120.0" in clock
+
+
+def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = described(tmp_path, "stuck_low = 4095")
+    assert main(["doctor", "--rig", rig]) == 3
+    assert capsys.readouterr().err.startswith("analogrig: INCONCLUSIVE: the self-test could not be made: no signal on")
+
+
+def test_doctor_that_cannot_tell_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At 100 kHz a tenth of a sample is 1 us, and the computer's own amplifiers are known to half of one."""
+    path = tmp_path / "fast.toml"
+    path.write_text(RIG_FILE.format(faults="").replace("noise_lsb", "rate_hz = 100000.0\nnoise_lsb", 1))
+    assert main(["doctor", "--rig", str(path)]) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("self-test of fast, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.017" in said
+
+
+def test_doctor_of_no_rig_is_a_matter_of_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--rig", "nowhere"]) == 2
+    assert "no rig is called" in capsys.readouterr().err
+
+
+def test_what_cannot_be_measured_is_said() -> None:
+    """Noise of 60 LSB: the skew is known to no more than some hundredths of a sample. But noise is what is wrong."""
+    findings = self_test(emulated(noise_lsb=60.0), 1)
+    assert {check.title for check in findings.having("wrong")} == {"noise of force", "noise of displacement"}
+    assert "skew" in {check.title for check in findings.having("not measured")}

@@ -1,0 +1,317 @@
+"""Clients that no server deserves; as a program, each of them for some seconds, with what the server needed for it.
+
+    python -m tests.instrument.hostile SECONDS SEED
+
+A witness speaks to the server at the same time, as one who means well would.
+"""
+
+# ruff: noqa: S311, T201 - what is said is drawn from a seed and is no secret; a program prints
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from tests.instrument.serving import Served, ended, serving
+from tests.instrument.talk import SEQUENCE
+
+IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
+MOST_GROWTH_KB = 96 * 1024
+"""Of the resident memory, over that of a server that has taken a record: 16 clients with an answer each are 4 MB; the
+rest is the largest record, at a million samples a second."""
+WITNESS_S = 10.0
+"""In which a busy machine has answered: the commands of all clients before it, a record's computation each."""
+LONG_LINE_BYTES = 10_000_000
+SILENT_BYTES = 30_000_000
+"""Of commands, more than the server's buffers and this machine's take from a client that never reads."""
+
+WORDS = (
+    *(line.partition(" ")[0] for line in SEQUENCE),
+    *("ACQ:TRig:STAT?", "ACQ:TRig:FILL?", "ACQ:SOUR1:DATA?", "ACQ:SOUR2:DATA:STA:N?", "*IDN?", "*RST", "*CLS"),
+    *("POT1:DIAL", "POT2:DIAL?", "POT3:DIAL", "POT:CATalog?", "POT:SCHedule", "POT:SCHedule:CLEar", "ACQ:STOP"),
+    *("SYST:ERR?", "SYST:ERR:COUN?", "SOUR1:PHAS", "SOUR1:DCYC", "ACQ:SRATe?", "ACQ:BUF:SIZE?", "OUTPUT1:STATE?"),
+)
+VALUES = (
+    *("0", "1", "-1", "0.5", "1e-3", "8192", "16384", "-8192", "125", "65536", "1e6", "1e400", "-1e400", "nan", "inf"),
+    *(
+        "9" * 400,
+        "0." + "0" * 400 + "1",
+        "1,2,3",
+        "0,16384",
+        "16383,1",
+        "3,0.5,0.01",
+        "1,0,1e4",
+        ",",
+        ",,,",
+        "#15hello",
+    ),
+    *("ON", "OFF", "NOW", "AWG_PE", "CH1_PE", "CH2_NE", "DISABLED", "SQUARE", "PWM", "DC", "LV", "HV", "BIN", "ASCII"),
+    *("RAW", "VOLTS", "'", '"', "(@1:16384)", "MAX", "1 V", "\x00", "\x7f", "%s%n", "../../etc/passwd", "{0}"),
+)
+RIGHT = (
+    *(*SEQUENCE, *SEQUENCE, "ACQ:START", "ACQ:START", "ACQ:TRig NOW", "ACQ:TRig CH1_PE", "ACQ:TRig CH2_NE"),
+    *("ACQ:DEC 125", "ACQ:DEC 65536", "ACQ:TRig:DLY 0", "ACQ:TRig:DLY -8192", "ACQ:TRig:DLY 1e6", "ACQ:AVG OFF"),
+    *("SOUR1:FREQ:FIX 1e-3", "SOUR1:FREQ:FIX 1e6", "SOUR1:FUNC PWM", "SOUR1:DCYC 0.001", "SOUR1:PHAS -1", "*RST"),
+    *("POT1:DIAL 0", "POT1:DIAL 1", "POT2:DIAL 0", "POT3:DIAL 1", "POT:SCH 2,1,0", "POT:SCH 3,0,1e-5", "ACQ:STOP"),
+    *("ACQ:DATA:FORMAT BIN", "ACQ:DATA:Units RAW", "ACQ:SOUR1:DATA?", "ACQ:SOUR2:DATA:STA:N? 5,7", "ACQ:TRig:STAT?"),
+)
+"""Commands that are understood, to the ends of what may be asked for."""
+
+
+def line(draw: random.Random) -> bytes:
+    """Mostly what the instrument understands, or nearly."""
+    if draw.random() < 0.1:
+        return draw.randbytes(draw.choice((1, 10, 100, 5000))) + b"\n"
+    units = []
+    for _ in range(draw.choice((1, 1, 1, 2, 5, 50))):
+        if draw.random() < 0.6:
+            units.append(f":{draw.choice(RIGHT)}")
+            continue
+        value = draw.choice(VALUES) if draw.random() < 0.7 else f"{draw.uniform(-2.0, 2.0) * 10 ** draw.randint(-3, 5)}"
+        units.append(f"{draw.choice(WORDS)} {value}" if draw.random() < 0.7 else draw.choice(WORDS))
+    said = bytearray(";".join(units).encode())
+    if draw.random() < 0.2:
+        said[draw.randrange(len(said))] = draw.randrange(256)
+    return bytes(said) + b"\n"
+
+
+Stop = Callable[[], bool]
+Attack = Callable[[Served, random.Random, Stop], int]
+"""Goes on until it is told to stop, at least once; returns how often it did what it does."""
+
+
+def talk(served: Served, draw: random.Random, stop: Stop) -> int:
+    """Lines by chance, and most answers are read."""
+    said = 0
+    while True:
+        with _gone_is_gone(), served.connect() as connection:
+            connection.settimeout(0.01)
+            for _ in range(draw.randrange(1, 200)):
+                connection.sendall(line(draw))
+                said += 1
+                if draw.random() < 0.9:
+                    with contextlib.suppress(TimeoutError):
+                        connection.recv(draw.choice((1, 1000, 1_000_000)))
+        if stop():
+            return said
+
+
+def talk_at_once(served: Served, draw: random.Random, stop: Stop) -> int:
+    """Several of them."""
+    said: list[int] = []
+    own = [random.Random(draw.random()) for _ in range(6)]
+    clients = [
+        threading.Thread(target=lambda each: said.append(talk(served, each, stop)), args=(each,)) for each in own
+    ]
+    for client in clients:
+        client.start()
+    for client in clients:
+        client.join()
+    return sum(said)
+
+
+def leave_half_open(served: Served, draw: random.Random, stop: Stop) -> int:
+    """Half a line, and then: close one way, vanish with a reset, or stay and say nothing more."""
+    left: list[socket.socket] = []
+    count = 0
+    while True:
+        with _gone_is_gone():
+            connection = served.connect()
+            connection.sendall(draw.choice((b"", b"*IDN", b"OUTPUT1:STATE ON\nSOUR1:TRig:INT\nACQ:", line(draw)[:-1])))
+            match draw.randrange(3):
+                case 0:
+                    connection.shutdown(socket.SHUT_WR)
+                    left.append(connection)
+                case 1:
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                    connection.close()
+                case _:
+                    left.append(connection)
+        count += 1
+        for connection in left[:-200]:
+            connection.close()
+        del left[:-200]
+        if stop() and count >= 100:
+            for connection in left:
+                connection.close()
+            return count
+
+
+def read_slowly(served: Served, draw: random.Random, stop: Stop) -> int:
+    """A kilobyte at a time of answers of 100 kB."""
+    count = 0
+    with served.connect() as connection, _gone_is_gone():
+        connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
+        connection.sendall(b"ACQ:SOUR1:DATA?;" * 200 + b"\n")
+        while not stop() or count < 100:
+            count += len(connection.recv(draw.randrange(1, 1024))) > 0
+            time.sleep(0.001)
+    return count
+
+
+def never_read(served: Served, draw: random.Random, stop: Stop) -> int:
+    """Large answers are asked for until nothing more is taken."""
+    count = 0
+    while True:
+        with served.connect() as connection, _gone_is_gone():
+            connection.settimeout(0.2)
+            connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
+            for _ in range(SILENT_BYTES // 4000):
+                connection.sendall(b"ACQ:SOUR1:DATA?;" * draw.randrange(1, 250) + b"\n")
+        count += 1
+        if stop():
+            return count
+
+
+def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
+    """10 MB without an end; then one line more, which is understood."""
+    count = 0
+    while True:
+        client = served.client()
+        chunk = bytes(draw.randrange(11, 256) for _ in range(1000))
+        for _ in range(LONG_LINE_BYTES // len(chunk)):
+            client.connection.sendall(chunk)
+        client.say("", "")
+        if client.ask("SYST:ERR?") != '-363,"Input buffer overrun"' or client.ask("*IDN?") != IDENTITY:
+            raise AssertionError("a line of 10 MB was not refused as one")
+        client.close()
+        count += 1
+        if stop():
+            return count
+
+
+def connect_often(served: Served, draw: random.Random, stop: Stop) -> int:
+    """And go at once, or a little later."""
+    count = 0
+    kept: list[socket.socket] = []
+    while True:
+        with _gone_is_gone():
+            kept.append(served.connect())
+        count += 1
+        if len(kept) > draw.randrange(1, 100):
+            kept.pop(draw.randrange(len(kept))).close()
+        if stop() and count >= 1000:
+            for connection in kept:
+                connection.close()
+            return count
+
+
+ATTACKS: tuple[Attack, ...] = (
+    talk,
+    talk_at_once,
+    leave_half_open,
+    read_slowly,
+    never_read,
+    never_end_a_line,
+    connect_often,
+)
+
+
+@contextlib.contextmanager
+def _gone_is_gone() -> Iterator[None]:
+    """A server may hang up on clients like these, and turn them away."""
+    with contextlib.suppress(OSError):
+        yield
+
+
+@dataclass(frozen=True)
+class Survival:
+    """What an attack did, and what the server needed."""
+
+    times: int
+    grown_kb: int
+    slowest_s: float
+    """In which the witness had its answer."""
+
+
+def warm(served: Served) -> None:
+    """What a server needs for its work at all: a record at the highest rate has been taken and read."""
+    client = served.client()
+    client.say(*SEQUENCE, "ACQ:DEC 125", "ACQ:START", "ACQ:TRig NOW")
+    if len(client.ask("ACQ:SOUR1:DATA?")) < 16384:
+        raise AssertionError("it takes no record")
+    client.say("*RST")
+    client.close()
+
+
+def survived(served: Served, attack: Attack, seed: int, seconds: float) -> Survival:
+    """Attack a server that is warm.
+
+    :raises AssertionError: it does not answer the witness, or needs too much memory.
+    """
+    before_kb = served.most_resident_kb
+    until_s = time.monotonic() + seconds
+    done = threading.Event()
+    slowest_s = [0.0]
+    failures: list[str] = []
+    witness = threading.Thread(target=_watch, args=(served, done, slowest_s, failures))
+    witness.start()
+    try:
+        times = attack(served, random.Random(seed), lambda: time.monotonic() >= until_s)
+    finally:
+        done.set()
+        witness.join()
+    survival = Survival(times, served.most_resident_kb - before_kb, slowest_s[0])
+    if failures or survival.grown_kb > MOST_GROWTH_KB or served.process.poll() is not None:
+        raise AssertionError(f"{attack.__name__}, seed {seed}: {failures or survival}")
+    return survival
+
+
+def _watch(served: Served, done: threading.Event, slowest_s: list[float], failures: list[str]) -> None:
+    """Ask again and again, and once more at the end."""
+    over = False
+    while not over and not failures:
+        over = done.wait(0.02)
+        begun_s = time.monotonic()
+        try:
+            heard = _asked(served)
+        except OSError as error:
+            heard = repr(error)
+        waited_s = time.monotonic() - begun_s
+        slowest_s[0] = max(slowest_s[0], waited_s)
+        if heard != IDENTITY or waited_s > WITNESS_S:
+            failures.append(f"the witness heard {heard!r} after {waited_s:.1f} s")
+
+
+def _asked(served: Served) -> str:
+    """When all places are taken, one who means well comes again."""
+    deadline_s = time.monotonic() + WITNESS_S
+    while True:
+        client = served.client()
+        try:
+            heard = client.ask("*IDN?")
+        except ConnectionError:
+            heard = ""
+        finally:
+            client.close()
+        if heard or time.monotonic() > deadline_s:
+            return heard
+        time.sleep(0.05)
+
+
+def main(seconds: float, seed: int) -> None:
+    """One table; a fault is an exception."""
+    print(f"{'client':18} {'times':>9} {'grown kB':>9} {'slowest answer s':>17}")
+    with serving() as served:
+        warm(served)
+        for attack in ATTACKS:
+            survival = survived(served, attack, seed, seconds)
+            print(
+                f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}",
+                flush=True,
+            )
+        served.process.terminate()
+        if said := ended(served):
+            raise AssertionError(said)
+    print(f"{seconds:g} s each, seed {seed}: alive afterwards")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,87 @@
+"""`analogrig serve` in another process, and clients of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+LONG_S = 30.0
+"""For what comes at once unless something is broken."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server at work."""
+
+    process: subprocess.Popen[str]
+    said: dict[str, Any]
+    """When it began."""
+
+    @property
+    def port(self) -> int:
+        return int(self.said["port"])
+
+    def connect(self) -> socket.socket:
+        return socket.create_connection(("127.0.0.1", self.port), timeout=LONG_S)
+
+    def client(self) -> Client:
+        return Client(self.connect())
+
+    @property
+    def most_resident_kb(self) -> int:
+        """Of its memory, the most that has been resident."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0])
+
+
+class Client:
+    """Says lines, hears lines."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self._heard = connection.makefile("rb")
+
+    def say(self, *lines: str) -> None:
+        self.connection.sendall("".join(f"{line}\r\n" for line in lines).encode())
+
+    def ask(self, line: str) -> str:
+        self.say(line)
+        return self._heard.readline().decode("ascii").removesuffix("\r\n")
+
+    def rest(self) -> bytes:
+        """All that comes before the other end is gone."""
+        return self._heard.read()
+
+    def close(self) -> None:
+        self._heard.close()
+        self.connection.close()
+
+
+@contextmanager
+def serving(*options: str) -> Iterator[Served]:
+    """On any free port, until the end of the block."""
+    command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--json", *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            if process.stdout is None:
+                raise RuntimeError("it has no standard output")
+            yield Served(process, json.loads(process.stdout.readline()))
+        finally:
+            process.kill()
+
+
+def ended(served: Served, statuses: Sequence[int] = (0,)) -> str:
+    """What it has said on standard error; its end must be one of these."""
+    _, said = served.process.communicate(timeout=LONG_S)
+    if served.process.returncode not in statuses:
+        raise AssertionError(f"ended with {served.process.returncode}: {said}")
+    return said

@@ -1,0 +1,62 @@
+"""Whatever comes in, the instrument answers by the rules of its language, and goes on; longer: `make fuzz-serve`."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from harness.instrument.scpi import MOST_ERRORS
+from tests.instrument.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
+from tests.instrument.serving import LONG_S, Served, ended, serving
+from tests.instrument.talk import SEQUENCE, asking, interpreter, record, say
+
+ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')
+
+values = st.one_of(
+    st.sampled_from(VALUES), st.floats().map(repr), st.integers().map(str), st.text(st.characters(codec="ascii"))
+)
+commands = st.builds(lambda word, value: f"{word} {value}".encode(), st.sampled_from(WORDS), values)
+"""What the instrument understands, or nearly."""
+right = st.sampled_from(RIGHT).map(lambda command: f":{command}".encode())
+lines = st.one_of(st.binary(max_size=300), right, st.lists(st.one_of(commands, right), max_size=8).map(b";".join))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(lines, max_size=12))
+def test_whatever_is_said_is_answered_with_whole_lines_or_an_error_and_the_next_record_is_right(
+    said: list[bytes],
+) -> None:
+    speaking = interpreter()
+    for line in said:
+        answer = b"".join(speaking.enter(line.replace(b"\n", b"")))
+        assert answer == b"" or answer.endswith(b"\r\n")
+    ask = asking(speaking)
+    for _ in range(MOST_ERRORS):
+        assert ERROR.fullmatch(ask("SYST:ERR?"))
+    assert ask("SYST:ERR?") == '0,"No error"'
+    say(ask, ["*RST", *SEQUENCE])
+    assert 9.8 < record(ask)[:, 0].max() < 10.0
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    with serving() as served:
+        warm(served)
+        yield served
+        served.process.terminate()
+        assert ended(served) == "", "nothing is complained of"
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
+def test_a_server_survives_with_bounded_memory_and_answers_others_meanwhile(served: Served, attack: Attack) -> None:
+    assert survived(served, attack, seed=1, seconds=0.5).times > 0
+    client = served.client()
+    deadline_s = time.monotonic() + LONG_S
+    while client.ask("*IDN?;OUTPUT1:STATE?") != f"{IDENTITY};OFF":
+        assert time.monotonic() < deadline_s, "whoever drove the generator is gone, and so are the lines it left"
+    client.close()

@@ -1,0 +1,49 @@
+"""What harness/README.md says of the served instrument."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from harness import config
+from harness.instrument.description import InstrumentDescription
+from tests.instrument.serving import LONG_S, serving
+from tests.instrument.talk import interpreter
+
+SECTION = (
+    (Path(__file__).parents[2] / "harness" / "README.md")
+    .read_text()
+    .partition("## The emulator as an instrument\n")[2]
+    .partition("\n## ")[0]
+)
+
+
+def block(language: str) -> str:
+    return str(re.findall(rf"```{language}\n(.*?)```", SECTION, re.DOTALL)[0])
+
+
+def test_the_table_of_what_can_be_wrong_has_every_key_with_its_default() -> None:
+    table = tomllib.loads(block("toml"))["instrument"]
+    assert config.build(InstrumentDescription, table, "README") == InstrumentDescription()
+    known = dataclasses.asdict(InstrumentDescription())
+    assert {name: set(part) for name, part in table.items()} == {name: set(part) for name, part in known.items()}
+
+
+def test_the_example_runs_as_it_stands(tmp_path: Path) -> None:
+    with serving("--rig", "emulator-ideal") as served:
+        program = block("python").replace("5000", str(served.port))
+        program += "assert len(force_v) == len(displacement_v) == 16384 and 9.8 < max(force_v) < 10.0\n"
+        subprocess.run([sys.executable, "-c", program], check=True, timeout=LONG_S, cwd=tmp_path)
+
+
+def test_every_command_of_the_instrument_is_in_the_table() -> None:
+    """Each of its words, but those that are optional."""
+    rows = SECTION.partition("| commands | |")[2].partition("\n\n")[0]
+    words = {word for code in re.findall(r"`([^`]+)`", rows) for word in re.findall(r"[A-Za-z]+", code)}
+    for expression, *_ in interpreter()._commands:
+        long = re.findall(r"\(\?:(\w+)\|", expression.pattern)
+        assert set(long) <= words | {"Factor", "NEXT", "FIX"}, expression.pattern

@@ -1,0 +1,200 @@
+"""`analogrig serve`: the instrument in another process, by TCP, for clients that others wrote."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvisa
+
+from emulator.excitation import Excitation
+from harness.cli import main
+from harness.instrument.scpi import Interpreter
+from harness.instrument.served import ServedDescription
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
+from harness.scenario import Scenario
+from tests.instrument.serving import LONG_S, Served, ended, serving
+from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
+
+LSB_V = 40.0 / 2**14
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    """The ideal rig."""
+    with serving("--rig", "emulator-ideal") as served:
+        yield served
+
+
+@pytest.fixture
+def visa(served: Served) -> Iterator[pyvisa.resources.MessageBasedResource]:
+    """As programs for the real instrument open it."""
+    manager = pyvisa.ResourceManager("@py")
+    address = f"TCPIP::127.0.0.1::{served.port}::SOCKET"
+    opened = manager.open_resource(address, read_termination="\r\n", write_termination="\r\n", timeout=1e3 * LONG_S)
+    assert isinstance(opened, pyvisa.resources.MessageBasedResource)
+    yield opened
+    opened.close()
+    manager.close()
+
+
+def test_pyvisa_drives_the_published_sequence_and_reads_both_channels(
+    visa: pyvisa.resources.MessageBasedResource,
+) -> None:
+    """In ASCII and in blocks of IEEE 488.2, and both are the volts of the emulator with ideal amplifiers."""
+    for line in POINT_SAMPLES:
+        visa.write(line)
+    assert visa.query("ACQ:TRig:STAT?") == "TD" and visa.query("ACQ:TRig:FILL?") == "1"
+    texts = [visa.query_ascii_values(f"ACQ:SOUR{n}:DATA?", converter=lambda v: float(v.strip("{}"))) for n in (1, 2)]
+    visa.write("ACQ:DATA:FORMAT BIN")
+    blocks = [visa.query_binary_values(f"ACQ:SOUR{n}:DATA?", datatype="f", is_big_endian=True) for n in (1, 2)]
+    assert visa.query("SYST:ERR?") == '0,"No error"'
+    with open_rig("emulator-ideal") as rig:
+        assert isinstance(rig, EmulatorRig)
+        computer = rig.set_up(Scenario.load("healthy"), 0).computer
+    played = np.concatenate(list(computer.play(Excitation("square", 0.1, 9.9, 100.0, clock="free"), 16384)))
+    for channel in (0, 1):
+        assert np.abs(np.array(texts[channel]) - played[:, channel]).max() < 0.5 * LSB_V + 6e-5
+        assert np.abs(np.array(blocks[channel]) - played[:, channel]).max() < 0.5 * LSB_V + 1e-6
+
+
+def test_pyvisa_turns_pots(visa: pyvisa.resources.MessageBasedResource) -> None:
+    names = visa.query("POT:CATalog?").split(",")
+    visa.write(f"POT{1 + names.index('K')}:DIAL 0.5")
+    assert float(visa.query("POT3:DIAL?")) == pytest.approx(0.5, abs=1e-3)
+    visa.write(f"POT3:DIAL {front(20e3).dials['K']:.9f}")
+
+
+@pytest.mark.parametrize("rig", ["emulator", "emulator-real"])
+@pytest.mark.parametrize("plant", ["front", "shock"])
+def test_the_served_computer_has_the_components_that_the_rig_draws_from_the_seed(rig: str, plant: str) -> None:
+    scenario = Scenario.load("shock" if plant == "shock" else "healthy")
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        emulated = [opened.set_up(scenario, seed).computer.circuit for seed in (1, 2)]
+    described = ServedDescription.load(rig)
+    laid = [described.laid(plant, seed)._table._computer.circuit for seed in (1, 2)]
+    assert [circuit.elements for circuit in laid] == [circuit.elements for circuit in emulated]
+    assert laid[0].elements != laid[1].elements
+
+
+def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> None:
+    description = ServedDescription.load("emulator-ideal", ["inputs.noise_v=[0.01,0.01]"])
+
+    def noisy(seed: int) -> np.ndarray:
+        ask = asking(Interpreter(description.laid("front", seed).commands))
+        say(ask, SEQUENCE)
+        return record(ask)
+
+    assert np.array_equal(noisy(1), noisy(1))
+    assert not np.array_equal(noisy(1), noisy(2))
+
+
+def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named() -> None:
+    """Of emulator-skewed: displacement 10 us after force; 1 LSB rms of 12 V and of 10 V on 12 bits."""
+    description = ServedDescription.load("emulator-skewed", ["inputs.skew_s=2e-6", "inputs.noise_v=[0.0,0.004]"])
+    inputs = description.instrument.beside(description.card.card()).inputs
+    assert inputs.skew_s == pytest.approx(12e-6)
+    assert inputs.noise_v == pytest.approx((12 / 4096, np.hypot(10 / 4096, 0.004)))
+    assert description.left_out == ()
+    assert "card.levels_lsb" in ServedDescription.load("emulator-real").left_out
+
+
+# ---- the command
+
+
+def test_the_line_says_what_is_served_and_where() -> None:
+    command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--plant", "shock", "--seed", "7"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        process.kill()
+    start, _, port = line.rstrip("\n").rpartition(":")
+    assert start == "rig emulator (shock, seed 7) at 127.0.0.1" and int(port) > 0
+
+
+@pytest.mark.parametrize(("sign", "status"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_a_server_ends_when_it_is_told_to_and_hangs_up(sign: signal.Signals, status: int) -> None:
+    with serving() as served:
+        client = served.client()
+        client.say(*SEQUENCE)
+        assert client.ask("OUTPUT1:STATE?") == "ON"
+        served.process.send_signal(sign)
+        assert client.rest() == b""
+        said = ended(served, [status])
+        assert said == ("" if status == 0 else "analogrig: interrupted\n")
+        client.close()
+
+
+def test_json_says_the_same(served: Served) -> None:
+    address = f"127.0.0.1:{served.port}"
+    place = {"host": "127.0.0.1", "port": served.port, "address": address}
+    assert served.said == {"rig": "emulator-ideal", "plant": "front", "seed": 1995, **place}
+
+
+def test_it_listens_on_this_machine_alone(served: Served) -> None:
+    """/proc/net/tcp: 0100007F is 127.0.0.1, state 0A is listening."""
+    rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    assert [row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{served.port:04X}")] == [
+        f"0100007F:{served.port:04X}"
+    ]
+
+
+def test_a_file_says_what_is_wrong_with_the_instrument(tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    ideal = (Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-ideal.toml").read_text()
+    path.write_text(f"{ideal}\n[instrument.wiring]\nswapped = true\nforce = {{ gain = -1.0 }}\n")
+    with serving("--rig", str(path), "--defect", "acquisition.half_filled=true") as served:
+        client = served.client()
+        client.say(*SEQUENCE)
+        first = client.ask("ACQ:SOUR2:DATA?").strip("{}").split(",")
+        assert float(first[0]) == pytest.approx(-9.9, abs=LSB_V)
+        assert set(first[8192:]) == {"0"}
+        client.close()
+
+
+def status_of(*options: str) -> int:
+    """In this process, of a server that does not come to serve."""
+    try:
+        return main(["serve", *options])
+    except SystemExit as usage:
+        return int(usage.code or 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--rig", "bench"], "no rig is called 'bench'"),
+        (["--defect", "swapped"], "--defect swapped: Expected '='"),
+        (["--defect", "wiring.swopped=true"], "instrument: wiring: unknown key 'swopped'"),
+        (["--defect", "inputs.skew_s=1"], "instrument: inputs: skew_s must be within +-0.001, not 1"),
+        (["--defect", "acquisition.drop_out='now'"], "instrument: acquisition: drop_out: must be one of 'none'"),
+        (["--defect", "wiring.force.limits_v=[1,0]"], "force: limits_v must be (low, high) within"),
+        (["--host", "192.0.2.1"], "cannot listen at 192.0.2.1:0"),
+        (["--host", ""], "cannot listen: the host is empty"),
+        (["--port", "65536"], "argument --port: must be a whole number from 0 to 65535"),
+        (["--plant", "rear"], "argument --plant: invalid choice: 'rear'"),
+    ],
+)
+def test_what_cannot_be_served_is_one_line_and_status_2(
+    options: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert status_of("--port", "0", *options) == 2
+    out, wrong = capsys.readouterr()
+    assert out == "" and wrong.count("\n") == 1 and said in wrong
+
+
+def test_a_port_that_is_taken_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert status_of("--port", str(port)) == 2
+    assert f"cannot listen at 127.0.0.1:{port}" in capsys.readouterr().err

@@ -1,0 +1,378 @@
+"""The server, in this process: places, turns, and a bench that is left safe."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from typing import Any
+
+import numpy as np
+
+from harness.instrument.acquisition import AcquisitionFaults
+from harness.instrument.description import InstrumentDescription
+from harness.instrument.red_pitaya import RedPitaya
+from harness.instrument.scpi import Call, Command, Response
+from harness.instrument.server import BUFFERED_BYTES, MOST_CLIENTS, Instrument, Server
+from tests.instrument.serving import LONG_S
+from tests.instrument.talk import SEQUENCE, front
+
+DRIVE = "OUTPUT1:STATE ON"
+LIVE = "OUTPUT1:STATE?"
+LARGE_BYTES = 1_000_000
+
+
+class Counter:
+    """An instrument that counts what it is told."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.live = False
+
+    @property
+    def commands(self) -> Mapping[str, tuple[int, Command]]:
+        return {
+            "COUNT": (0, self._raise),
+            "COUNT?": (0, lambda _: str(self.count)),
+            "LARGE?": (0, lambda _: bytes(LARGE_BYTES)),
+        }
+
+    def _raise(self, _: Call) -> Response:
+        self.count += 1
+        return None
+
+    def silence(self) -> None:
+        self.live = False
+
+
+class Client:
+    """One that means well."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader = reader
+        self.writer = writer
+
+    def say(self, *lines: str) -> None:
+        self.writer.write("".join(f"{line}\n" for line in lines).encode())
+
+    async def ask(self, line: str) -> str:
+        self.say(line)
+        return (await self.reader.readline()).decode().removesuffix("\r\n")
+
+    async def leave(self) -> None:
+        self.writer.close()
+        with contextlib.suppress(ConnectionError):
+            await self.writer.wait_closed()
+
+
+class Bench:
+    """A server, and how to reach it."""
+
+    def __init__(self, server: Server, port: int) -> None:
+        self.server = server
+        self.port = port
+        self.clients: list[Client] = []
+
+    async def client(self) -> Client:
+        return self.add(*await asyncio.open_connection("127.0.0.1", self.port, limit=LARGE_BYTES))
+
+    def add(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Client:
+        self.clients.append(Client(reader, writer))
+        return self.clients[-1]
+
+
+@contextlib.asynccontextmanager
+async def bench(instrument: Instrument, **patience_s: float) -> AsyncIterator[Bench]:
+    server = Server(instrument, **patience_s)
+    _, port = await server.listen("127.0.0.1", 0)
+    served = Bench(server, port)
+    try:
+        yield served
+    finally:
+        await server.close()
+        for client in served.clients:
+            await client.leave()
+
+
+def red_pitaya(faults: AcquisitionFaults | None = None) -> RedPitaya:
+    description = InstrumentDescription(acquisition=faults or AcquisitionFaults())
+    return RedPitaya(front, np.random.default_rng(1), description)
+
+
+def in_time(course: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def bounded() -> None:
+        async with asyncio.timeout(LONG_S):
+            await course()
+
+    asyncio.run(bounded())
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """The server has had its turns; one that never gets there runs out of time."""
+    while not holds():  # noqa: ASYNC110 - each turn of the loop is one
+        await asyncio.sleep(0)
+
+
+# ---- safe
+
+
+def test_a_bench_is_left_safe_by_who_switched_it_on_however_it_goes() -> None:
+    async def course() -> None:
+        instrument = red_pitaya()
+        async with bench(instrument) as served:
+            for goes in ("closes", "closes one way", "resets"):
+                client, watcher = await served.client(), await served.client()
+                client.say(*SEQUENCE)
+                assert await client.ask(LIVE) == "ON" and instrument.live
+                if goes == "closes":
+                    client.writer.close()
+                elif goes == "closes one way":
+                    client.writer.write_eof()
+                else:
+                    client.writer.transport.abort()
+                await until(lambda: not instrument.live)
+                assert await watcher.ask(LIVE) == "OFF"
+                watcher.say("ACQ:START", "ACQ:TRig NOW", "ACQ:SOUR1:GAIN HV")
+                force = await watcher.ask("ACQ:SOUR1:DATA:STA:N? 16000,1")
+                assert abs(float(force.strip("{}"))) < 1e-2
+
+    in_time(course)
+
+
+def test_a_client_that_only_looked_on_leaves_the_generator_alone() -> None:
+    async def course() -> None:
+        instrument = red_pitaya()
+        async with bench(instrument) as served:
+            driver, watcher = await served.client(), await served.client()
+            driver.say(DRIVE)
+            assert await driver.ask(LIVE) == "ON" and await watcher.ask(LIVE) == "ON"
+            await watcher.leave()
+            await until(lambda: len(served.server._clients) == 1)
+            assert instrument.live
+            await driver.leave()
+            await until(lambda: not served.server._clients)
+            assert not instrument.live
+
+    in_time(course)
+
+
+def test_a_server_that_is_closed_leaves_the_bench_safe() -> None:
+    async def course() -> None:
+        instrument = red_pitaya()
+        async with bench(instrument) as served:
+            client = await served.client()
+            client.say(DRIVE)
+            assert await client.ask(LIVE) == "ON"
+        assert not instrument.live
+
+    in_time(course)
+
+
+def test_a_server_that_is_closed_leaves_a_bench_safe_that_was_live_before_it_served() -> None:
+    async def course() -> None:
+        counter = Counter()
+        counter.live = True
+        async with bench(counter):
+            assert counter.live
+        assert not counter.live
+
+    in_time(course)
+
+
+# ---- drop-outs
+
+
+def test_an_instrument_that_hangs_up_has_sent_half_and_answers_the_next_client() -> None:
+    async def course() -> None:
+        async with bench(red_pitaya(AcquisitionFaults(drop_out="hang up"))) as served:
+            client = await served.client()
+            client.say(*SEQUENCE, "ACQ:SOUR1:DATA?")
+            heard = await client.reader.read()
+            assert heard.startswith(b"{9.8") and not heard.endswith(b"}\r\n")
+            another = await served.client()
+            whole = await another.ask("ACQ:SOUR1:DATA?")
+            assert whole.endswith("}") and whole.startswith(heard.decode())
+            assert await another.ask(LIVE) == "OFF"
+
+    in_time(course)
+
+
+def test_an_instrument_that_falls_silent_takes_what_is_said_and_answers_nothing() -> None:
+    async def course() -> None:
+        async with bench(red_pitaya(AcquisitionFaults(drop_out="silence"))) as served:
+            client, another = await served.client(), await served.client()
+            client.say(*SEQUENCE, "ACQ:DATA:FORMAT BIN", "ACQ:SOUR1:DATA?")
+            half = (len("#565536") + 65536) // 2
+            await client.reader.readexactly(half)
+            client.say("*IDN?")
+            assert (await another.ask("*IDN?")).startswith("analogrig")
+            assert await another.ask(LIVE) == "ON", "it has not gone"
+            client.writer.write_eof()
+            assert await client.reader.read() == b""
+            assert await another.ask(LIVE) == "OFF"
+
+    in_time(course)
+
+
+# ---- turns and places
+
+
+def test_a_long_line_of_one_client_does_not_make_another_wait() -> None:
+    """What is said in between is answered after a few commands, and not after all the thousand."""
+
+    async def course() -> None:
+        counter = Counter()
+        async with bench(counter) as served:
+            busy, other = await served.client(), await served.client()
+            assert await other.ask("COUNT?") == "0"
+            busy.say(";".join(["COUNT"] * 600), *["COUNT"] * 400)
+            await until(lambda: counter.count > 0)
+            assert int(await other.ask("COUNT?")) < 200
+            await until(lambda: counter.count == 1000)
+
+    in_time(course)
+
+
+def test_a_client_that_takes_nothing_is_dropped() -> None:
+    async def course() -> None:
+        async with bench(Counter(), slow_s=0.1) as served:
+            deaf = await served.client()
+            deaf.say(";".join(["LARGE?"] * 20))
+            await until(lambda: len(served.server._clients) == 1)
+            await until(lambda: not served.server._clients)
+
+    in_time(course)
+
+
+def test_a_client_that_takes_a_little_now_and_then_gets_all() -> None:
+    """A second for what another would get at once, and the patience of the server is a quarter of that."""
+
+    async def course() -> None:
+        async with bench(Counter(), slow_s=0.25) as served:
+            connection = socket.socket()
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            connection.connect(("127.0.0.1", served.port))
+            slow = served.add(*await asyncio.open_connection(sock=connection, limit=4096))
+            slow.say(";".join(["LARGE?"] * 4))
+            heard = 0
+            for _ in range(20):
+                heard += len(await slow.reader.readexactly(50_000))
+                await asyncio.sleep(0.05)
+            await slow.reader.readexactly(4 * (LARGE_BYTES + len("#71000000")) + len(";;;\r\n") - heard)
+            assert await slow.ask("COUNT?") == "0"
+
+    in_time(course)
+
+
+def test_a_server_keeps_no_more_than_an_answer_that_is_not_taken() -> None:
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            deaf = await served.client()
+            deaf.say(*["LARGE?"] * 100)
+            transports = [client.writer.transport for client in served.server._clients.values()]
+            while not transports or not any(transport.get_write_buffer_size() for transport in transports):
+                await asyncio.sleep(0)
+                transports = [client.writer.transport for client in served.server._clients.values()]
+            for _ in range(1000):
+                await asyncio.sleep(0)
+                assert transports[0].get_write_buffer_size() <= LARGE_BYTES + BUFFERED_BYTES
+
+    in_time(course)
+
+
+def test_when_all_places_are_taken_a_newcomer_is_turned_away() -> None:
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            clients = [await served.client() for _ in range(MOST_CLIENTS)]
+            for client in clients:
+                assert await client.ask("COUNT?") == "0"
+            newcomer = await served.client()
+            with contextlib.suppress(ConnectionError):
+                assert await newcomer.reader.read() == b""
+            assert await clients[0].ask("COUNT?") == "0"
+
+    in_time(course)
+
+
+def test_a_newcomer_gets_the_place_of_who_has_been_silent_for_longest_but_not_of_who_drives() -> None:
+    async def course() -> None:
+        instrument = red_pitaya()
+        async with bench(instrument, idle_s=0.0) as served:
+            driver = await served.client()
+            driver.say(DRIVE)
+            assert await driver.ask(LIVE) == "ON"
+            clients = [await served.client() for _ in range(MOST_CLIENTS - 1)]
+            for client in clients:
+                assert await client.ask("*OPC?") == "1"
+            assert await clients[0].ask("*OPC?") == "1"
+            newcomer = await served.client()
+            assert await newcomer.ask("*OPC?") == "1"
+            with contextlib.suppress(ConnectionError):
+                assert await clients[1].reader.read() == b""
+            assert await clients[0].ask("*OPC?") == "1" and await driver.ask(LIVE) == "ON"
+
+    in_time(course)
+
+
+def test_a_client_whose_machine_vanishes_is_asked_whether_it_lives() -> None:
+    """Within half a minute: 15 s of silence, three questions of 5 s."""
+
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            client = await served.client()
+            assert await client.ask("COUNT?") == "0"
+            (accepted,) = served.server._clients.values()
+            connection = accepted.writer.get_extra_info("socket")
+            assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+            idle_s, every_s, times = (
+                connection.getsockopt(socket.IPPROTO_TCP, option)
+                for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+            )
+            assert idle_s + every_s * times <= 30
+
+    in_time(course)
+
+
+# ---- lines
+
+
+def test_a_line_that_is_too_long_is_refused_and_the_next_is_understood() -> None:
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            client = await served.client()
+            for length in (4096, 5000, 100_000):
+                client.writer.write(b"X" * length + b"\nCOUNT\n")
+                assert await client.ask("SYST:ERR?") == (
+                    '-363,"Input buffer overrun"' if length > 4096 else f'-113,"Undefined header;{"X" * 40}"'
+                )
+            assert await client.ask("COUNT?") == "3"
+
+    in_time(course)
+
+
+def test_what_is_asked_before_the_connection_is_closed_one_way_is_answered() -> None:
+    """As by `printf '*IDN?' | nc`; a line without an end is none."""
+
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            client = await served.client()
+            client.say("COUNT", "LARGE?", "COUNT?")
+            client.writer.write(b"COUNT?")
+            client.writer.write_eof()
+            heard = await client.reader.read()
+            assert heard == b"#71000000" + bytes(LARGE_BYTES) + b"\r\n1\r\n"
+
+    in_time(course)
+
+
+def test_errors_are_those_of_a_connection_and_the_state_is_that_of_the_instrument() -> None:
+    async def course() -> None:
+        async with bench(Counter()) as served:
+            one, other = await served.client(), await served.client()
+            one.say("FOO", "COUNT")
+            assert await one.ask("COUNT?") == "1"
+            assert await other.ask("SYST:ERR?;:COUNT?") == '0,"No error";1'
+            assert await one.ask("SYST:ERR?") == '-113,"Undefined header;FOO"'
+
+    in_time(course)
