@@ -154,7 +154,11 @@ class Bench:
         try:
             with _undisturbed(pace):
                 self._exchange(blocks, pace, scenario.samples, collected)
-        except (DeviceError, LinkError, RigError) as error:
+        except RigError as error:
+            faults.append(str(error))
+            with contextlib.suppress(DeviceError, LinkError):
+                self.dut.handshake()  # it waits for samples: nothing of this run may reach the next one
+        except (DeviceError, LinkError) as error:
             faults.append(str(error))
         except KeyboardInterrupt:
             faults.append(INTERRUPTED_BY_USER)
@@ -165,6 +169,10 @@ class Bench:
         known = performance.hindsight()
         conditions = dataclasses.replace(
             begun,
+            channels={
+                name: dataclasses.replace(channel, noise_lsb=known.noise_lsb.get(name, channel.noise_lsb))
+                for name, channel in begun.channels.items()
+            },
             segments=known.segments,
             faults=(*faults, *known.caveats),
             overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < collected.samples},

@@ -31,7 +31,7 @@ def write(run: Run, folder: Path) -> str:
     scenario: dict[str, Any] = {**conditions.scenario, "seed": conditions.seed}
     name = str(conditions.rig["name"])
     shipped = name if name in config.names("rigs") and _is_rig(name, run) else None
-    if shipped is None and conditions.rig.get("kind") == "emulator":
+    if shipped is None and conditions.rig.get("kind") in ("emulator", "real"):
         rig = {key: value for key, value in conditions.rig.items() if key != "name"}
         (folder / RIG_FILE).write_text(config.to_toml(rig), encoding="utf-8")
         scenario["rig"] = RIG_FILE

@@ -152,6 +152,17 @@ def _check_owner(name: str) -> None:
         raise pytest.UsageError(f"device {name}: one worker owns it; run pytest with -n 1, or without -n")
 
 
+def _check_rig_owner(name: str, rig: Rig) -> None:
+    """A real rig likewise.
+
+    :raises pytest.UsageError: this worker is another one.
+    """
+    from harness.rigs.real import RealRig
+
+    if isinstance(rig, RealRig) and os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
+        raise pytest.UsageError(f"rig {name}: one worker owns it; run pytest with -n 1, or without -n")
+
+
 # ----------------------------------------------------------------------------------------------------------- fixtures
 
 
@@ -209,6 +220,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with _in_one_line():
         opened = open_rig(name)
     with opened:
+        _check_rig_owner(name, opened)
         _skip_unless_able(request.node, opened, name)
         yield opened
 

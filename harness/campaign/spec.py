@@ -261,8 +261,9 @@ class Plan:
         return Case(rig, self.devices[cell.device], scenario, seed, drawn)
 
     def one_worker_only(self) -> str:
-        """As the function, of the first of the devices that is alone."""
-        return next(filter(None, map(one_worker_only, self.devices)), "")
+        """As the function, of the first of the devices that is alone, or of a real rig."""
+        real = (str(table.get("name", "")) for table in self.rigs if table.get("kind") == "real")
+        return next(filter(None, (*map(one_worker_only, self.devices), *real)), "")
 
     def _check(self) -> None:
         spec = self.spec

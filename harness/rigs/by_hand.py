@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from harness.links.wire import Clock
 from harness.onset import NoOnset, onset
-from harness.plant import Plant
+from harness.plant import AT_REST, Plant, SampledPlant
 from harness.rigs.pots import Pots
 from harness.run import Segment
 from harness.turn import Turn, turn
@@ -19,6 +19,11 @@ BEFORE_S, AFTER_S = 0.02, 0.05
 that it stood."""
 
 LEAST_SEARCH_N = 8
+
+_BESIDE_N = 200
+"""So far beside its sample a tweak of the instrument is looked for ..."""
+_PLAIN = 1000.0
+"""... and with so much information, in the sense of ``harness.information``, it cannot but be found."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +121,39 @@ def _dated(record: Record, tweak: Tweak, search: range, within: range, *, slow: 
     if isinstance(found, NoOnset):
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=found.reason)
     return Segment(found.sample, tweak.after, start_low=found.low, start_high=found.high)
+
+
+def doubts(record: Record, tweaks: Sequence[Tweak], first: int) -> list[str]:
+    """What the samples of a record say against tweaks whose instants are taken for exact."""
+    out = []
+    starts = [tweak.sample for tweak in tweaks]
+    for tweak, before, after in zip(tweaks, [0, *starts], [*starts[1:], len(record)], strict=False):
+        search = range(max(tweak.sample - _BESIDE_N, before + 1), min(tweak.sample + _BESIDE_N, after - 1))
+        if len(search) < LEAST_SEARCH_N:
+            continue
+        found = onset(record, tweak.before, tweak.after, search, within=range(before, after))
+        where = f"the pot that was to be turned at sample {first + tweak.sample} ({tweak.words})"
+        if isinstance(found, NoOnset):
+            if _is_plain(record, tweak, range(tweak.sample, after)):
+                out.append(f"{where}: {found.reason}")
+        elif not found.low - 1 <= tweak.sample <= found.high + 1:
+            span = f"{first + found.low} to {first + found.high}"
+            out.append(f"{where} was turned at {first + found.sample} ({span}) by the samples")
+    return out
+
+
+def _is_plain(record: Record, tweak: Tweak, stretch: range) -> bool:
+    """Whether a change could not have stayed unseen."""
+    plants = [SampledPlant.of(plant, record.period_s) for plant in (tweak.before, tweak.after)]
+    states = [AT_REST, AT_REST]
+    information = 0.0
+    for k in range(stretch.stop):
+        inside = k >= stretch.start
+        states = [
+            plants[1 if inside and i else 0].next(state, float(record.force_n[k])) for i, state in enumerate(states)
+        ]
+        information += 0.5 * ((states[1][0] - states[0][0]) / record.noise_m) ** 2 if inside else 0.0
+    return information > _PLAIN
 
 
 def _moved(segment: Segment, by: int) -> Segment:

@@ -125,6 +125,7 @@ def parsed(url: str) -> SplitResult:
     try:
         split = urlsplit(url)
         known = split.scheme in INSTRUMENTS and bool(split.hostname) and (split.port is None or split.port > 0)
+        known &= not (split.path or split.query or split.fragment or split.username or " " in url)
     except ValueError:
         known = False
     if not known:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import select
 import shlex
 import signal
 import subprocess
 import termios
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -196,12 +198,29 @@ class _Command(_OneByOne):
         where = f"pot {pot} to {dial:.{DECIMALS}f}: {shlex.join(arguments)}"
         with _started(arguments, where) as process:
             try:
-                said, _ = process.communicate(timeout=self._description.timeout_s)
+                said = _heard(process, self._description.timeout_s)
             except subprocess.TimeoutExpired:
                 raise RigError(f"{where}: not done within {self._description.timeout_s:g} s, killed") from None
         if process.returncode:
             how = f"status {process.returncode}" if process.returncode > 0 else f"signal {-process.returncode}"
             raise RigError(f"{where}: ended with {how}{_quoted(said)}")
+
+
+def _heard(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
+    """The beginning of what it said, when it has ended.
+
+    :raises subprocess.TimeoutExpired: it has not.
+    """
+    assert process.stdout is not None  # noqa: S101 - as it was started
+    said, deadline_s = b"", time.monotonic() + timeout_s
+    while select.select([process.stdout], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
+        if not (heard := os.read(process.stdout.fileno(), _MOST_REPLY_BYTES)):
+            process.wait(max(0.0, deadline_s - time.monotonic()))
+            return said
+        said = (said + heard)[:_MOST_REPLY_BYTES]
+        if time.monotonic() > deadline_s:
+            break
+    raise subprocess.TimeoutExpired(process.args, timeout_s)
 
 
 @contextlib.contextmanager

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 
 from emulator import Excitation, SuspensionComputer
 from harness.errors import ConfigurationError, RigError, SelfTestError
+from harness.information import QUANTISATION_VARIANCE_LSB2
 from harness.plant import Plant
-from harness.rigs.by_hand import ByHand, Tweak
+from harness.rigs.by_hand import ByHand, Tweak, doubts
 from harness.rigs.emulator import Stream, emulator_errors, settings_of
 from harness.rigs.instrument import Instrument, Recorded, Turn, driver
+from harness.rigs.lock import Lock
 from harness.rigs.pots import Pots, PotsDescription
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
 from harness.run import CHANNELS, Channel, Segment
@@ -198,7 +200,23 @@ def check_wiring(description: RealDescription, instrument: type[Instrument] | In
         if wired.range not in instrument.ranges_v:
             has = " or ".join(map(repr, instrument.ranges_v))
             raise ConfigurationError(f"inputs.{name}: range must be {has}, not {wired.range!r}")
+        low_v, high_v = sorted((end - wired.offset_v) / wired.gain for end in instrument.ranges_v[wired.range])
+        if not low_v < 0.0 < high_v or wired.least_v > 0.0:
+            raise ConfigurationError(
+                f"inputs.{name}: 0 V at the computer must be within what is seen of it, {low_v:g} V to {high_v:g} V"
+                f" by gain and offset_v, from least_v, {wired.least_v:g} V, on"
+            )
+    pots = tuple(SuspensionComputer(description.plant).dials)
+    named = {"limits.dials": description.limits.dials, "pots.names": getattr(description.pots, "names", {})}
+    for key, table in named.items():
+        if unknown := sorted(set(table) - set(pots)):
+            raise ConfigurationError(f"{key}: there is no pot {unknown[0]!r}: there are {', '.join(pots)}")
     stage = description.generator
+    if not description.limits.force_v[0] <= stage.offset_v <= description.limits.force_v[1]:
+        raise ConfigurationError(
+            f"generator: when it is off, the force input stands at offset_v, {stage.offset_v:g} V, and limits.force_v"
+            f" allow {description.limits.force_v[0]:g} V to {description.limits.force_v[1]:g} V"
+        )
     ends_v = sorted(stage.gain * volts + stage.offset_v for volts in instrument.output_v)
     low_v, high_v = description.limits.force_v
     if ends_v[0] >= high_v or ends_v[1] <= low_v:
@@ -224,6 +242,9 @@ class RealRig:
         self._connect = connect or self._kind.open
         self._instrument: Instrument | None = None
         self._pots: Pots | None = None
+        self._noise_lsb: dict[str, float] = {}
+        """By channel, as the self-test has measured it."""
+        self._lock: Lock | None = None
         self._standing: dict[str, float] = {}
         """Dials, as far as they are known."""
         self._caveats: tuple[str, ...] | None = None if description.self_test else ()
@@ -247,8 +268,12 @@ class RealRig:
             time_scale=self._time_scale(plan.computer),
             channels=self._channels(plan.computer),
             blocks=self._blocks(scenario, plan, tested=tested),
-            hindsight=lambda: Hindsight(plan.truth(), caveats=(self._caveats or ()) if tested else ()),
+            hindsight=lambda: self._hindsight(plan, tested=tested),
         )
+
+    def _hindsight(self, plan: _Plan, *, tested: bool) -> Hindsight:
+        caveats = (*(self._caveats or ()), *plan.doubts) if tested else ()
+        return Hindsight(plan.truth(), caveats=caveats, noise_lsb=self._noise_lsb if tested else {})
 
     # ---- before
 
@@ -279,7 +304,7 @@ class RealRig:
             before, plant = plant, dataclasses.replace(plant, **tweak.given())
             tweaks.append(Tweak(tweak.sample, dials, before, plant))
         truth = None if isinstance(self._description.pots, InstrumentPots) else [Segment(0, scenario.plant.plant())]
-        return _Plan(scenario, computer, excitation, start, tuple(tweaks), truth)
+        return _Plan(scenario, computer, excitation, start, tuple(tweaks), [], truth)
 
     def _check_force(self, excitation: Excitation, where: str) -> None:
         low_v, high_v = self._description.limits.force_v
@@ -351,8 +376,11 @@ class RealRig:
                 standing, plant = {**standing, **tweak.dials}, tweak.after
             self._standing = dict(standing)
             volts, codes, clipped = self._converted(taken, self._channels(plan.computer))
+            measured = self._as_measured(plan, codes, clipped)
             if plan.dated is not None:
-                plan.dated.extend(by_hand.dated(self._as_measured(plan, codes, clipped), start))
+                plan.dated.extend(by_hand.dated(measured, start))
+            else:
+                plan.doubts.extend(doubts(measured, mine, start))
             for first in range(0, len(codes), BLOCK_SAMPLES):
                 part = slice(first, first + BLOCK_SAMPLES)
                 yield Block(start + first, volts[part], codes[part], clipped[part], record)
@@ -384,7 +412,9 @@ class RealRig:
         try:
             yield
         except RigError as error:
-            if danger := self._danger(instrument):
+            danger = self._danger(instrument)
+            self._let_go()  # what it still has to say would be taken for the answer to something else
+            if danger:
                 raise type(error)(f"{error}; {danger}") from error
             raise
         except BaseException:
@@ -429,6 +459,8 @@ class RealRig:
         :raises ConfigurationError: there is no terminal for the operator.
         """
         description = self._description
+        if self._lock is None:
+            self._lock = Lock(description.instrument)
         if self._instrument is None:
             self._instrument = self._connect(description.instrument, description.timeout_s)
         if self._pots is None:
@@ -451,6 +483,11 @@ class RealRig:
             findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
         except (SelfTestError, ConfigurationError) as error:
             return (f"the rig's self-test could not be made: {error}",)
+        self._noise_lsb = {
+            check.channel: math.sqrt(max(0.0, check.value**2 - QUANTISATION_VARIANCE_LSB2))
+            for check in findings.checks
+            if check.name == "noise" and check.state == "well"
+        }
         return tuple(f"the rig's self-test: {reason}" for reason in findings.reasons)
 
     def __enter__(self) -> Self:
@@ -459,6 +496,14 @@ class RealRig:
     def __exit__(self, *_: object) -> None:
         if self._instrument is not None:
             _warn(self._danger(self._instrument))
+        self._let_go()
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _let_go(self) -> None:
+        """Of the instrument and the pots; the next play begins with new connections."""
+        if self._instrument is not None:
             self._instrument.close()
             self._instrument = None
         if self._pots is not None:
@@ -479,6 +524,8 @@ class _Plan:
     start: Mapping[str, float]
     """Dials."""
     tweaks: tuple[Tweak, ...]
+    doubts: list[str]
+    """What the samples say against the instants of the instrument's own pots."""
     dated: list[Segment] | None
     """The truth as the samples tell it, where nothing else does."""
 

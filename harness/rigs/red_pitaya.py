@@ -40,9 +40,10 @@ _EARLY_N = 1e-4
 class ScpiConnection:
     """Lines and blocks over TCP, each with a deadline."""
 
-    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+    def __init__(self, host: str, port: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
         """:raises RigError: nobody answers there."""
         self.name = f"{host}:{port}"
+        self._clock = clock
         self._timeout_s = timeout_s
         self._input = bytearray()
         try:
@@ -56,6 +57,7 @@ class ScpiConnection:
     def send(self, *commands: str) -> None:
         """Commands without an answer, a line each."""
         try:
+            self._socket.settimeout(self._timeout_s)
             self._socket.sendall("".join(f"{command}\r\n" for command in commands).encode("ascii"))
         except TimeoutError as error:
             raise RigTimeout(f"instrument {self.name}: took no command for {self._timeout_s:g} s") from error
@@ -72,7 +74,7 @@ class ScpiConnection:
         end = self._until(lambda: self._input.find(b"\n"), query)
         line = bytes(self._input[:end]).rstrip(b"\r")
         del self._input[: end + 1]
-        return line.decode("ascii", "replace")
+        return "".join(character if character.isprintable() else "?" for character in line.decode("ascii", "replace"))
 
     def ask_block(self, query: str) -> bytes:
         """The content of the definite-length block (IEEE 488.2, 8.7.9) that it answers."""
@@ -101,10 +103,15 @@ class ScpiConnection:
         self._until(lambda: count if len(self._input) >= count else -1, query)
 
     def _until(self, found: Callable[[], int], query: str) -> int:
-        """Take what comes until ``found`` says where; a pause of the time-out ends it."""
+        """Take what comes until ``found`` says where, no longer than the time-out."""
+        deadline_s = self._clock() + self._timeout_s
         while (at := found()) < 0:
             if len(self._input) > 2 * _MOST_ANSWER_BYTES:
                 raise RigError(f"instrument {self.name}: {query}: an answer without end")
+            left_s = deadline_s - self._clock()
+            if left_s <= 0.0:
+                raise RigTimeout(f"instrument {self.name}: {query}: no whole answer within {self._timeout_s:g} s")
+            self._socket.settimeout(left_s)
             try:
                 received = self._socket.recv(65536)
             except TimeoutError as error:
@@ -197,6 +204,7 @@ class RedPitaya(Instrument):
             while_recording()
         self._await_record(BUFFER_N / self.rate_hz)
         self._check("the record")
+        self._check_alone(turns)
         volts = np.stack([self._volts(number) for number, _ in self._ranges], axis=1)
         self._check_filled(volts)
         lsb_v = np.array([self._lsb_v(word) for _, word in self._ranges])
@@ -257,6 +265,27 @@ class RedPitaya(Instrument):
                     raise RigTimeout(f"{self.name}: the record {what} in time: {query} says {answer[:20]!r}")
                 time.sleep(_POLL_S)
 
+    def _check_alone(self, turns: Sequence[Turn]) -> None:
+        """:raises RigRefused: what was set for the record is not set any more: somebody else has the instrument too."""
+        stand = {
+            "OUTPUT1:STATE?": "ON",
+            "ACQ:DEC:Factor?": str(DECIMATION),
+            **({"POT:SCHedule:COUNt?": str(len(turns))} if self.pots else {}),
+        }
+        for query, wanted in stand.items():
+            if (answer := self._scpi.ask(query)) not in (wanted, {"ON": "1"}.get(wanted, wanted)):
+                raise RigRefused(
+                    f"{self.name}: somebody else has changed it during the record: {query} says {answer[:20]!r}, not"
+                    f" {wanted}"
+                )
+        frequency_hz = self._scpi.ask("SOUR1:FREQ:FIX?")
+        wanted_hz = self._excitation.frequency_hz * (1.0 + 1e-6 * self._excitation.drift_ppm)
+        if not _is_close(frequency_hz, wanted_hz):
+            raise RigRefused(
+                f"{self.name}: somebody else has changed it during the record: its generator gives {frequency_hz[:20]}"
+                f" Hz, not {wanted_hz:g} Hz"
+            )
+
     def _volts(self, number: int) -> NDArray[np.float64]:
         volts = np.frombuffer(self._scpi.ask_block(f"ACQ:SOUR{number}:DATA?"), ">f4").astype(np.float64)
         if len(volts) != BUFFER_N:
@@ -299,3 +328,10 @@ class RedPitaya(Instrument):
         if not answer.startswith(("0,", "+0,", "0 ")) and answer != "0":
             self._scpi.send("*CLS")
             raise RigRefused(f"{self.name}: {what}: it says {answer[:120]}")
+
+
+def _is_close(answer: str, wanted: float) -> bool:
+    try:
+        return math.isclose(float(answer), wanted, rel_tol=1e-5)
+    except ValueError:
+        return False

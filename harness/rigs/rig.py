@@ -49,6 +49,8 @@ class Hindsight:
     """Of each amplifier whose overload lamp is lit, the first sample that was taken with it lit."""
     caveats: tuple[str, ...] = ()
     """Why what was played cannot be judged; none if it can."""
+    noise_lsb: Mapping[str, float] = field(default_factory=dict)
+    """rms on a channel before quantisation, by its name, where it was measured."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import signal
@@ -9,18 +10,23 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from emulator.excitation import Excitation
+from harness import config
 from harness.bench import Bench
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigTimeout
+from harness.rigs.description import described as described_rig
 from harness.rigs.description import open_rig
-from harness.rigs.real import LEAD_N, records
+from harness.rigs.instrument import Recorded, Turn
+from harness.rigs.real import LEAD_N, RealDescription, RealRig, records
+from harness.rigs.red_pitaya import RedPitaya
 from harness.rigs.rig import Performance
 from harness.run import Run
 from harness.scenario import PlantChoice, Scenario, Tweak
@@ -154,6 +160,69 @@ FAILURES = {
 }
 
 
+def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
+    def drips(listening: socket.socket) -> None:
+        connection, _ = listening.accept()
+        with connection, contextlib.suppress(OSError):
+            while not done.wait(0.1):
+                connection.sendall(b"x")
+
+    done = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=drips, args=(listening,), daemon=True)
+        thread.start()
+        file = tmp_path / "rigs.toml"
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        file.write_text(RIG.format(address=address, self_test="false").replace("2.0", "0.5"))
+        with open_rig(str(file)) as rig, pytest.raises(RigTimeout, match=r"no (whole )?answer within 0.5 s"):
+            next(rig.perform(SHORT, 1).blocks)
+        done.set()
+        thread.join(LONG_S)
+
+
+def test_instrument_belongs_to_one_who_plays(bench: str) -> None:
+    with open_rig(bench) as first, open_rig(bench) as second:
+        next(first.perform(SHORT, 1).blocks)
+        with pytest.raises(RigClosed, match="somebody else on this machine plays on it"):
+            next(second.perform(SHORT, 1).blocks)
+    with open_rig(bench) as third:
+        next(third.perform(SHORT, 1).blocks)
+
+
+def test_run_after_one_that_failed_is_a_good_one(tmp_path: Path) -> None:
+    second = ("--defect", "acquisition.drop_out_record=2")
+    with served("--defect", 'acquisition.drop_out="zeros"', *second) as instrument:
+        file = instrument.rigs_file(tmp_path)
+        with open_rig(str(file)) as rig, open_dut("inproc") as dut:
+            table = Bench(rig, dut)
+            outcomes = [judge(table.play(SHORT, 1)).outcome for _ in range(2)]
+    assert outcomes == ["inconclusive", "passed"]
+
+
+class Disobedient(RedPitaya):
+    """Does something else with the turns of a record."""
+
+    late_s = 0.0
+
+    def record(self, samples: int, turns: Sequence[Turn] = (), while_recording: Any = None) -> Recorded:
+        mine = [Turn(delay_s + self.late_s, pot, dial) for delay_s, pot, dial in turns] if self.late_s else []
+        return super().record(samples, mine, while_recording)
+
+
+@pytest.mark.parametrize(("late_s", "said"), [(0.0, "nothing in the samples"), (60 / 20e3, "was turned at 1260")])
+def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
+    late_s: float, said: str, bench: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Disobedient, "late_s", late_s)
+    scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])
+    description = config.build(RealDescription, described_rig(bench)[0], "bench")
+    with RealRig(description, Disobedient.open) as rig, open_dut("inproc") as dut:
+        verdict = judge(Bench(rig, dut).play(scenario, 1))
+    assert verdict.outcome == "inconclusive"
+    assert "the pot that was to be turned at sample 1200 (K 18000)" in verdict.reasons[0]
+    assert said in verdict.reasons[0]
+
+
 @pytest.mark.parametrize("defect", FAILURES)
 def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclusive(
     defect: str, tmp_path: Path
@@ -225,7 +294,8 @@ def test_generator_is_off_while_the_device_works_and_afterwards(bench: str, idea
     assert output_state(ideal.address) == "OFF"
 
 
-def test_interrupted_run_leaves_the_generator_off(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_run_that_is_ended_leaves_the_generator_off(number: signal.Signals, status: int, tmp_path: Path) -> None:
     silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
     with served(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
@@ -236,8 +306,8 @@ def test_interrupted_run_leaves_the_generator_off(tmp_path: Path) -> None:
         ) as process:
             while output_state(instrument.address) != "ON":  # as soon as it plays; it then waits for its record
                 assert process.poll() is None
-            process.send_signal(signal.SIGINT)
-            assert process.wait(LONG_S) == 130
+            process.send_signal(number)
+            assert process.wait(LONG_S) == status
         assert output_state(instrument.address) == "OFF"
 
 
@@ -260,6 +330,10 @@ WRONG = {
     "redpitaya://": ("picoscope://", "give it as redpitaya://NAME"),
     "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
+    "timeout_s = 2.0": ("timeout_s = 2.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
+    "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
+    '2, range = "HV"': ('2, range = "HV", least_v = 900.0', "inputs.displacement: 0 V at the computer must be within"),
+    "127.0.0.1:1": ("127.0.0.1:1/?timeout=1", "give it as redpitaya://NAME"),
     "[rig.bench]": ("[rig.bench]\nlimits.dials.M = [0.5, 2.0]", "dials.M must be"),
 }
 
@@ -341,6 +415,12 @@ def test_run_on_a_rig_that_is_not_well_is_inconclusive_and_says_why(defect: str,
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
+
+
+def test_noise_is_that_which_the_self_test_has_measured(tmp_path: Path) -> None:
+    with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.0042]") as instrument:
+        run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
+    assert run.conditions.channels["displacement"].noise_lsb == pytest.approx(0.0042 * (1 << 14) / 40.0, rel=0.05)
 
 
 def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) -> None:
