@@ -4,6 +4,7 @@ Clopper-Pearson bounds and ``Design`` are for a number of samples that was fixed
 looks while samples come, and stops when it suits, uses a ``SequentialTest`` (two rates, fixed error probabilities) or a
 ``ConfidenceSequence`` (a bound that holds at all times at once). Sources: Clopper and Pearson, Biometrika 26 (1934);
 Wald, Sequential Analysis (1947); Robbins, Annals of Mathematical Statistics 41 (1970).
+Where a rate is estimated and not counted (harness.rare), ``mean_bounds`` are those of the mean of many estimates.
 
 False alarms are counted as events among samples: after each the estimator begins anew, so that they are as good as
 independent.

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-__all__ = ["Cost", "costs", "count_steps", "link", "main", "missing_tools"]
+__all__ = ["Cost", "costs", "count_steps", "executed", "link", "main", "missing_tools"]
 
 HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
@@ -197,9 +197,8 @@ def _between(log: Iterable[bytes], ends: set[int]) -> Iterator[tuple[int, int]]:
             length[block] = 1 if address == block else length[block] + 1
 
 
-def count_steps(image: Path, machine: str, step: str, *others: str) -> list[int]:
-    """How many instructions each call of the function ``step`` took, in the order of the calls; ``others`` are called
-    between them.
+def executed(image: Path, machine: str) -> Iterator[bytes]:
+    """The log of QEMU's run of an image, line by line: what it executes of the measured sections, block by block.
 
     SystemExit if the image judges that its run was not what it is made for: subject_judge() in its source.
     """
@@ -222,13 +221,20 @@ def count_steps(image: Path, machine: str, step: str, *others: str) -> list[int]
     command += ["-semihosting", "-d", "in_asm,exec,nochain", "-dfilter", f"{first:#x}..{last - 1:#x}"]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE) as simulator:
         assert simulator.stderr is not None  # noqa: S101 - it is a pipe
-        ends = {places[name][0] for name in (step, *others, "after_last_step")}
-        counts = [count for begun, count in _between(simulator.stderr, ends) if begun == places[step][0]]
+        yield from simulator.stderr
     if simulator.returncode != 0:
         raise SystemExit(
             f"cost: {image.name} ended with status {simulator.returncode}: see subject_judge() in its source"
         )
-    return counts
+
+
+def count_steps(image: Path, machine: str, step: str, *others: str) -> list[int]:
+    """How many instructions each call of the function ``step`` took, in the order of the calls; ``others`` are called
+    between them. SystemExit as ``executed``.
+    """
+    places = symbols(image)
+    ends = {places[name][0] for name in (step, *others, "after_last_step")}
+    return [count for begun, count in _between(executed(image, machine), ends) if begun == places[step][0]]
 
 
 @dataclass(frozen=True)

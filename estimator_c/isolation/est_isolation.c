@@ -27,6 +27,10 @@
 #define BY_CHANCE 2.0F
 #define NOT_BY_CHANCE 11.0F
 
+/// In nats: by how much one change alone must lead the two others together, which have a magnitude more to fit the samples with.
+/// M alone is soon like a B and a K that grow alike, and so on round.
+#define AGAINST_TWO 2.0F
+
 /// A second change must be known to so much before it is ruled out: a standard deviation of 5 %.
 #define RULED_OUT 400.0F
 
@@ -277,7 +281,8 @@ static uint8_t best(const est_fit_t* const fit) {
 static est_change_t verdict(const est_fit_t* const fit, const float unit, const float noise_variance) {
     static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
     const uint8_t one    = best(fit);
-    bool ruled = fit->known[one] > (EXTENT_KNOWN * noise_variance);
+    const float   two = fit->pair[2U - one];  // of the two others
+    bool ruled = (fit->known[one] > (EXTENT_KNOWN * noise_variance)) && ((fit->alone[one] - two) >= (AGAINST_TWO * unit));
     for (uint8_t other = 0U; other < 3U; other++) {
         if (other != one) {
             const uint8_t pair   = (uint8_t)(one + other - 1U);

@@ -58,7 +58,7 @@ def _text(findings: Findings) -> str:
     for check in findings.checks:
         lines.append(_line(check))
         if check.state != "well":
-            lines.append(f"{'':16}{check.advice}")
+            lines.append(f"{'':16}{check.what_to_do}")
     return "\n".join(lines)
 
 

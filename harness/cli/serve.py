@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import signal
+import time
 from typing import TYPE_CHECKING, Any
 
 from harness.cli.options import PROGRAMS, seed
@@ -42,6 +43,11 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--port", type=port, default=DEFAULT_PORT, metavar="N", help="0 takes any that is free (%(default)d)"
     )
+    command.add_argument(
+        "--real-time",
+        action="store_true",
+        help="a record takes as long as it lasts, and a pot turns when it is turned (default: time passes in records)",
+    )
     command.add_argument("--json", action="store_true", help="print one JSON object instead of a sentence")
     command.set_defaults(command=_run)
 
@@ -61,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(described.laid(arguments.plant, drawn_from))
+    server = Server(described.laid(arguments.plant, drawn_from, time.monotonic if arguments.real_time else None))
     if described.left_out:
         complain(f"{described.name}: the instrument has no {', '.join(described.left_out)}", PASSED)
     names = {"rig": described.name, "plant": arguments.plant, "seed": drawn_from}

@@ -1,7 +1,8 @@
 """The acquisition of the instrument: arming, triggers, records.
 
 Time passes only here, and a command lets no more of it pass than four records take: who waits for a trigger that does
-not come asks again and again, and is told each time that there is none.
+not come asks again and again, and is told each time that there is none. With a clock, the samples after a trigger come
+no sooner than it says, so that what others do meanwhile falls into the record.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from harness.instrument.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
 from harness.instrument.scpi import ScpiError
 from harness.instrument.table import Table
+from harness.links.wire import Clock
 
 CLOCK_HZ = 125_000_000
 BUFFER_N = 16_384
@@ -66,6 +68,8 @@ class Settings:
     """The range of each input."""
     units: str = "VOLTS"
     form: str = "ASCII"
+    order: str = "BEND"
+    """Of the bytes of a number in a block: the highest first, or LEND."""
 
     @property
     def before_n(self) -> int:
@@ -105,15 +109,26 @@ class _Filling:
     """The last samples, not more than the buffer holds."""
     left_n: int
     """Those that are still to come."""
+    begun_s: float
+    """On the clock: when ``asked_n`` were still to come."""
+    asked_n: int
 
 
 class Acquisition:
     """Two channels of a table, a record at a time."""
 
     def __init__(
-        self, table: Table, inputs: tuple[InputFaults, np.random.Generator], faults: AcquisitionFaults
+        self,
+        table: Table,
+        inputs: tuple[InputFaults, np.random.Generator],
+        faults: AcquisitionFaults,
+        clock: Clock | None = None,
     ) -> None:
-        """``inputs``: their faults, and the random numbers of their noise."""
+        """``inputs``: their faults, and the random numbers of their noise.
+
+        Without a ``clock`` a record takes no time.
+        """
+        self._clock = clock
         self.settings = Settings()
         self.record: Record | None = None
         self._table = table
@@ -242,16 +257,24 @@ class Acquisition:
     def _take(self, seen: Volts, trigger_at: int) -> None:
         """The record of a trigger at that sample of those that were seen."""
         stop = trigger_at + self.settings.after_n
-        self._doing = filling = _Filling(seen[:stop], max(stop - len(seen), 0))
+        left_n = max(stop - len(seen), 0)
+        self._doing = filling = _Filling(seen[:stop], left_n, self._clock() if self._clock else 0.0, left_n)
         self._fill(filling)
 
     def _fill(self, filling: _Filling) -> None:
         """By no more than a record's length: of a long delay the rest is left for the next time."""
-        count = min(filling.left_n, BUFFER_N)
+        count = min(filling.left_n, self._due_n(filling), BUFFER_N)
         filling.seen = np.concatenate((filling.seen, self._samples(count)))[-BUFFER_N:]
         filling.left_n -= count
         if not filling.left_n:
             self._keep(filling.seen)
+
+    def _due_n(self, filling: _Filling) -> int:
+        """How many of the samples that are still to come have come by the clock."""
+        if self._clock is None:
+            return filling.left_n
+        passed_n = int((self._clock() - filling.begun_s) * CLOCK_HZ / self.settings.decimation)
+        return max(passed_n - (filling.asked_n - filling.left_n), 0)
 
     def _keep(self, volts: Volts) -> None:
         """As the record."""

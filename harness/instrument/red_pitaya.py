@@ -2,8 +2,8 @@
 
 Generator and acquisition of two channels, after https://redpitaya.readthedocs.io (SCPI commands, OS 2.0). What is here
 behaves as there: 125 MHz through a decimation, records of 16,384 samples with the trigger in their middle plus a delay,
-+-1 V (LV) or +-20 V (HV) on 14 bits, numbers in braces or as big-endian float32 and int16 in a block. Commands that it
-does not have are refused; a real one has many more.
++-1 V (LV) or +-20 V (HV) on 14 bits, numbers in braces or as float32 and int16 in a block, the highest byte first
+unless ACQ:DATA:BYTE:ORDER LEND says otherwise. Commands that it does not have are refused; a real one has many more.
 
     GEN:RST  ACQ:RST  SOUR1:FUNC SQUARE  SOUR1:FREQ:FIX 100  SOUR1:VOLT .5  SOUR1:VOLT:OFFS .5  ACQ:DEC:Factor 6250
     ACQ:AVG ON  ACQ:DATA:Units VOLTS  ACQ:DATA:FORMAT ASCII  ACQ:SOUR1:GAIN HV  ACQ:TRig:DLY 8192  ACQ:START
@@ -45,11 +45,13 @@ from harness.instrument.acquisition import (
 from harness.instrument.description import InstrumentDescription
 from harness.instrument.generator import MOST_VOLTS, SHAPES, Generator
 from harness.instrument.inputs import RANGES_V, Codes, lsb_v
-from harness.instrument.scpi import Broken, Call, Command, Response, ScpiError
+from harness.instrument.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
 from harness.instrument.table import Table, Turn
+from harness.links.wire import Clock
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
+_ORDERS = {"BEND": ">", "LEND": "<"}
 _IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 
 
@@ -61,14 +63,17 @@ class RedPitaya:
         computer: Callable[[float], SuspensionComputer],
         rng: np.random.Generator,
         description: InstrumentDescription | None = None,
+        clock: Clock | None = None,
     ) -> None:
         """``computer`` makes the machine for a rate of looks in Hz; ``rng`` gives the noise of the inputs.
+
+        With a ``clock`` a record takes the time that it lasts, and a pot turns where in the record it was turned.
 
         :raises EmulatorError: the computer cannot be made.
         """
         described = description or InstrumentDescription()
         self._table = Table(computer, described.wiring)
-        self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition)
+        self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition, clock)
         self._generator = Generator()
         self._pots = tuple(self._table.dials)
         self._scheduled: list[Turn] = []
@@ -111,17 +116,22 @@ class RedPitaya:
             "OUTPUT#:STATE": (1, lambda call: self._generate_with(self._out(call), on=call.switch(0))),
             "OUTPUT#:STATE?": (0, lambda call: _on_off(self._out(call).on)),
             "SOUR#:TRig:INT": (0, self._trigger_generator),
-            **self._quantity("SOUR#:FREQ[:FIX]", "frequency_hz", 1e-3, 1e6),
-            **self._quantity("SOUR#:VOLT", "amplitude_v", 0.0, MOST_VOLTS),
-            **self._quantity("SOUR#:VOLT:OFFS", "offset_v", -MOST_VOLTS, MOST_VOLTS),
+            **self._quantity("SOUR#:FREQ[:FIX]", "frequency_hz", 1e-3, 1e6, HERTZ),
+            **self._quantity("SOUR#:VOLT", "amplitude_v", 0.0, MOST_VOLTS, VOLTS),
+            **self._quantity("SOUR#:VOLT:OFFS", "offset_v", -MOST_VOLTS, MOST_VOLTS, VOLTS),
             **self._quantity("SOUR#:PHAS", "phase_deg", -360.0, 360.0),
             **self._quantity("SOUR#:DCYC", "duty", 0.001, 0.999),
         }
 
-    def _quantity(self, pattern: str, name: str, low: float, high: float) -> dict[str, tuple[int, Command]]:
+    def _quantity(
+        self, pattern: str, name: str, low: float, high: float, suffixes: Mapping[str, float] | None = None
+    ) -> dict[str, tuple[int, Command]]:
         """A number of the generator's, set and asked for."""
         return {
-            pattern: (1, lambda call: self._generate_with(self._out(call), **{name: call.number(0, low, high)})),
+            pattern: (
+                1,
+                lambda call: self._generate_with(self._out(call), **{name: call.number(0, low, high, suffixes)}),
+            ),
             f"{pattern}?": (0, lambda call: _number(getattr(self._out(call), name))),
         }
 
@@ -161,6 +171,8 @@ class RedPitaya:
             "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
             "ACQ:SOUR#:DATA?": (0, lambda call: self._data(call, 0, BUFFER_N)),
             "ACQ:SOUR#:DATA:STArt:N?": (2, self._part_of_data),
+            "ACQ:SOUR#:DATA:Old:N?": (1, lambda call: self._data(call, 0, call.whole(0, 1, BUFFER_N))),
+            "ACQ:SOUR#:DATA:LATest:N?": (1, self._latest_data),
             **self._settings_of_time(),
             **self._settings_of_data(),
         }
@@ -178,7 +190,7 @@ class RedPitaya:
             "ACQ:SRATe?": (0, lambda _: f"{_number(CLOCK_HZ / settings().decimation)} Hz"),
             "ACQ:AVG": (1, lambda call: self._acquire_with(averages=call.switch(0))),
             "ACQ:AVG?": (0, lambda _: _on_off(settings().averages)),
-            "ACQ:TRig:LEV": (1, lambda call: self._acquire_with(level_v=call.number(0, -LARGEST_V, LARGEST_V))),
+            "ACQ:TRig:LEV": (1, lambda call: self._acquire_with(level_v=call.number(0, -LARGEST_V, LARGEST_V, VOLTS))),
             "ACQ:TRig:LEV?": (0, lambda _: _number(settings().level_v)),
             "ACQ:TRig:DLY": (1, lambda call: self._acquire_with(delay_n=call.whole(0, LEAST_DELAY_N, MOST_DELAY_N))),
             "ACQ:TRig:DLY?": (0, lambda _: str(settings().delay_n)),
@@ -195,6 +207,8 @@ class RedPitaya:
             "ACQ:DATA:Units?": (0, lambda _: settings().units),
             "ACQ:DATA:FORMAT": (1, lambda call: self._acquire_with(form=call.word(0, ("ASCII", "BIN")))),
             "ACQ:DATA:FORMAT?": (0, lambda _: settings().form),
+            "ACQ:DATA:BYTE:ORDER": (1, lambda call: self._acquire_with(order=call.word(0, tuple(_ORDERS)))),
+            "ACQ:DATA:BYTE:ORDER?": (0, lambda _: settings().order),
         }
 
     def _acquire_with(self, **changes: Any) -> None:
@@ -218,6 +232,10 @@ class RedPitaya:
             raise ScpiError(-222, f"{first} + {count} is beyond the buffer of {BUFFER_N}")
         return self._data(call, first, count)
 
+    def _latest_data(self, call: Call) -> Response:
+        count = call.whole(0, 1, BUFFER_N)
+        return self._data(call, BUFFER_N - count, count)
+
     def _data(self, call: Call, first: int, count: int) -> Response:
         """Samples of the record, in the units and the form that are set."""
         channel, record = _channel(call), self._acquisition.record
@@ -228,17 +246,18 @@ class RedPitaya:
 
     def _formed(self, codes: Codes, switch: str) -> str | bytes:
         settings = self._acquisition.settings
+        order, binary = _ORDERS[settings.order], settings.form == "BIN"
         if settings.units == "RAW":
-            return codes.astype(">i2").tobytes() if settings.form == "BIN" else _braces(map(str, codes.tolist()))
+            return codes.astype(f"{order}i2").tobytes() if binary else _braces(map(str, codes.tolist()))
         volts: NDArray[np.float64] = codes.astype(np.float64) * lsb_v(switch)
-        return volts.astype(">f4").tobytes() if settings.form == "BIN" else _braces(f"{v:.6g}" for v in volts.tolist())
+        return volts.astype(f"{order}f4").tobytes() if binary else _braces(f"{v:.6g}" for v in volts.tolist())
 
     # ---- pots
 
     def _of_pots(self) -> dict[str, tuple[int, Command]]:
         return {
             "POT:CATalog?": (0, lambda _: ",".join(self._pots)),
-            "POT#:DIAL": (1, lambda call: self._table.turn(self._pot(call.numbers[0]), call.number(0, 0.0, 1.0))),
+            "POT#:DIAL": (1, self._turn),
             "POT#:DIAL?": (0, lambda call: _number(self._table.dials[self._pot(call.numbers[0])])),
             "POT:SCHedule": (3, self._schedule),
             "POT:SCHedule:CLEar": (0, lambda _: self._scheduled.clear()),
@@ -249,6 +268,13 @@ class RedPitaya:
         if not 1 <= number <= len(self._pots):
             raise ScpiError(-114, f"there are pots 1 to {len(self._pots)}")
         return self._pots[number - 1]
+
+    def _turn(self, call: Call) -> None:
+        """At this instant: what has been recorded by now was taken before."""
+        pot, dial = self._pot(call.numbers[0]), call.number(0, 0.0, 1.0)
+        if self._acquisition.triggered:
+            self._acquisition.wait()
+        self._table.turn(pot, dial)
 
     def _schedule(self, call: Call) -> None:
         if len(self._scheduled) == MOST_SCHEDULED:

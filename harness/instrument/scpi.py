@@ -33,6 +33,8 @@ ERRORS = {
     -109: "Missing parameter",
     -113: "Undefined header",
     -114: "Header suffix out of range",
+    -131: "Invalid suffix",
+    -138: "Suffix not allowed",
     -221: "Settings conflict",
     -222: "Data out of range",
     -223: "Too much data",
@@ -44,7 +46,13 @@ ERRORS = {
 """SCPI 1999, 21.8.9 to 21.8.11."""
 _MOST_ERROR_CHARACTERS = 255
 
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+VOLTS = {"V": 1.0, "MV": 1e-3}
+HERTZ = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6}
+"""Suffixes behind a number, and what they multiply it with (IEEE 488.2, 7.7.3: MHZ is a million, MV a thousandth)."""
+_ERROR_QUEUE = 4
+"""The bit of the status byte that says that it holds something (SCPI 1999, 9)."""
+
+_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z]*)")
 _HEADER = re.compile(r"(?:\*|:?[A-Za-z])[\w:]*\??")
 
 
@@ -84,12 +92,13 @@ class Call:
             raise ScpiError(-224, f"{_shown(word)}, it may be {', '.join(allowed)}")
         return word
 
-    def number(self, at: int, low: float, high: float) -> float:
-        """An argument that is a number from ``low`` to ``high``."""
+    def number(self, at: int, low: float, high: float, suffixes: Mapping[str, float] | None = None) -> float:
+        """An argument that is a number from ``low`` to ``high``, perhaps with a suffix."""
         text = self._argument(at)
-        if not _NUMBER.fullmatch(text):
+        found = _NUMBER.fullmatch(text)
+        if not found:
             raise ScpiError(-104, f"{_shown(text)} is no number")
-        value = float(text)
+        value = float(found[1]) * _factor(found[2].upper(), suffixes or {})
         if not (math.isfinite(value) and low <= value <= high):
             raise ScpiError(-222, f"{_shown(text)}, it may be {low:g} to {high:g}")
         return value
@@ -116,6 +125,12 @@ class Call:
         return self.arguments[at]
 
 
+def _factor(suffix: str, suffixes: Mapping[str, float]) -> float:
+    if suffix and suffix not in suffixes:
+        raise ScpiError(-131 if suffixes else -138, _shown(suffix))
+    return suffixes[suffix] if suffix else 1.0
+
+
 @dataclass(frozen=True)
 class Broken:
     """A response of which the first half is sent, and then nothing any more: DropOut."""
@@ -137,6 +152,7 @@ class Interpreter:
         """``commands``: by pattern the number of arguments it takes at most, and what it does."""
         own: dict[str, tuple[int, Command]] = {
             "*CLS": (0, lambda _: self._errors.clear()),
+            "*STB?": (0, lambda _: str(_ERROR_QUEUE if self._errors else 0)),
             "SYSTem:ERRor[:NEXT]?": (0, lambda _: self._next_error()),
             "SYSTem:ERRor:COUNt?": (0, lambda _: str(len(self._errors))),
         }

@@ -11,9 +11,10 @@ from harness import config
 from harness.errors import ConfigurationError
 from harness.instrument.description import InstrumentDescription, left_out
 from harness.instrument.red_pitaya import RedPitaya
+from harness.links.wire import Clock
 from harness.rigs.emulator import EmulatorDescription, Stream, emulator_errors
 
-Table = dict[str, Any]
+Keys = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -29,13 +30,15 @@ class ServedDescription(EmulatorDescription):
         :raises ConfigurationError: there is none, or something in it is wrong.
         """
         path = config.locate("rigs", name)
-        table: Table = {"name": path.stem, **config.read_toml(path)}
+        table: Keys = {"name": path.stem, **config.read_toml(path)}
         for defect in defects:
             table = _merged(table, {"instrument": _parsed(defect)})
         return config.build(cls, table, str(path))
 
-    def laid(self, program: str, seed: int) -> RedPitaya:
+    def laid(self, program: str, seed: int, clock: Clock | None = None) -> RedPitaya:
         """The instrument, and on its table the very computer that an EmulatorRig plays on with that seed.
+
+        With a ``clock`` its records take the time that they last.
 
         :raises ConfigurationError: the computer or the instrument cannot be.
         """
@@ -45,7 +48,10 @@ class ServedDescription(EmulatorDescription):
             except ValueError as error:
                 raise ConfigurationError(f"{self.name}: card and instrument together: {error}") from error
             return RedPitaya(
-                lambda rate_hz: self.computer.wired(program, seed, rate_hz), Stream.CARD.generator(seed), described
+                lambda rate_hz: self.computer.wired(program, seed, rate_hz),
+                Stream.CARD.generator(seed),
+                described,
+                clock,
             )
 
     @property
@@ -55,7 +61,7 @@ class ServedDescription(EmulatorDescription):
         return (*of_card, "computer.noise") if self.computer.noise else of_card
 
 
-def _parsed(defect: str) -> Table:
+def _parsed(defect: str) -> Keys:
     try:
         return tomllib.loads(defect)
     except (ValueError, RecursionError) as error:
@@ -64,7 +70,7 @@ def _parsed(defect: str) -> Table:
         ) from error
 
 
-def _merged(table: Table, more: Table) -> Table:
+def _merged(table: Keys, more: Keys) -> Keys:
     """Table with the keys of another, tables in it likewise."""
     out = dict(table)
     for key, value in more.items():

@@ -36,7 +36,7 @@ LEAST_RIGHT, SURELY = 0.9, 1.0 - 1e-7
 SINGLE_WRONG, SINGLE_FAR_TOO_WRONG = 0.01, 0.05
 """Of the diagnoses of single changes by 20 %: what is expected at most, and what is refuted."""
 SINGLE_MISS, SINGLE_FALSE_FAILURE = 1e-3, 1e-7
-MOST_SINGLE_PLAYS_N, SILENT_N = 200, 5
+MOST_SINGLE_PLAYS_N, SILENT_N = 300, 5
 """A device that has named nothing in so many plays does not name changes at all."""
 
 _TURNED = {

@@ -54,17 +54,19 @@ def render(run: Run, verdict: Verdict) -> str:
     )
 
 
-def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], **texts: str) -> str:
-    """A page that needs nothing but itself: ``template`` with its styles, scripts and texts.
+def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
+    """A page that needs nothing but itself: ``template`` with its styles, scripts and texts; ``title`` is escaped.
 
     :raises RecordingError: the build has not put uPlot in its place.
     """
     style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
+    head = Template(_part(FOLDER / "head.html")).substitute(
+        title=title, policy=_policy(style, script), styles="\n".join(f"<style>{each}</style>" for each in style)
+    )
     return Template(_part(template)).substitute(
         texts,
-        policy=_policy(style, script),
+        head=head.rstrip("\n"),
         licence=_part(FOLDER / "licence.html").rstrip("\n"),
-        styles="\n".join(f"<style>{each}</style>" for each in style),
         scripts="\n".join(f"<script>{each}</script>" for each in script),
     )
 

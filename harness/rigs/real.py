@@ -441,7 +441,7 @@ class RealRig:
         return self._instrument, self._pots
 
     def _tested(self) -> tuple[str, ...]:
-        """What is wrong with the rig.
+        """What is wrong with the rig, or cannot be told of it.
 
         :raises RigError: it failed.
         """
@@ -451,7 +451,7 @@ class RealRig:
             findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
         except (SelfTestError, ConfigurationError) as error:
             return (f"the rig's self-test could not be made: {error}",)
-        return tuple(f"the rig's self-test: {check.sentence}" for check in findings.having("wrong"))
+        return tuple(f"the rig's self-test: {reason}" for reason in findings.reasons)
 
     def __enter__(self) -> Self:
         return self

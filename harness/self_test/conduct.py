@@ -112,7 +112,7 @@ class _Seen:
         high, low = (np.median(volts[settled & (state == level)]) for level in (1, 0))
         answer = 1.0 if high > low else -1.0
         force = 1.0 if upright < inverted else -1.0
-        return checks.polarity("force", force), checks.polarity("displacement", answer)
+        return checks.polarity("force", force), checks.polarity("displacement", max(answer, answer * force))
 
     def quantities(self) -> tuple[Check, ...]:
         """All that has a size."""

@@ -42,7 +42,19 @@ class Check:
             return "not measured"
         if self.value - SIGMAS * self.error > self.most or self.value + SIGMAS * self.error < self.least:
             return "wrong"
-        return "not measured" if self.error > RESOLUTION * (self.most - self.least) else "well"
+        return "not measured" if self.error > self.most_error else "well"
+
+    @property
+    def most_error(self) -> float:
+        """With a larger standard error nothing can be said."""
+        return RESOLUTION * (self.most - self.least)
+
+    @property
+    def what_to_do(self) -> str:
+        """About a quantity that is not well."""
+        if self.state == "not measured" and not math.isnan(self.value):
+            return f"known too poorly: its standard error would have to be at most {self.most_error:.2g}"
+        return self.advice
 
     @property
     def title(self) -> str:
@@ -54,7 +66,7 @@ class Check:
         if math.isnan(self.value):
             return f"{self.title}: not measured: {self.advice}"
         known = f"{self.title}: {self.value:.4g} +- {self.error:.2g} {self.unit}".rstrip()
-        return f"{known}, allowed {self.least:.4g} to {self.most:.4g}: {self.advice}"
+        return f"{known}, allowed {self.least:.4g} to {self.most:.4g}: {self.what_to_do}"
 
 
 @dataclass(frozen=True)

@@ -288,7 +288,7 @@ def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figur
     displacement = run.channel("displacement") * 1e3
     lsb_mm = run.conditions.channels["displacement"].lsb * 1e3
     changes = marks(dataclasses.replace(mean, alarms=mean.alarms[:0]), segments, CHANGE_LABELS)
-    batch = _batch_estimates(run)
+    batch = batch_estimates(run)
     m_per_code = lsb_mm / 1e3
     ceiling = MEAN_CEILING / UNITS_PER_M / m_per_code
     predicted = displacement - mean.innovation * lsb_mm
@@ -320,7 +320,7 @@ def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figur
             "5.8 A",
             "The same without noise.",
             (
-                *_estimate_panels(calm, _batch_estimates(quantised.run), quantised.run),
+                *_estimate_panels(calm, batch_estimates(quantised.run), quantised.run),
                 _statistic("Triggering sequence [LSB]", calm.statistic, ceiling),
             ),
             "Ideal amplifiers and no noise but that of the 12 bits, the same scheme and ceiling.",
@@ -389,7 +389,7 @@ def _conditioned_figure(recording: Recording, batch: Signal) -> Figure:
     )
 
 
-def _batch_estimates(run: Run) -> Signal:
+def batch_estimates(run: Run) -> Signal:
     """(n, 4) a1, a2, b0, b1 [m/N]: the batch estimate of each stretch at all its samples."""
     u, y, n_per_code, m_per_code = run_codes(run)
     out = np.empty((run.samples, 4))

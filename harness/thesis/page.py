@@ -42,6 +42,7 @@ def render(chapters: Sequence[Chapter], comparison: Comparison) -> str:
         _FOLDER / "page.html",
         (*STYLES, _FOLDER / "page.css"),
         (*SCRIPTS, _FOLDER / "page.js"),
+        title="The thesis, reproduced",
         summary=_summary(claims),
         contents=_contents(chapters),
         chapters="\n".join(_chapter(chapter, order) for chapter in chapters),

@@ -18,7 +18,7 @@ from .figure import Figure
 
 CHANGES: tuple[Change, ...] = (
     *({name: factor} for name in "MBK" for factor in (0.8, 1.2)),
-    {"B": 1.2, "K": 1.2},
+    *({one: factor, two: factor} for one, two in ("BK", "MB", "MK") for factor in (0.8, 1.2)),
     {"B": 0.8, "K": 1.2},
 )
 
@@ -34,6 +34,7 @@ def figures(trials: int = 400) -> Iterator[Figure]:
                 named = ", ".join(f"{name}{100 * (factor - 1):+.0f}%" for name, factor in change.items())
                 remark = (
                     f"limit 2: {found.mean_n:.1f} against {found.bound_n:.1f} samples, "
+                    f"{found.bound_of_pairs_n:.1f} with two at once as a rival; "
                     f"within twice in {100 * found.within_twice:.0f} % of the trials; "
                     f"{100 * found.reported:.1f} % reported, {100 * found.right:.1f} % of those right"
                 )

@@ -13,6 +13,7 @@ from tests.estimator_c.performance import Settings
 from tests.estimator_c.plants import (
     CODES,
     DISPLACEMENT_RANGE_M,
+    PERIOD_S,
     VARIANCE_LSB2,
     Array,
     Excitation,
@@ -28,6 +29,10 @@ SAMPLES = LEARNT_N + ONSET_SPAN_N + HORIZON_N
 LN_CERTAIN = float(np.log(20.0))
 FACTORS = np.exp(np.linspace(np.log(0.25), np.log(4.0), 111))
 """Magnitudes of a rival; the best is interpolated."""
+PAIRED = np.exp(np.linspace(-1.2, 1.2, 41))
+"""Magnitudes of each of two that change at once; likewise."""
+AT_ONCE = 50
+"""Trials that are worked on together, so that all pairs of magnitudes fit into memory."""
 
 Change = Mapping[str, float]
 """Factors of "M", "B", "K"; those that do not change are absent."""
@@ -45,6 +50,8 @@ class Isolation:
     """Samples from the change to the report, HORIZON_N where there was none."""
     bound_n: float
     """Mean of the isolation bounds of these very trials; NaN if not asked for."""
+    bound_of_pairs_n: float
+    """The same if two others at once count as a rival too; NaN if several had changed, or if not asked for."""
     within_twice: float
     """Share of the trials in which the report came within twice the bound of that trial."""
     error: float
@@ -71,8 +78,8 @@ def truth(change: Change) -> str:
     return next(iter(change)) if len(change) == 1 else "several"
 
 
-def judged(found: Isolated, played: Trials, change: Change, bound_n: Array) -> Isolation:
-    """The measures of these diagnoses; ``bound_n`` (t,)."""
+def judged(found: Isolated, played: Trials, change: Change, bound_n: Array, bound_of_pairs_n: Array) -> Isolation:
+    """The measures of these diagnoses; the bounds are (t,)."""
     reported, right = found.change != "undecided", found.change == truth(change)
     taken_n = np.where(reported, found.at - played.onset, HORIZON_N)
     errors = [float("nan")] * 2
@@ -84,6 +91,7 @@ def judged(found: Isolated, played: Trials, change: Change, bound_n: Array) -> I
         right=float(right.sum() / max(reported.sum(), 1)),
         mean_n=float(taken_n.mean()),
         bound_n=float(bound_n.mean()),
+        bound_of_pairs_n=float(bound_of_pairs_n.mean()),
         within_twice=float((taken_n <= 2.0 * bound_n).mean()),
         error=errors[0],
         error_refined=errors[1],
@@ -105,8 +113,12 @@ def measure(
     played = play(plant, change, excitation, trials, seed)
     assert estimator.init(**settings)
     found = estimator.isolate(played.u, played.y, played.onset)
-    bound_n = bounds(plant, change, excitation, played.onset, seed) if bounded else np.full(trials, np.nan)
-    return judged(found, played, change, bound_n)
+    bound_n = bound_of_pairs_n = np.full(trials, np.nan)
+    if bounded:
+        bound_n = bounds(plant, change, excitation, played.onset, seed)
+    if bounded and len(change) == 1:
+        bound_of_pairs_n = bounds_of_pairs(plant, change, excitation, played.onset, seed)
+    return judged(found, played, change, bound_n, bound_of_pairs_n)
 
 
 def bounds(
@@ -122,9 +134,56 @@ def bounds(
     for rival in "MBK":
         if rival != truth(change):
             others = _courses(plant, [plant.scaled(rival, f) for f in FACTORS], excitation, first, onset)
-            least = np.minimum(least, _least(np.cumsum((others - course) ** 2, axis=1) / (2.0 * VARIANCE_LSB2)))
+            least = np.minimum(least, _least(_divergence(course, others)))
+    return _separated(least)
+
+
+def bounds_of_pairs(
+    plant: Mechanics, change: Change, excitation: Excitation, onset: NDArray[np.int64], seed: int
+) -> NDArray[np.float64]:
+    """As ``bounds`` of a single change; the rival is a change of both other parameters at once, or of either."""
+    first = excitation.first_edges(np.random.default_rng(seed), len(onset))
+    one, two = (name for name in "MBK" if name != truth(change))
+    rivals = [plant.scaled(one, f).scaled(two, g) for f in PAIRED for g in PAIRED]
+    out = np.empty(len(onset))
+    for at in range(0, len(onset), AT_ONCE):
+        part = slice(at, at + AT_ONCE)
+        course = _courses(plant, [changed(plant, change)], excitation, first[part], onset[part])[0]
+        others = _courses(plant, rivals, excitation, first[part], onset[part])
+        out[part] = _separated(_least_of_pairs(_divergence(course, others).reshape(41, 41, *course.shape)))
+    return out
+
+
+def _divergence(course: Array, others: Array) -> Array:
+    """(f, n, t) nats after each sample."""
+    return np.asarray(np.cumsum((others - course) ** 2, axis=1) / (2.0 * VARIANCE_LSB2))
+
+
+def _separated(least: Array) -> Array:
+    """(t,) samples after which the best rival (n, t) falls behind by ln 20."""
     reached = least >= LN_CERTAIN
     return np.asarray(np.where(reached.any(axis=0), reached.argmax(axis=0) + 1.0, float(HORIZON_N)))
+
+
+def _least_of_pairs(divergence: Array) -> Array:
+    """(f, g, n, t) at evenly spaced f and g: the least over both (n, t), by a paraboloid around the lowest."""
+    sides, rest = divergence.shape[:2], divergence.shape[2:]
+    at = divergence.reshape(-1, *rest).argmin(axis=0)
+    i, j = (np.clip(x, 1, n - 2) for x, n in zip(np.divmod(at, sides[1]), sides, strict=True))
+    n, t = np.ogrid[: rest[0], : rest[1]]
+
+    def near(di: int, dj: int) -> Array:
+        return np.asarray(divergence[i + di, j + dj, n, t])
+
+    mid = near(0, 0)
+    gi, gj = (near(1, 0) - near(-1, 0)) / 2.0, (near(0, 1) - near(0, -1)) / 2.0
+    ii, jj = near(1, 0) + near(-1, 0) - 2.0 * mid, near(0, 1) + near(0, -1) - 2.0 * mid
+    ij = (near(1, 1) + near(-1, -1) - near(1, -1) - near(-1, 1)) / 4.0
+    determinant = ii * jj - ij**2
+    with np.errstate(all="ignore"):
+        least = mid - (jj * gi**2 - 2.0 * ij * gi * gj + ii * gj**2) / (2.0 * determinant)
+    bowl = (determinant > 0.0) & (ii > 0.0)
+    return np.asarray(np.clip(np.where(bowl, least, mid), 0.0, mid))
 
 
 def _least(divergence: Array) -> Array:
@@ -141,7 +200,6 @@ def _courses(
     plant: Mechanics, plants: list[Mechanics], excitation: Excitation, first: Array, onset: NDArray[np.int64]
 ) -> Array:
     """(plants, HORIZON_N, t) codes of displacement in the samples after the onset, the plant as it was up to there."""
-    times = np.arange(HORIZON_N)[:, None] + onset
     half_n = excitation.half_period_n * (1.0 + excitation.drift_ppm * 1e-6)
     force_n = plant.force_range_n * excitation.part_of_range
 
@@ -151,18 +209,41 @@ def _courses(
     def rest_n(k: NDArray[np.int64]) -> Array:
         return k + 1.0 - (first + (np.floor((k - first) / half_n) + 1.0) * half_n)
 
-    def step(who: Mechanics, state: Array, k: NDArray[np.int64]) -> Array:
-        jump = level(k + 1) - level(k)
-        kick = np.where(jump != 0.0, who.response(np.where(jump != 0.0, rest_n(k), 1.0)) * jump, 0.0)
-        return np.asarray(who.transition(1.0) @ state + who.response(np.ones(1)) * level(k) + kick)
+    class Course:
+        """Of these plants, (plants, t) each, from rest."""
 
-    state = np.zeros((2, len(onset)))
+        def __init__(self, who: list[Mechanics]) -> None:
+            self.first, self.second = np.array([each.poles() for each in who]).T[:, :, None]
+            self.stiffness = np.array([each.stiffness_n_per_m for each in who])[:, None]
+            self.transition = np.stack([each.transition(1.0) for each in who])[:, :, :, None]
+            self.whole = self.response(np.ones(1))
+            self.x, self.v = np.zeros((2, len(who), len(onset)))
+
+        def response(self, span_n: Array) -> tuple[Array, Array]:
+            """As Mechanics.response(), of all plants (plants, ...)."""
+            first, second = self.first, self.second
+            a, b = (np.exp(pole * span_n * PERIOD_S) for pole in (first, second))
+            gap = (first - second) * self.stiffness
+            return 1.0 / self.stiffness + ((second * a - first * b) / gap).real, (first * second * (a - b) / gap).real
+
+        def step(self, k: NDArray[np.int64]) -> None:
+            (xx, xv), (vx, vv) = self.transition.transpose(1, 2, 0, 3)
+            now = level(k)
+            x = xx * self.x + xv * self.v + self.whole[0] * now
+            v = vx * self.x + vv * self.v + self.whole[1] * now
+            jump = level(k + 1) - now
+            (edges,) = np.nonzero(jump)
+            for part, kick in zip((x, v), self.response(rest_n(k)[edges]), strict=True):
+                part[:, edges] += kick * jump[edges]
+            self.x, self.v = x, v
+
+    believed = Course([plant])
     for back in range(400, 0, -1):
-        state = step(plant, state, onset - back)
+        believed.step(onset - back)
+    played = Course(plants)
+    played.x, played.v = (np.repeat(part, len(plants), axis=0) for part in (believed.x, believed.v))
     out = np.empty((len(plants), HORIZON_N, len(onset)))
-    for i, who in enumerate(plants):
-        now = state
-        for k in range(HORIZON_N):
-            now = step(who, now, times[k])
-            out[i, k] = now[0]
+    for k in range(HORIZON_N):
+        played.step(onset + k)
+        out[:, k] = played.x
     return out * (CODES / DISPLACEMENT_RANGE_M)

@@ -17,6 +17,8 @@ from tests.estimator_c.plants import FRONT, Excitation, random_plants, simulate
 
 CLOCKS = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere": (OWN_CLOCK, FULL_FREE)}
 SINGLE = [{name: factor} for name in "MBK" for factor in (0.8, 1.2)]
+TWO = [{"B": 1.2, "K": 1.2}, {"B": 0.8, "K": 0.8}, {"M": 1.2, "B": 1.2}, {"M": 1.2, "K": 1.2}, {"B": 0.8, "K": 1.2}]
+"""Of the first four each looks like a change of the third parameter at first."""
 
 
 @pytest.mark.parametrize(("settings", "excitation"), CLOCKS.values(), ids=CLOCKS)
@@ -32,18 +34,22 @@ def test_changed_parameter_is_named_in_time_and_its_extent_told(
     assert found.error_refined < 0.01
 
 
-@pytest.mark.parametrize("change", [{"M": 0.8}, {"K": 1.2}], ids=str)
+@pytest.mark.parametrize("change", [{"M": 1.2}, {"K": 1.2}], ids=str)
 def test_report_comes_within_twice_the_isolation_bound_on_average(estimator: Estimator, change: Change) -> None:
-    """The largest of the measured ratios is 1.9, the smallest 1.5, with standard errors of 0.1."""
+    """The bound against all rivals, the two other parameters at once being one: 1.4 times, standard error 0.1.
+
+    Of the six single changes those two are the earliest; the latest, of B - 20 %, comes after 2.1 of these bounds.
+    """
     found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 100, seed=31)
-    assert found.bound_n < found.mean_n < 2.0 * found.bound_n
+    assert found.bound_n <= found.bound_of_pairs_n < found.mean_n < 2.0 * found.bound_of_pairs_n
 
 
-@pytest.mark.parametrize("change", [{"B": 1.2, "K": 1.2}, {"B": 0.8, "K": 1.2}], ids=str)
-def test_two_changes_at_once_are_mostly_not_taken_for_one(estimator: Estimator, change: Change) -> None:
-    """Damping and stiffness that grow alike look like a smaller mass at first: 8 in 10 are told from it."""
+@pytest.mark.parametrize("change", TWO, ids=str)
+def test_two_changes_at_once_are_not_taken_for_one(estimator: Estimator, change: Change) -> None:
+    """95 % of 400 is missed with a probability of 2 % where the rate is 97 %."""
     found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 400, seed=31, bounded=False)
-    assert found.right > 0.7
+    assert found.reported > 0.98
+    assert found.right >= 0.95
 
 
 @pytest.mark.parametrize("change", SINGLE, ids=str)

@@ -58,13 +58,14 @@ def test_a_gap_ends_the_doubt_about_an_edge(estimator: Estimator) -> None:
     assert refreshes == [0, 1]
 
 
-def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator) -> None:
-    """EST_DOUBT_N of est_edges.h. C, due long before, is taken with the first equation after them."""
+@pytest.mark.parametrize("refresh_n", [9, 10])
+def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refresh_n: int) -> None:
+    """EST_DOUBT_N of est_edges.h. C, due before, is taken with the first equation after them."""
     u, y = front()
     edge = 10
     refreshes = []
     for samples in (edge + 12, edge + 13):
-        assert estimator.init(refresh_n=9)
+        assert estimator.init(refresh_n=refresh_n)
         refreshes.append(estimator.run(u[:samples], y[:samples]).counters["refreshes"])
     assert refreshes == [0, 1]
 

@@ -15,7 +15,7 @@ import pytest
 from emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
 from harness import config
 from harness.calibration.fit import Stock, calibrate
-from harness.calibration.model import _taken_late
+from harness.calibration.model import Model, _taken_late
 from harness.calibration.plan import check_scenario, scenarios
 from harness.calibration.recordings import (
     DISPLACEMENT,
@@ -30,9 +30,10 @@ from harness.calibration.recordings import (
 from harness.cli import main
 from harness.errors import ConfigurationError, RigError
 from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
+from harness.rigs.emulator import ComputerDescription, EmulatorRig
 from harness.rigs.rig import Block, Hindsight, Performance
 from harness.run import Channel
+from harness.scenario import PlantChoice
 from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
 
 LSB_V = 20.0 / 4096
@@ -55,6 +56,7 @@ def test_the_twin_of_a_drawn_rig_follows_it_and_its_errors_cover_what_was_drawn(
     for scenario in (thesis_profile(rig.program), check_scenario(rig.program)):
         assert rms_lsb(rig, found.twin, scenario) < 0.5
     drawn_values = truth(rig)
+    assert found.chi_square < found.freedom + 5.0 * math.sqrt(2.0 * found.freedom)
     deviations = [(each.value - drawn_values[each.name]) / each.standard_error for each in found.estimates]
     assert max(map(abs, deviations)) < 4.5
     assert sum(deviation**2 for deviation in deviations) < 3 * len(deviations)
@@ -118,6 +120,29 @@ def test_the_displacement_taken_late_is_that_of_a_card_with_that_skew() -> None:
     expected = np.concatenate(list(acquired(fast, card, wave, 300, rng=np.random.default_rng(1))))[:, DISPLACEMENT]
     taken = _taken_late(SuspensionComputer("front"), wave, 300, 0.25)
     np.testing.assert_allclose(taken[100:], expected[100:], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pot", "elsewhere"),
+    [
+        (0, PlantChoice("front", 115.0 / 1.001, 3021.0, 24500.0)),
+        (1, PlantChoice("front", 115.0, 3021.0 * 1.001, 24500.0)),
+        (2, PlantChoice("front", 115.0, 3021.0, 24500.0 * 1.001)),
+    ],
+    ids="MBK",
+)
+def test_a_pot_that_misses_its_setting_is_a_pot_set_elsewhere(pot: int, elsewhere: PlantChoice) -> None:
+    """By a thousandth of its coefficient, which is 1 / M, B and K; seen, and told to a hundredth of that."""
+    there = made(np.zeros(1400))
+    other = dataclasses.replace(there, scenario=dataclasses.replace(there.scenario, plant=elsewhere))
+    model = Model([there, other], ComputerDescription(), 1.0)
+    at_rest = np.zeros(len(model.known_to))
+    missed = at_rest.copy()
+    missed[len(model.unknowns) + pot] = 1e-3
+    expected = model.codes(at_rest, other)
+    moved = expected - model.codes(at_rest, there)
+    assert np.abs(moved).max() > 0.1
+    np.testing.assert_allclose(model.codes(missed, there), expected, rtol=0, atol=0.01 * np.abs(moved).max())
 
 
 # ---- what is nobody's twin

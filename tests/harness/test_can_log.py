@@ -82,6 +82,14 @@ def nth(frames: Sequence[can.Message], name: str, n: int) -> int:
     return [i for i, frame in enumerate(frames) if frame.arbitration_id == identifier(name)][n]
 
 
+def contradicting(frame: can.Message, *, later: int = 0) -> can.Message:
+    """It says something else of the same thing, with a sequence number that is so much later."""
+    other = copy.copy(frame)
+    seq, *between, changed, last = frame.data
+    other.data = bytearray(((seq + later) % 256, *between, changed ^ 1, last))
+    return other
+
+
 def without(frames: list[can.Message], *places: int) -> list[can.Message]:
     return [frame for i, frame in enumerate(frames) if i not in places]
 
@@ -139,14 +147,16 @@ from pathlib import Path
 from harness.links.python_can import can
 from harness.can_log import CanLog, CapturedFrames
 frame = can.Message(arbitration_id=0x18, is_extended_id=False, data=b"12345678", is_rx=False)
+def is_there():
+    return not {"asammdf", "pandas"}.isdisjoint(sys.modules)
 for suffix in ("log", "mf4"):
-    print("asammdf" in sys.modules)
+    print(is_there())
     log = CanLog(Path(sys.argv[1], f"can.{suffix}"))
     log.begin()
     log(frame)
     log.close()
 with can.LogReader(log.path) as users:
-    print(*(bytes(each.data) for each in [*CapturedFrames(log.path), *users]), "asammdf" in sys.modules)
+    print(*(bytes(each.data) for each in [*CapturedFrames(log.path), *users]), is_there())
 """
     assert ran("-c", told, str(tmp_path)).splitlines() == ["False", "False", "b'12345678' b'12345678' True"]
 
@@ -353,8 +363,7 @@ def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconc
 ) -> None:
     frames = list(traffic[1])
     at = nth(frames, name, 0)
-    other = copy.copy(frames[at])
-    other.data = other.data[:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
+    other = contradicting(frames[at])
     twice = written(tmp_path / "twice.log", [*frames[:at], frames[at], *frames[at:]])
     assert judge(captured(twice)).outcome == "passed"
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]])))
@@ -368,10 +377,7 @@ def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
 ) -> None:
     frames = list(traffic[1])
     at = nth(frames, name, 40)
-    other = copy.copy(frames[at])
-    other.data = (
-        bytearray(((other.data[0] + 50) % 256,)) + other.data[1:-2] + bytes((other.data[-2] ^ 1, other.data[-1]))
-    )
+    other = contradicting(frames[at], later=50)
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].endswith("twice, and not the same")

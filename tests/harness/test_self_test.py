@@ -227,8 +227,17 @@ def test_an_inverted_signal_on_a_range_of_one_sign_is_off_scale() -> None:
     assert wrong(rig) == ["clipping of displacement"]
 
 
-def test_swapped_leads_of_an_overdamped_machine_are_found() -> None:
-    assert wrong(Altered(emulated(), swapped), "shock") == ["identity"]
+def test_swapped_leads_are_told_from_one_signal_on_both() -> None:
+    def both(codes: Codes) -> Codes:
+        return codes[:, [0, 0, 2, 3]]
+
+    found = {}
+    for alter in (swapped, both):
+        (check,) = self_test(Altered(emulated(), alter), 1, "shock").having("wrong")
+        assert check.title == "identity"
+        found[alter] = check.advice
+    assert "swapped" in found[swapped]
+    assert "wrong jack" in found[both]
 
 
 def test_several_faults_are_all_found() -> None:
@@ -489,6 +498,16 @@ def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.
     rig = described(tmp_path, "stuck_low = 4095")
     assert main(["doctor", "--rig", rig]) == 3
     assert capsys.readouterr().err.startswith("analogrig: INCONCLUSIVE: the self-test could not be made: no signal on")
+
+
+def test_doctor_that_cannot_tell_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At 100 kHz a tenth of a sample is 1 us, and the computer's own amplifiers are known to half of one."""
+    path = tmp_path / "fast.toml"
+    path.write_text(RIG_FILE.format(faults="").replace("noise_lsb", "rate_hz = 100000.0\nnoise_lsb", 1))
+    assert main(["doctor", "--rig", str(path)]) == 3
+    said = capsys.readouterr().out
+    assert said.startswith("self-test of fast, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.017" in said
 
 
 def test_doctor_of_no_rig_is_a_matter_of_usage(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,8 @@ from emulator.suspension import SuspensionComputer
 from harness.instrument.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
 from harness.instrument.description import InstrumentDescription
 from harness.instrument.inputs import InputFaults
-from harness.instrument.red_pitaya import MOST_SCHEDULED
-from harness.instrument.scpi import DropOut
+from harness.instrument.red_pitaya import MOST_SCHEDULED, RedPitaya
+from harness.instrument.scpi import DropOut, Interpreter
 from harness.instrument.table import Booster, Stage, Wiring
 from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
@@ -82,7 +82,9 @@ def test_ascii_and_binary_raw_and_volts_are_the_same_record() -> None:
         assert answer[:7] == b"#532768" and len(answer) == 7 + 32768 + 2
         codes = np.frombuffer(answer[7:-2], ">i2")
         assert np.array_equal(np.float32(codes * LSB_V), floats)
-        say(asking(speaking), ["ACQ:DATA:FORMAT ASCII"])
+        say(asking(speaking), ["ACQ:DATA:BYTE:ORDER LEND"])
+        assert np.array_equal(np.frombuffer(binary("RAW", channel)[7:-2], "<i2"), codes)
+        say(asking(speaking), ["ACQ:DATA:BYTE:ORDER BEND", "ACQ:DATA:FORMAT ASCII"])
         assert np.array_equal(numbers(asking(speaking)(f"ACQ:SOUR{channel}:DATA?")), codes)
 
 
@@ -90,6 +92,8 @@ def test_part_of_a_record_can_be_asked_for(ask: Ask) -> None:
     say(ask, SEQUENCE)
     whole = record(ask)
     assert np.array_equal(numbers(ask("ACQ:SOUR2:DATA:STA:N? 16000,384")), whole[16000:, 1])
+    assert np.array_equal(numbers(ask("ACQ:SOUR2:DATA:LATest:N? 100")), whole[-100:, 1])
+    assert np.array_equal(numbers(ask("ACQ:SOUR1:DATA:Old:N? 100")), whole[:100, 0])
     assert ask("ACQ:SOUR2:DATA:STArt:N? 16000,385") == "" and error(ask) == -222
 
 
@@ -223,6 +227,11 @@ def test_an_output_that_is_off_drives_nothing(ask: Ask) -> None:
 def test_settings_of_a_generator_that_runs_take_effect(ask: Ask) -> None:
     say(ask, [*SEQUENCE, "SOUR1:VOLT 0.25", "ACQ:START", "ACQ:TRig NOW"])
     assert sorted(set(np.round(record(ask)[100:, 0], 1))) == [2.5, 7.5]
+
+
+def test_volts_and_hertz_may_have_a_suffix(ask: Ask) -> None:
+    say(ask, ["SOUR1:VOLT 250 mV", "SOUR1:FREQ:FIX 0.2 kHz", "ACQ:TRig:LEV 125 mV"])
+    assert (ask("SOUR1:VOLT?"), ask("SOUR1:FREQ?"), ask("ACQ:TRig:LEV?")) == ("0.25", "200", "0.125")
 
 
 @pytest.mark.parametrize("line", ["SOUR1:VOLT 0.6", "SOUR1:VOLT:OFFS -0.6"])
@@ -404,3 +413,33 @@ def test_an_instrument_drops_out_once_with_half_of_the_first_answer(drop_out: st
         next(parts)
     assert raised.value.hangs_up is (drop_out == "hang up")
     assert np.array_equal(record(ask), whole)
+
+
+# ---- in real time
+
+
+class Hands:
+    """A clock that goes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_record_in_real_time_is_full_when_its_time_is_over_and_a_pot_turns_where_it_was_turned() -> None:
+    hands = Hands()
+    instrument = RedPitaya(front, np.random.default_rng(0), clock=hands)
+    ask = asking(Interpreter(instrument.commands))
+    say(ask, POINT_SAMPLES)
+    assert ask("ACQ:TRig:STAT?") == "TD"
+    assert ask("ACQ:TRig:FILL?") == "0"
+    hands.now_s = 2000.5 / RATE_HZ
+    say(ask, ["POT3:DIAL 0.6"])
+    hands.now_s = (BUFFER_N - 1.5) / RATE_HZ
+    assert ask("ACQ:TRig:FILL?") == "0"
+    hands.now_s = (BUFFER_N + 0.5) / RATE_HZ
+    assert ask("ACQ:TRig:FILL?") == "1"
+    looks = played(tweaks=((8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
+    assert np.abs(record(ask) - looks[::8]).max() < ROUNDED_V

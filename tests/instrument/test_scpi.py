@@ -7,6 +7,7 @@ import pytest
 from harness.instrument.scpi import (
     MOST_ARGUMENTS,
     MOST_ERRORS,
+    VOLTS,
     Broken,
     Call,
     Command,
@@ -30,6 +31,7 @@ class Lamp:
             "*IDN?": (0, lambda _: "maker,lamp,0,1"),
             "LAMP:LEVel[:IMMediate]": (1, self._set),
             "LAMP:LEVel[:IMMediate]?": (0, lambda _: f"{self.level:g}"),
+            "LAMP:SUPPly": (1, lambda call: self._raise(f"{call.number(0, 0.0, 1.0, VOLTS):g} V")),
             "LAMP:COLour?": (0, lambda _: "red"),
             "LAMP:BULB#:AGE?": (0, lambda call: str(call.numbers[0])),
             "LAMP:STEPs": (1, lambda call: self._raise(call.whole(0, 0, 9))),
@@ -105,6 +107,8 @@ def test_a_header_behind_a_semicolon_goes_on_where_the_one_before_it_left_off(la
         ("LAMP:LEV 1,2", -108),
         ("LAMP:COL? 1", -108),
         ("LAMP:LEV " + ",".join("1" * (MOST_ARGUMENTS + 1)), -108),
+        ("LAMP:LEV 1 V", -138),
+        ("LAMP:SUPPly 1 A", -131),
         ("LAMP:STEP 1.5", -104),
         ("LAMP:STEP 3", -221),
         ("LAMP:MODE dusk", -224),
@@ -143,6 +147,22 @@ def test_errors_are_told_in_their_order_and_an_overflow_takes_the_last_place(lam
     assert ask(lamp, "SYST:ERR:COUN?") == b"%d\r\n" % MOST_ERRORS
     told = [error(lamp) for _ in range(MOST_ERRORS + 1)]
     assert told == [-109, *[-113] * (MOST_ERRORS - 2), -350, 0]
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"), [("0.25", "0.25"), ("250mV", "0.25"), ("250 MV", "0.25"), (".25 v", "0.25")]
+)
+def test_a_suffix_multiplies_its_number(lamp: Interpreter, said: str, meant: str) -> None:
+    """IEEE 488.2, 7.7.3."""
+    ask(lamp, f"LAMP:SUPP {said}")
+    assert f"it has no {meant} V".encode() in ask(lamp, "SYST:ERR?")
+
+
+def test_the_status_byte_says_whether_there_are_errors(lamp: Interpreter) -> None:
+    """SCPI 1999, 9: bit 2."""
+    assert ask(lamp, "*STB?") == b"0\r\n"
+    ask(lamp, "FOO")
+    assert ask(lamp, "*STB?;SYST:ERR?;*STB?") == b'4;-113,"Undefined header;FOO";0\r\n'
 
 
 def test_cls_forgets_the_errors(lamp: Interpreter) -> None:

@@ -15,12 +15,13 @@ import pyvisa
 
 from emulator.excitation import Excitation
 from harness.cli import main
+from harness.instrument.scpi import Interpreter
 from harness.instrument.served import ServedDescription
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
 from tests.instrument.serving import LONG_S, Served, ended, serving
-from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, front
+from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
 
 LSB_V = 40.0 / 2**14
 
@@ -82,6 +83,18 @@ def test_the_served_computer_has_the_components_that_the_rig_draws_from_the_seed
     laid = [described.laid(plant, seed)._table._computer.circuit for seed in (1, 2)]
     assert [circuit.elements for circuit in laid] == [circuit.elements for circuit in emulated]
     assert laid[0].elements != laid[1].elements
+
+
+def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> None:
+    description = ServedDescription.load("emulator-ideal", ["inputs.noise_v=[0.01,0.01]"])
+
+    def noisy(seed: int) -> np.ndarray:
+        ask = asking(Interpreter(description.laid("front", seed).commands))
+        say(ask, SEQUENCE)
+        return record(ask)
+
+    assert np.array_equal(noisy(1), noisy(1))
+    assert not np.array_equal(noisy(1), noisy(2))
 
 
 def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named() -> None:

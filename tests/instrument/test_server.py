@@ -169,6 +169,17 @@ def test_a_server_that_is_closed_leaves_the_bench_safe() -> None:
     in_time(course)
 
 
+def test_a_server_that_is_closed_leaves_a_bench_safe_that_was_live_before_it_served() -> None:
+    async def course() -> None:
+        counter = Counter()
+        counter.live = True
+        async with bench(counter):
+            assert counter.live
+        assert not counter.live
+
+    in_time(course)
+
+
 # ---- drop-outs
 
 

@@ -26,10 +26,10 @@ from tests.harness.firmware import needs_firmware
 
 pytestmark = pytest.mark.timeout(300)
 
-LONG = "rarer_than or of_all_kinds or faults_of_the_line"
+LONG = "rarer_than or of_all_kinds or stay_rare or noticed_soon or faults_of_the_line"
 """Those for which a line is too slow; its faults are tried apart, with short time-outs."""
 
-FIRMWARE = "found_once or raises_no_alarm or come_to_the_truth or warm_up or answers_with_numbers"
+FIRMWARE = "found_once or come_to_the_truth or warm_up or answers_with_numbers"
 """Those of short plays: QEMU takes 1500 samples a second."""
 
 DIFFERING, MISS = 7e-4, 1e-3
@@ -54,7 +54,7 @@ def test_device_in_this_process_has_every_property(tmp_path: Path) -> None:
 
 
 def test_device_program_has_every_property_that_a_line_has_time_for(tmp_path: Path) -> None:
-    assert "11 passed" in run(tmp_path, "host?exchange=block", "-k", f"not ({LONG})")
+    assert "10 passed" in run(tmp_path, "host?exchange=block", "-k", f"not ({LONG})")
 
 
 def test_faults_of_the_line_to_the_device_program_do_no_harm(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_faults_of_the_line_to_the_device_program_do_no_harm(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("core", [pytest.param("m4", marks=needs_firmware)])
 def test_firmware_has_those_of_short_plays(core: str, tmp_path: Path) -> None:
-    assert "5 passed" in run(tmp_path, f"qemu-{core}?exchange=stream", "-k", FIRMWARE)
+    assert "4 passed" in run(tmp_path, f"qemu-{core}?exchange=stream", "-k", FIRMWARE)
 
 
 @pytest.mark.parametrize("dut", ["host?exchange=block", pytest.param("qemu-m4?exchange=stream", marks=needs_firmware)])
