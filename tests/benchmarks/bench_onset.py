@@ -19,7 +19,7 @@ from tests.harness.onsets import Clock, Trial, still
 
 from .figure import Figure
 
-JUMPS_N, RAMPS_N, STILL_N = 500, 200, 200
+JUMPS_N, RAMPS_N, STILL_N = 500, 100, 100
 CLOCKS: tuple[Clock, ...] = ("card", "free")
 
 
