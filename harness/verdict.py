@@ -310,7 +310,7 @@ def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outc
     """Outcome of a valid run, and why it is not ``passed``."""
     tweaks = _with_others(judged)
     unseen = [f"{tweak.what} at {tweak.sample} is not judged: {tweak.unseen}" for tweak in tweaks if tweak.unseen]
-    if all(each.failures for each in judged):
+    if _surely_failed(judged, expect):
         return "failed", [*judged[0].failures, *unseen]
     undecided = [_doubt(tweak) for tweak in tweaks if tweak.result == "undecided"]
     counts = sorted(len(each.false_alarms) for each in judged)
@@ -321,6 +321,14 @@ def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outc
         )
     doubts = undecided if any(each.failures for each in judged) else []  # which then are some
     return ("inconclusive" if doubts or unseen else "passed"), [*doubts, *unseen]
+
+
+def _surely_failed(judged: Sequence[_Judgement], expect: Expectations) -> bool:
+    """Whether the same is wrong at every instant: one that is late for some and missed for others may be neither."""
+    instants = list(zip(*(each.tweaks for each in judged), strict=True))
+    missed = sum(all(tweak.missed and not tweak.unseen for tweak in each) for each in instants)
+    late = any(all(tweak.late and not tweak.unseen for tweak in each) for each in instants)
+    return late or missed > expect.missed or min(len(each.false_alarms) for each in judged) > expect.false_alarms
 
 
 def _doubt(tweak: TweakVerdict) -> str:

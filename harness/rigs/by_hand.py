@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -94,7 +95,11 @@ class ByHand:
             within = range(min(earliest, search.start), max(int(min(following, len(record))), search.stop))
             segment = _dated(record, tweak, search, within, slow=self._pots.slow)
             earliest = (segment.end_high or segment.start_high or search.stop) + 1
-            out.append(_moved(segment, first))
+            moved = _moved(segment, first)
+            if out and moved.start <= out[-1].start:  # both when the record was over
+                out[-1] = dataclasses.replace(out[-1], plant=moved.plant)
+            else:
+                out.append(moved)
         return out
 
 

@@ -28,7 +28,7 @@ from harness.rigs.by_hand import ByHand, Tweak, doubts
 from harness.rigs.emulator import Stream, emulator_errors, settings_of
 from harness.rigs.instrument import Instrument, Recorded, Turn, driver
 from harness.rigs.lock import Lock
-from harness.rigs.pots import Pots, PotsDescription
+from harness.rigs.pots import NoPots, Pots, PotsDescription
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
 from harness.run import CHANNELS, Channel, Segment
 from harness.scenario import Scenario
@@ -229,13 +229,13 @@ def check_wiring(description: RealDescription, instrument: type[Instrument] | In
 class RealRig:
     """A description and the instrument that it names; nothing is sent before the first block is asked for."""
 
-    capabilities = frozenset({"tweak", "excite"})
-
     def __init__(self, description: RealDescription, connect: Callable[[str, float], Instrument] | None = None) -> None:
         """``connect`` opens the instrument of a URL with a time-out; by default the driver of its scheme.
 
         :raises ConfigurationError: the description contradicts itself, or the instrument.
         """
+        turned = set() if isinstance(description.pots, NoPots) else {"tweak"}
+        self.capabilities = frozenset({"excite", *turned})
         self._kind = driver(description.instrument)
         check_wiring(description, self._kind)
         self._description = description
@@ -296,6 +296,8 @@ class RealRig:
         plant = scenario.plant.plant()
         for i, tweak in enumerate(scenario.tweaks):
             place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
+            if "tweak" not in self.capabilities:
+                raise ConfigurationError(f'{place}nobody turns the pots of this rig: its pots have kind = "none"')
             if tweak.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):

@@ -125,3 +125,10 @@ def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
     assert asked(0, {"B": 0.5, "K": 0.6}, FRONT, after).middle == FRONT.scaled("B", 0.7)
     assert asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).middle is None
     assert np.isclose(asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).after.stiffness_n_per_m, 18375.0)
+
+
+def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> None:
+    soft, light = FRONT.scaled("K", 0.7), FRONT.scaled("K", 0.7).scaled("M", 0.5)
+    tweaks = [asked(1300, {"K": 0.6}, FRONT, soft), asked(1500, {"M": 0.5}, soft, light)]
+    (segment,) = turned(tweaks, takes_s=0.01).dated(taken(1100), first=0)
+    assert (segment.plant, bool(segment.unseen)) == (light, True)

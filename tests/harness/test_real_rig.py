@@ -449,3 +449,18 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
         )
     assert result.returncode == 0, result.stdout[-3000:]
     assert "11 passed, 2 skipped" in result.stdout
+
+
+def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Path) -> None:
+    name = described(tmp_path, lambda text: text.replace('pots.kind = "instrument"', 'pots.kind = "none"'))
+    with open_rig(name) as rig:
+        assert "tweak" not in rig.capabilities
+        with pytest.raises(ConfigurationError, match=r"tweaks\[0\] at sample 1200: nobody turns the pots"):
+            rig.perform(THESIS, 1)
+
+
+def test_rig_of_which_something_could_not_be_measured_is_not_judged_on(tmp_path: Path) -> None:
+    with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.009]") as instrument:
+        verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons[0].startswith("the rig's self-test: ")

@@ -91,6 +91,15 @@ def test_alarm_between_earliest_and_latest_instant_is_false_or_the_detection() -
     assert verdict.tweaks[0].result == "undecided"
 
 
+def test_alarm_that_is_late_for_one_instant_and_false_for_another_may_be_in_time_for_a_third() -> None:
+    change = between(390, 403, 442)
+    verdict = judge(learned(change, alarms=[425], force_n=SWITCHED))
+    assert verdict.tweaks[0].result == "undecided"
+    assert verdict.outcome == "inconclusive"
+    exact = judge(learned(Segment(415, SOFT), alarms=[425], force_n=SWITCHED))
+    assert exact.outcome == "passed"
+
+
 def test_of_two_alarms_after_the_earliest_instant_one_is_false_whichever() -> None:
     verdict = judge(learned(between(380, 400, 402), alarms=[390, 404]))
     assert verdict.outcome == "failed"
