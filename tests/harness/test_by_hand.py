@@ -129,6 +129,6 @@ def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
 
 def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> None:
     soft, light = FRONT.scaled("K", 0.7), FRONT.scaled("K", 0.7).scaled("M", 0.5)
-    tweaks = [asked(1300, {"K": 0.6}, FRONT, soft), asked(1500, {"M": 0.5}, soft, light)]
+    tweaks = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
     (segment,) = turned(tweaks, takes_s=0.01).dated(taken(1100), first=0)
     assert (segment.plant, bool(segment.unseen)) == (light, True)
