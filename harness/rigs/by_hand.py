@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from harness.links.wire import Clock
-from harness.onset import NoOnset, onset
+from harness.onset.jump import NoOnset, onset
+from harness.onset.turn import Turn, turn
+from harness.onset.two_filter import Record
 from harness.plant import AT_REST, Plant, SampledPlant
 from harness.rigs.pots import Pots
 from harness.run import Segment
-from harness.turn import Turn, turn
-from harness.two_filter import Record
 
 BEFORE_S, AFTER_S = 0.02, 0.05
 """Machine time by which a record may have begun later than it was asked to, and a pot move after whoever turned it said

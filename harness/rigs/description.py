@@ -10,9 +10,10 @@ from typing import Any
 from harness import config
 from harness.errors import ConfigurationError
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors
-from harness.rigs.real import RealDescription, RealRig
+from harness.rigs.real import RealRig
 from harness.rigs.recording import RecordingRig
 from harness.rigs.rig import Rig
+from harness.rigs.wiring import RealDescription
 
 DEFAULT_RIG = "emulator"
 """When neither the user nor the scenario says another."""

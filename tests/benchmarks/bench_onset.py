@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from harness.onset import NoOnset, Onset
+from harness.onset.jump import NoOnset, Onset
+from harness.onset.turn import Turn
 from harness.statistics import lower_rate
-from harness.turn import Turn
 from tests.harness.onsets import Clock, Trial, still
 
 from .figure import Figure

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from emulator import Excitation
 from harness import config, information
-from harness.onset import NoOnset, Onset, onset
+from harness.onset.jump import NoOnset, Onset, onset
+from harness.onset.turn import Turn, turn
+from harness.onset.two_filter import Record
 from harness.plant import PARAMETERS, Plant, SampledPlant
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.scenario import PLANTS, Scenario, Tweak
-from harness.turn import Turn, turn
-from harness.two_filter import Record
 
 FRONT = PLANTS["front"]
 

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from harness.links.wire import VirtualClock
+from harness.onset.two_filter import Record
 from harness.plant import Plant
 from harness.rigs.by_hand import ByHand, Tweak
 from harness.scenario import Tweak as PlayedTweak
-from harness.two_filter import Record
 from tests.harness.onsets import FRONT, played, scenario_of
 
 RATE_HZ = 20e3

@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator import COMPONENTS, Excitation, SuspensionComputer
-from harness.onset import NoOnset, Onset, colour, interval, onset
+from harness.onset.jump import NoOnset, Onset, colour, interval, onset
+from harness.onset.turn import Turn, turn
+from harness.onset.two_filter import ANYWHERE, Backwards, Columns, Edges, Forwards, Model, Record, joined
 from harness.plant import Plant, SampledPlant
-from harness.turn import Turn, turn
-from harness.two_filter import ANYWHERE, Backwards, Columns, Edges, Forwards, Model, Record, joined
 from tests.harness.onsets import FRONT, Trial, played, scenario_of, still
 
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01

@@ -17,7 +17,8 @@ from harness.bench import Bench
 from harness.dut import open_dut
 from harness.rigs.instrument import Recorded, Turn
 from harness.rigs.ni_daqmx import NiDaqmx
-from harness.rigs.real import RealDescription, RealRig
+from harness.rigs.real import RealRig
+from harness.rigs.wiring import RealDescription
 from harness.run import Run
 from harness.scenario import Scenario
 from harness.scenario import Tweak as Asked

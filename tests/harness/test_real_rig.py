@@ -25,9 +25,10 @@ from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigE
 from harness.rigs.description import described as described_rig
 from harness.rigs.description import open_rig
 from harness.rigs.instrument import Recorded, Turn
-from harness.rigs.real import LEAD_N, RealDescription, RealRig, records
+from harness.rigs.real import LEAD_N, RealRig, records
 from harness.rigs.red_pitaya import RedPitaya
 from harness.rigs.rig import Performance
+from harness.rigs.wiring import RealDescription
 from harness.run import Run
 from harness.scenario import PlantChoice, Scenario, Tweak
 from harness.verdict import judge

@@ -1,6 +1,6 @@
 """A pot that a hand turns, slowly: when it began to turn and when it stood, learned from the samples.
 
-As ``harness.onset``, but that between the two instants the plant is on its way. How a hand goes nobody knows: it may
+As ``jump``, but that between the two instants the plant is on its way. How a hand goes nobody knows: it may
 turn evenly, or begin and end gently (least jerk; Flash and Hogan 1985). Both are tried, and the intervals are those of
 whatever the samples do not refuse. Two pots that jump one after the other are such a turn too, with a plant between
 them that is known. The plants at both ends are those that the samples before and after the range tell.
@@ -15,9 +15,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.onset import CONFIDENCE, Guess, NoOnset, Onset, Problem, beside, doubt, interval
+from harness.onset.jump import CONFIDENCE, Guess, NoOnset, Onset, Problem, beside, doubt, interval
+from harness.onset.two_filter import Array, Backwards, Edges, Forwards, Model, Record, joined
 from harness.plant import PARAMETERS, Plant
-from harness.two_filter import Array, Backwards, Edges, Forwards, Model, Record, joined
 
 Indices = NDArray[np.int64]
 

@@ -2,8 +2,8 @@
 
 Where an operator sets the pots, or a command that takes its time, nobody knows the sample at which the plant changed.
 The samples tell: the plant as it was explains those up to the instant, the plant as it then is those after it
-(``harness.two_filter``). What else is not known is estimated with it: M, B, K before and after, since a real rig is
-some per cent beside its nominal values, the offsets of both channels, and where in a sample period the edges of the
+(``harness.onset.two_filter``). What else is not known is estimated with it: M, B, K before and after, since a real rig
+is some per cent beside its nominal values, the offsets of both channels, and where in a sample period the edges of the
 force come.
 
 The interval holds every instant that the likelihood ratio does not refuse, and the asked part of the likelihood over
@@ -23,8 +23,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.onset.two_filter import ANYWHERE, Array, Backwards, Columns, Edges, Forwards, Model, Record, joined, scan
 from harness.plant import PARAMETERS, Plant
-from harness.two_filter import ANYWHERE, Array, Backwards, Columns, Edges, Forwards, Model, Record, joined, scan
 
 CONFIDENCE = 0.95
 
