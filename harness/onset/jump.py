@@ -98,6 +98,8 @@ class NoOnset:
     """Nothing in the samples can be called the instant of the change."""
 
     reason: str
+    unchanged: bool = False
+    """The plant does not seem to have changed at all."""
 
 
 def onset(
@@ -124,8 +126,8 @@ def onset(
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
         guess, profile = min((guess, profile), other, key=lambda each: float(each[1].cost.min()))
     cost = profile.cost / doubt(guess, profile.unexplained)
-    reason = problem.objection(float(profile.cost.min()), profile.unexplained, guess) or problem.beyond(cost)
-    return NoOnset(reason) if reason else interval(cost, np.arange(search.start, search.stop), confidence)
+    objection = problem.objection(float(profile.cost.min()), profile.unexplained, guess) or problem.beyond(cost)
+    return objection or interval(cost, np.arange(search.start, search.stop), confidence)
 
 
 def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Onset:
@@ -330,10 +332,10 @@ class Problem:
                 break
         return guess, profile
 
-    def objection(self, cost: float, unexplained: float, guess: Guess) -> str:
-        """Why the likeliest instant, of that cost, is none; empty if it is one."""
+    def objection(self, cost: float, unexplained: float, guess: Guess) -> NoOnset | None:
+        """Why the likeliest instant, of that cost, is none; None if it is one."""
         if unexplained > _MOST_UNEXPLAINED or self.left > _MOST_LEFT:
-            return (
+            return NoOnset(
                 f"what a plant that changes once leaves of the samples has {unexplained * self.left:.3g} times the"
                 " variance of their noise"
             )
@@ -341,16 +343,16 @@ class Problem:
         _, none, _ = _settled(self.record, self.before, guess, known, rounds=1)
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if none - cost < chance * doubt(guess, unexplained):
-            return f"nothing in the samples {self._searched} shows that the plant has changed"
-        return ""
+            return NoOnset(f"nothing in the samples {self._searched} shows that the plant has changed", unchanged=True)
+        return None
 
-    def beyond(self, cost: Array) -> str:
+    def beyond(self, cost: Array) -> NoOnset | None:
         """Why the likeliest of the instants that have these costs is none: towards an end of the range they fall."""
         best = int(cost.argmin())
         inwards = {0: 1, len(cost) - 1: len(cost) - 2}.get(best)
         if inwards is not None and len(cost) > 1 and cost[inwards] - cost[best] > _RISING:
-            return f"the plant seems to have changed before or after the samples {self._searched}"
-        return ""
+            return NoOnset(f"the plant seems to have changed before or after the samples {self._searched}")
+        return None
 
     @property
     def _searched(self) -> str:

@@ -79,8 +79,8 @@ def turn(
     best = every[0]
     at = int(best.cost.argmin())
     unexplained = float(best.fit[at]) / max(1, int(problem.record.valid.sum()))
-    if reason := problem.objection(float(best.cost[at]), unexplained, guess):
-        return NoOnset(reason)
+    if objection := problem.objection(float(best.cost[at]), unexplained, guess):
+        return objection
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
         return NoOnset(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
     doubted = doubt(guess, max(unexplained, float(best.on_the_way[at])))

@@ -133,13 +133,13 @@ def doubts(record: Record, tweaks: Sequence[Tweak], first: int) -> list[str]:
     out = []
     starts = [tweak.sample for tweak in tweaks]
     for tweak, before, after in zip(tweaks, [0, *starts], [*starts[1:], len(record)], strict=False):
-        search = range(max(tweak.sample - _BESIDE_N, before + 1), min(tweak.sample + _BESIDE_N, after - 1))
+        search = range(max(tweak.sample - _BESIDE_N, before + 2), min(tweak.sample + _BESIDE_N, after - 1))
         if len(search) < LEAST_SEARCH_N:
             continue
-        found = onset(record, tweak.before, tweak.after, search, within=range(before, after))
+        found = onset(record, tweak.before, tweak.after, search, within=range(before + 1, after))
         where = f"the pot that was to be turned at sample {first + tweak.sample} ({tweak.words})"
         if isinstance(found, NoOnset):
-            if _is_plain(record, tweak, range(tweak.sample, after)):
+            if found.unchanged and _is_plain(record, tweak, range(tweak.sample, after)):
                 out.append(f"{where}: {found.reason}")
         elif not found.low - 1 <= tweak.sample <= found.high + 1:
             span = f"{first + found.low} to {first + found.high}"

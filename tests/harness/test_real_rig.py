@@ -433,6 +433,7 @@ def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) 
 # ---- the shipped tests
 
 
+@pytest.mark.timeout(600)
 def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
     with served() as instrument:
         environment = {**os.environ, "ANALOGRIG_RIGS": str(instrument.rigs_file(tmp_path))}
@@ -449,7 +450,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
             check=False,
         )
     assert result.returncode == 0, result.stdout[-3000:]
-    assert "11 passed, 2 skipped" in result.stdout
+    assert "12 passed, 3 skipped" in result.stdout  # what takes a million samples, and faults of a line that is none
 
 
 def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Path) -> None:
