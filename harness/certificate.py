@@ -82,6 +82,15 @@ class Question:
             raise ValueError(f"allowed must be 0 to 1000, not {self.allowed}")
         if self.rare and not LEAST_FOR_MEAN <= self.rare <= MOST_ESTIMATES:
             raise ValueError(f"rare must be {LEAST_FOR_MEAN} to {MOST_ESTIMATES} estimates, not {self.rare}")
+        estimator = self.device["estimator"]
+        if estimator["trigger"] == "none":
+            raise ValueError("the device has no trigger: it raises no alarm, whatever comes")
+        drifts = self.scenario["excitation"].get("clock") == "free" and estimator["edge_instants"] != "anywhere"
+        if self.rare and drifts:
+            raise ValueError(
+                "of a generator on a clock of its own some instants of its edges are rare, and they are not drawn: wait"
+                ' for alarms, or set the device to edge_instants = "anywhere"'
+            )
         if self.rare and self.sequential:
             raise ValueError("a rare rate is estimated, or alarms are waited for by a sequential test")
         if self.scenario.get("tweaks"):

@@ -11,6 +11,7 @@ probabilities of all quantities are adjusted together (Holm 1979), so that the c
 from __future__ import annotations
 
 import itertools
+import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -123,7 +124,8 @@ def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0
 def _recorded(path: Path) -> Observation:
     run = Run.load(path)
     of = run.conditions
-    return (str(of.scenario["name"]), str(of.rig["name"]), of.seed), row(run, judge(run))
+    played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
+    return (played, str(of.rig["name"]), of.seed), row(run, judge(run))
 
 
 def _latencies(trial: Row, other: Row | None) -> list[float]:

@@ -10,20 +10,23 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from harness import config
-from harness.devices import DeviceDescription, describe, from_table
+from harness.devices import DeviceDescription, InprocDevice, describe, from_table
 from harness.errors import ConfigurationError
+from harness.links.wire import LIBRARY
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.rigs.recording import RecordingRig
 from harness.rigs.rig import Rig
-from harness.scenario import Scenario, Tweak
+from harness.scenario import MAX_SAMPLES, Scenario, Tweak
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
@@ -129,6 +132,8 @@ class CampaignSpec:
     name: str = ""
 
     def __post_init__(self) -> None:
+        if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
+            raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
         for name in ("rigs", "devices"):
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):
@@ -224,7 +229,9 @@ class Plan:
 
     def digest(self) -> str:
         """SHA-256 of all that decides the results."""
-        return hashlib.sha256(self.as_json().encode()).hexdigest()
+        own = [device.library_path for device in map(device_of, self.devices) if isinstance(device, InprocDevice)]
+        built = "".join(_content(path) for path in own if path != LIBRARY)  # it may be another one by the next time
+        return hashlib.sha256((self.as_json() + built).encode()).hexdigest()
 
     def cells(self) -> list[Cell]:
         """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
@@ -267,9 +274,7 @@ class Plan:
 
     def _check(self) -> None:
         spec = self.spec
-        count = (
-            len(self.rigs) * len(self.devices) * int(np.prod([len(v) for v in spec.grid.axes().values()], dtype=int))
-        )
+        count = len(self.rigs) * len(self.devices) * math.prod(len(values) for values in spec.grid.axes().values())
         where = f"campaign {spec.name}"
         if count > MAX_CELLS or count * spec.trials > MAX_TRIALS:
             raise ConfigurationError(
@@ -300,6 +305,14 @@ def open_table(table: Mapping[str, Any]) -> Rig:
 
 def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     return from_table(table, f"device {table['name']}")
+
+
+def _content(path: Path) -> str:
+    """:raises ConfigurationError: it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror or error}") from error
 
 
 def one_worker_only(table: Mapping[str, Any]) -> str:

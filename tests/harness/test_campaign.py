@@ -25,6 +25,7 @@ from harness.cli import main
 from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
+from harness.links.wire import LIBRARY
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario, Tweak
@@ -491,3 +492,23 @@ def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.
     planned(tmp_path, "devices = ['serial:/dev/absent']\n")
     assert main(["campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "out.json")]) == 2
     assert "serial:/dev/absent is one device" in capsys.readouterr().err
+
+
+def test_another_build_of_a_library_is_another_campaign(tmp_path: Path) -> None:
+    library = tmp_path / "own.so"
+    library.write_bytes(LIBRARY.read_bytes())
+    spec = CampaignSpec(devices=(f"inproc:{library}",), trials=1, name="own")
+    before = Plan.of(spec).digest()
+    assert Plan.of(spec).digest() == before
+    library.write_bytes(LIBRARY.read_bytes() + b" ")
+    assert Plan.of(spec).digest() != before
+
+
+@pytest.mark.parametrize("text", ["samples = 0", "samples = 2000000000"])
+def test_samples_that_cannot_be_are_refused_in_one_line(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "wrong.toml"
+    file.write_text(text)
+    assert main(["campaign", str(file), "--out", str(tmp_path / "x.json")]) == 2
+    assert "samples must be 1 to" in capsys.readouterr().err

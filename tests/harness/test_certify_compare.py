@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -24,7 +25,7 @@ from harness.devices import describe
 from harness.dut import open_dut
 from harness.errors import ConfigurationError, RecordingError
 from harness.rigs.description import open_rig
-from harness.scenario import Scenario
+from harness.scenario import Scenario, Tweak
 
 # -------------------------------------------------------------------------------------------------------- certificates
 
@@ -248,12 +249,42 @@ def test_sides_without_a_seed_in_common_are_compared_as_groups() -> None:
     assert found.identical == (0, 0)
 
 
+def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_path: Path) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        for factor in (0.7, 0.9):
+            drawn = dataclasses.replace(scenario, tweaks=(Tweak(400, stiffness_n_per_m=24500.0 * factor),))
+            Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
+    assert len(dict(load(tmp_path / "both"))) == 2
+    found = compare(load(tmp_path / "both" / "0.7"), load(tmp_path / "both" / "0.9"))
+    assert found.identical == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (["--dut", "{none}"], "no trigger"),
+        (["--rare", "--scenario", "thesis-free-running"], "instants of its edges"),
+    ],
+)
+def test_what_cannot_be_certified_is_refused(
+    changes: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    none = tmp_path / "none.toml"
+    none.write_text('kind = "inproc"\n[estimator]\ntrigger = "none"\n')
+    free = tmp_path / "thesis-free-running.toml"
+    free.write_text('samples = 2000\n[excitation]\nlow_v = 0.1\nhigh_v = 9.9\nclock = "free"\ndrift_ppm = 20.0\n')
+    filled = [str(free) if each == free.stem else each.format(none=none) for each in changes]
+    assert main(["certify", "--dut", "inproc", *filled]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenario = Scenario.load("thesis")
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for seed in range(2):
             Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
-    assert [key for key, _ in load(tmp_path / "a")] == [("thesis", "emulator", 0), ("thesis", "emulator", 1)]
+    assert [(key[1], key[2]) for key, _ in load(tmp_path / "a")] == [("emulator", 0), ("emulator", 1)]
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["identical"] == [1, 1]
