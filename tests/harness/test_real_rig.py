@@ -436,7 +436,8 @@ def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) 
 @pytest.mark.timeout(600)
 def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
     with served() as instrument:
-        environment = {**os.environ, "ANALOGRIG_RIGS": str(instrument.rigs_file(tmp_path))}
+        outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}  # no worker's
+        environment = {**outside, "ANALOGRIG_RIGS": str(instrument.rigs_file(tmp_path))}
         result = subprocess.run(
             [
                 *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0"),
