@@ -12,6 +12,7 @@ import importlib
 import inspect
 import logging
 import os
+import termios
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
@@ -285,6 +286,8 @@ def _errno(error: Exception) -> int | None:
             return each.error_code
         if isinstance(each, OSError) and not isinstance(each, can.CanError):
             return each.errno or 0
+        if isinstance(each, termios.error):  # of a terminal whose other end is gone; no OSError, though it is one
+            return int(each.args[0])
     return None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import pty
+import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -260,3 +261,18 @@ def test_garbage_of_an_adapter_is_counted_and_its_end_told() -> None:
     with pytest.raises(LinkClosed, match=f"^slcan/{path}: "):
         bus.receive(1.0)
     bus.close()
+
+
+def test_terminal_whose_other_end_is_gone_while_it_is_written_to_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pyserial lets the termios.error of tcdrain() or tcflush() through, which is no OSError."""
+
+    def gone(*_: object, **__: object) -> None:
+        raise can.CanOperationError("Could not write to serial device") from termios.error(errno.EIO, "no such end")
+
+    bus = PythonCanBus({"interface": "virtual", "channel": "gone"})
+    try:
+        monkeypatch.setattr(bus._bus, "send", gone)
+        with pytest.raises(LinkClosed):
+            bus.send(can.Message(arbitration_id=1))
+    finally:
+        bus.close()
