@@ -78,6 +78,8 @@ class Comparison:
     alpha: float
     trials: tuple[int, int]
     """Valid ones of each side."""
+    inconclusive: tuple[int, int]
+    """... and those that were not: nothing is said of them."""
     identical: tuple[int, int]
     """Of so many trials that both sides played, so many (first) have the same estimates to the bit."""
 
@@ -87,7 +89,7 @@ class Comparison:
 
 
 def load(path: Path) -> list[Observation]:
-    """The trials of a results file, of a recording, or of all recordings below a folder; those that are valid.
+    """The trials of a results file, of a recording, or of all recordings below a folder; valid or not.
 
     :raises RecordingError: it cannot be read, or there is nothing valid in it.
     """
@@ -100,25 +102,29 @@ def load(path: Path) -> list[Observation]:
             for cell, rows in zip(results.plan.cells(), results.rows, strict=True)
             for each in rows
         ]
-    valid = [(key, each) for key, each in found if each["outcome"] != "inconclusive"]
-    if not valid:
+    if not _valid(found):
         raise RecordingError(f"{path}: holds no valid trial")
-    return valid
+    return found
 
 
 def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01) -> Comparison:
     """``b`` against ``a``. The same two sides give the same answer."""
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
-    ours, theirs = dict(a), dict(b)
+    ours, theirs = _valid(a), _valid(b)
     common = ours.keys() & theirs.keys()
     found = [each for quantity in QUANTITIES if (each := _difference(quantity, ours, theirs)) is not None]
     return Comparison(
         differences=_worded(found, alpha),
         alpha=alpha,
         trials=(len(ours), len(theirs)),
+        inconclusive=(len(a) - len(ours), len(b) - len(theirs)),
         identical=(sum(ours[key]["theta"] == theirs[key]["theta"] for key in common), len(common)),
     )
+
+
+def _valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
+    return {key: each for key, each in trials if each["outcome"] != "inconclusive"}
 
 
 def _recorded(path: Path) -> Observation:

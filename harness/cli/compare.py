@@ -45,13 +45,20 @@ def _run(arguments: argparse.Namespace) -> int:
     show(json.dumps(asdict(found)) if arguments.json else _text(found))
     if not found.differences:
         return complain("INCONCLUSIVE: the two sides have nothing that can be compared", INCONCLUSIVE)
+    ours, theirs = found.inconclusive
+    if theirs > ours and not found.worse:
+        return complain(
+            f"INCONCLUSIVE: {theirs} trials of B were inconclusive, {ours} of A: nothing is said of them", INCONCLUSIVE
+        )
     return FAILED if found.worse else PASSED
 
 
 def _text(found: Comparison) -> str:
     same, both = found.identical
+    ours, theirs = found.inconclusive
     lines = [
         f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; {same} of {both} in common identical to the bit",
+        *([f"inconclusive: {ours} of A, {theirs} of B"] if ours or theirs else []),
         "",
         differences_text(found),
     ]

@@ -24,7 +24,10 @@ class Lock:
         """:raises RigClosed: somebody else on this machine has it."""
         place = hashlib.sha256(url.lower().encode()).hexdigest()[:16]
         path = Path(tempfile.gettempdir()) / f"analogrig-{os.getuid()}-{place}.lock"
-        self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise RigClosed(f"instrument {url}: cannot be locked: {path}: {error.strerror or error}") from error
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

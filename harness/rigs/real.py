@@ -198,7 +198,7 @@ class RealRig:
                 lsb_v=lsb_v,
                 unit=CHANNEL_UNITS[name],
                 unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
-                noise_lsb=wired.noise_lsb,
+                noise_lsb=self._noise_lsb.get(name, wired.noise_lsb),
                 codes=math.ceil((ends_v[1] - low_v) / lsb_v),
             )
         return out

@@ -292,3 +292,21 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
     with pytest.raises(RecordingError, match="empty: holds no valid trial"):
         load(tmp_path / "empty")
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "absent.json")]) == 2
+
+
+def test_trials_that_were_inconclusive_on_one_side_alone_are_no_pass(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        for seed in range(3):
+            run = Bench(rig, dut).play(scenario, seed)
+            run.save(tmp_path / "a" / str(seed) / "run.npz")
+            faults = ("the device was reset",) if seed else ()
+            broken = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, faults=faults))
+            broken.save(tmp_path / "b" / str(seed) / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    said = capsys.readouterr()
+    assert "inconclusive: 0 of A, 2 of B" in said.out
+    assert "2 trials of B were inconclusive, 0 of A" in said.err
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a")]) == 0
