@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from harness.dut import Dut, Replies, Stretch
 from harness.errors import DeviceError, LinkError, RigError
 from harness.pace import Pace
-from harness.rigs.rig import Block, Performance, Rig
+from harness.rigs.rig import Block, Hindsight, Performance, Rig
 from harness.run import CHANNELS, Conditions, Run, missing_to_device
 from harness.scenario import Scenario
 
@@ -135,7 +135,15 @@ class Bench:
         pace, blocks = self._paced(performance)
         self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
-        begun = Conditions(
+        begun = self._begun(performance, scenario, seed)
+        collected = _Collected()
+        faults = (*scenario.caveats, *self._failures(blocks, pace, scenario.samples, collected))
+        conditions = self._concluded(begun, performance.hindsight(), faults, collected)
+        return collected.run(conditions, self.dut.parameters)
+
+    def _begun(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
+        """What is known before the first sample."""
+        return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
             sample_period_s=performance.sample_period_s,
@@ -149,11 +157,13 @@ class Bench:
             line=self.dut.line,
             real_time=self._real_time or 0.0,
         )
-        collected = _Collected()
-        faults = list(scenario.caveats)
+
+    def _failures(self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected) -> list[str]:
+        """Exchanges the samples, and says what kept it from doing so to the end."""
+        faults = []
         try:
             with _undisturbed(pace):
-                self._exchange(blocks, pace, scenario.samples, collected)
+                self._exchange(blocks, pace, samples, collected)
         except RigError as error:
             faults.append(str(error))
             with contextlib.suppress(DeviceError, LinkError):
@@ -166,8 +176,13 @@ class Bench:
             faults.append(
                 f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"
             )
-        known = performance.hindsight()
-        conditions = dataclasses.replace(
+        return faults
+
+    def _concluded(
+        self, begun: Conditions, known: Hindsight, faults: tuple[str, ...], collected: _Collected
+    ) -> Conditions:
+        """What is known after the last sample."""
+        return dataclasses.replace(
             begun,
             channels={
                 name: dataclasses.replace(channel, noise_lsb=known.noise_lsb.get(name, channel.noise_lsb))
@@ -181,7 +196,6 @@ class Bench:
             counters=collected.counters,
             link_counters=self.dut.link_counters,
         )
-        return collected.run(conditions, self.dut.parameters)
 
     def _paced(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
         """The pace of the samples, and what to send."""
