@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
+from emulator.excitation import Excitation
 from harness import cli
+from harness.bench import Bench
+from harness.devices import host_child
+from harness.dut import open_dut
+from harness.rigs.description import open_rig
+from harness.scenario import Scenario
 
 SHORT = """\
 samples = 400
@@ -106,12 +114,32 @@ def test_profile_that_does_not_exist_is_a_usage_error_in_one_line(user: pytest.P
 
 def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) -> None:
     user.makepyfile(
-        "import pytest\n\n@pytest.mark.needs('tweak', 'fly')\ndef test_it(rig):\n    pass\n\n"
-        "@pytest.mark.needs('tweak')\ndef test_other(rig):\n    pass\n"
+        """
+        import pytest
+
+        @pytest.mark.needs("excite", "tweak")
+        @pytest.mark.parametrize("rig", ["emulator", "recording:RECORDED"], indirect=True)
+        def test_it(rig):
+            pass
+        """.replace("RECORDED", str(recorded(user.path)))
     )
     result = run(user, "-rs")
     result.assert_outcomes(passed=1, skipped=1)
-    result.stdout.fnmatch_lines(["*rig emulator cannot fly (it can excite, tweak)*"])
+    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot excite and tweak (it can nothing but play)*"])
+
+
+def recorded(folder: Path) -> Path:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        Bench(rig, dut).play(Scenario(10, Excitation(), name="ten"), 1).save(folder / "run.npz")
+    return folder / "run.npz"
+
+
+def test_need_that_no_rig_knows_ends_the_collection_in_one_line_with_those_known(user: pytest.Pytester) -> None:
+    user.makepyfile("import pytest\n\n@pytest.mark.needs('twaek')\ndef test_it(rig):\n    pass\n")
+    result = run(user)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["ERROR: *::test_it: needs: no rig is known to 'twaek': there are excite, tweak"])
+    assert len(result.errlines) <= 2
 
 
 def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
@@ -217,10 +245,43 @@ def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Py
     run(user, "--dut", "host").assert_outcomes(passed=2)
 
 
-def test_device_elsewhere_belongs_to_one_worker(user: pytest.Pytester) -> None:
-    user.makepyfile("import pytest\n\n@pytest.mark.parametrize('n', range(4))\ndef test_it(n, dut):\n    pass\n")
-    result = user.runpytest_subprocess("-n", "2", "--dist", "load", "--dut", "serial:/dev/null")
-    result.stdout.fnmatch_lines(["*device serial:/dev/null: one worker owns it*"])
+SHARED = """
+import os, pytest
+
+@pytest.mark.parametrize("n", range(4))
+def test_on_the_device(n, dut):
+    assert dut.handshake()
+    print(f"<{os.environ['PYTEST_XDIST_WORKER']}>")
+
+@pytest.mark.parametrize("n", range(4))
+def test_without(n):
+    pass
+"""
+
+
+def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pytester) -> None:
+    user.makepyfile(SHARED)
+    with board() as port:
+        result = user.runpytest_subprocess("-n", "2", "--dut", f"serial:{port}", "-rP")
+    result.assert_outcomes(passed=8)
+    assert len({line for line in result.outlines if re.fullmatch(r"<gw\d>", line)}) == 1
+
+
+def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
+    user.makepyfile(SHARED)
+    result = user.runpytest_subprocess("-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["ERROR: device serial:/dev/null: one worker owns it, and --dist loadfile may not: *"])
+
+
+@contextlib.contextmanager
+def board() -> Iterator[str]:
+    """A board at a serial port."""
+    child = host_child()
+    try:
+        yield child.first_line()
+    finally:
+        child.end()
 
 
 def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
