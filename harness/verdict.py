@@ -29,6 +29,9 @@ from harness.run import LOST, Run, Segment
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
 
+MISSING = "clipped and missing for the device"
+"""What the samples are that count as missing."""
+
 Outcome = Literal["passed", "failed", "inconclusive"]
 
 Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not judged"]
@@ -63,6 +66,13 @@ class Expectations:
         for name in ("missed", "false_alarms", "late_slack_n"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative")
+
+    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+        """Why a run of which so many samples were missing is not valid; empty if it is."""
+        if missing <= self.max_missing_fraction * samples:
+            return []
+        allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
+        return [f"{missing} of {samples} samples were {words}, {allowed}"]
 
 
 NAMES = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
@@ -202,8 +212,8 @@ def is_captured(run: Run) -> bool:
 
 
 def missing_text(run: Run) -> str:
-    """What the samples are that count as missing: ``clipped and missing for the device``."""
-    return "missing for the device or not in the log" if is_captured(run) else "clipped and missing for the device"
+    """What the samples are that count as missing."""
+    return "missing for the device or not in the log" if is_captured(run) else MISSING
 
 
 def judge(run: Run) -> Verdict:
@@ -418,16 +428,14 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
-    if run.conditions.counters.get("refused"):
-        reasons.append(f"the device refused {run.conditions.counters['refused']} samples")
+    reasons += refusals(run.conditions.counters.get("refused", 0))
     reasons += _losses(run)
-    missing = int(run.missing.sum())
-    if run.samples and missing > expect.max_missing_fraction * run.samples:
-        reasons.append(
-            f"{missing} of {run.samples} samples were {missing_text(run)},"
-            f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
-        )
-    return reasons
+    return reasons + expect.gaps(run.samples, int(run.missing.sum()), missing_text(run))
+
+
+def refusals(refused: int) -> list[str]:
+    """Why a run in which the device refused so many samples is not valid; empty if it is."""
+    return [f"the device refused {refused} samples"] if refused else []
 
 
 def _losses(run: Run) -> list[str]:
