@@ -33,6 +33,10 @@ MAX_SAMPLES = 10_000_000
 """A run is kept in memory, some 70 bytes a sample."""
 
 
+MISSING = "clipped and missing for the device"
+"""What the samples are that count as missing."""
+
+
 @dataclass(frozen=True)
 class PlantChoice:
     """The program on the computer and where its pots stand at the start."""
@@ -107,6 +111,13 @@ class Expectations:
         for name in ("missed", "false_alarms", "late_slack_n"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative")
+
+    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+        """Why a run of which so many samples were missing is not valid; empty if it is."""
+        if missing <= self.max_missing_fraction * samples:
+            return []
+        allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
+        return [f"{missing} of {samples} samples were {words}, {allowed}"]
 
 
 @dataclass(frozen=True)
