@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from emulator import Excitation, SuspensionComputer
 from harness.errors import ConfigurationError, RigError, SelfTestError
 from harness.information import QUANTISATION_VARIANCE_LSB2
-from harness.onset.two_filter import Record
+from harness.onset.two_filter import Signals
 from harness.plant import Plant
 from harness.rigs.by_hand import ByHand, Tweak, doubts
 from harness.rigs.emulator import Stream, emulator_errors, settings_of
@@ -247,9 +247,9 @@ class RealRig:
         by_hand = ByHand(pots, tweaks, rate_hz)
         return instrument.record(samples, while_recording=by_hand.turn_all), by_hand
 
-    def _as_measured(self, plan: _Plan, codes: NDArray[np.uint16], clipped: NDArray[np.bool_]) -> Record:
+    def _as_measured(self, plan: _Plan, codes: NDArray[np.uint16], clipped: NDArray[np.bool_]) -> Signals:
         period_s = self._time_scale(plan.computer) / self._kind.rate_hz
-        return Record.of(codes, clipped, self._channels(plan.computer), period_s)
+        return Signals.of(codes, clipped, self._channels(plan.computer), period_s)
 
     def _time_scale(self, computer: SuspensionComputer) -> float:
         return self._description.scaling.time or computer.scales.time

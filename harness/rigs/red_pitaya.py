@@ -1,7 +1,7 @@
 """A Red Pitaya STEMlab 125-14 by its SCPI server: generator OUT1, inputs IN1 and IN2, 20 kS/s.
 
 Commands after https://redpitaya.readthedocs.io (OS 2.0), in the order that its examples publish. A box of digital pots
-on the same server (``POT:...``, harness/instrument/red_pitaya.py) is used when it is there.
+on the same server (``POT:...``, harness/served/red_pitaya.py) is used when it is there.
 """
 
 from __future__ import annotations

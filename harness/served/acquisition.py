@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from harness.instrument.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
-from harness.instrument.scpi import ScpiError
-from harness.instrument.table import Table
 from harness.links.wire import Clock
+from harness.served.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
+from harness.served.scpi import ScpiError
+from harness.served.table import Table
 
 CLOCK_HZ = 125_000_000
 BUFFER_N = 16_384
@@ -83,7 +83,7 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Buffer:
     """What a trigger has left in the buffer."""
 
     codes: Codes
@@ -130,7 +130,7 @@ class Acquisition:
         """
         self._clock = clock
         self.settings = Settings()
-        self.record: Record | None = None
+        self.record: Buffer | None = None
         self._table = table
         self._input_faults = inputs[0]
         self._inputs = Inputs(*inputs)
@@ -284,7 +284,7 @@ class Acquisition:
             codes[MIDDLE_N:] = 0
         if self._faults.drop_out == "zeros" and self._records == self._faults.drop_out_record:
             codes[_LOST] = 0
-        self.record, self._doing = Record(codes, self.settings.switches), None
+        self.record, self._doing = Buffer(codes, self.settings.switches), None
 
     def _samples(self, count: int) -> Volts:
         return self._inputs.samples(self._table.look, count, averages=self.settings.averages)
