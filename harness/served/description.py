@@ -41,7 +41,8 @@ class InstrumentDescription:
         noise_v = (float(noise_lsb[first] * lsb_v[first]), float(noise_lsb[second] * lsb_v[second]))
         return replace(
             self,
-            inputs=InputFaults(
+            inputs=replace(
+                own,
                 noise_v=(math.hypot(own.noise_v[0], noise_v[0]), math.hypot(own.noise_v[1], noise_v[1])),
                 gain_error=both(own.gain_error, gain_error),
                 offset_v=both(own.offset_v, (offset_lsb * lsb_v).tolist()),

@@ -45,7 +45,7 @@ from harness.served.acquisition import (
 )
 from harness.served.description import InstrumentDescription
 from harness.served.generator import MOST_VOLTS, SHAPES, Generator
-from harness.served.inputs import RANGES_V, Codes, lsb_v
+from harness.served.inputs import RANGES_V, Codes
 from harness.served.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
 from harness.served.table import DueTurn, Table
 
@@ -241,15 +241,15 @@ class ServedRedPitaya:
         channel, record = _channel(call), self._acquisition.record
         if record is None:
             raise ScpiError(-230, "no record is complete")
-        data = self._formed(record.codes[first : first + count, channel], record.switches[channel])
+        data = self._formed(record.codes[first : first + count, channel], record.lsb_v[channel])
         return Broken(data, hangs_up=self._acquisition.hangs_up) if self._acquisition.drops_out() else data
 
-    def _formed(self, codes: Codes, switch: str) -> str | bytes:
+    def _formed(self, codes: Codes, lsb_v: float) -> str | bytes:
         settings = self._acquisition.settings
         order, binary = _ORDERS[settings.order], settings.form == "BIN"
         if settings.units == "RAW":
             return codes.astype(f"{order}i2").tobytes() if binary else _braces(map(str, codes.tolist()))
-        volts: NDArray[np.float64] = codes.astype(np.float64) * lsb_v(switch)
+        volts: NDArray[np.float64] = codes.astype(np.float64) * lsb_v
         return volts.astype(f"{order}f4").tobytes() if binary else _braces(f"{v:.6g}" for v in volts.tolist())
 
     # ---- pots
