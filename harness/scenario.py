@@ -32,7 +32,6 @@ MOST_SEED = 2**63
 MAX_SAMPLES = 10_000_000
 """A run is kept in memory, some 70 bytes a sample."""
 
-
 MISSING = "clipped and missing for the device"
 """What the samples are that count as missing."""
 
