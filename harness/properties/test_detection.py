@@ -17,9 +17,8 @@ from harness.played import Played
 from harness.properties import Play, is_playable, with_some_seed
 from harness.properties.experiments import changes_are_noticed_soon_and_rightly_named, single_changes_are_rightly_named
 from harness.rigs.rig import Rig
-from harness.scenario import Scenario, Tweak
+from harness.scenario import Expectations, Scenario, Tweak
 from harness.strategies import WARM_UP_N, profile, scenarios, seeds
-from harness.verdict import Expectations
 
 ARL0 = 1e5
 MOST_INFORMATION = 6.0

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -293,3 +294,123 @@ def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment, cwd="/"
     )
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+# ------------------------------------------------------------------------------------------------ folder of what failed
+
+
+DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
+
+
+def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
+    """What an earlier session has left, as a suite."""
+    return run(user, "--scenario-dir", "build/runs", *arguments)
+
+
+def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(user: pytest.Pytester) -> None:
+    user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 40.0\n')
+    user.makepyfile(DETECTS_SOON.format(within=1.5))
+    first = run(user, "--dut", "deafer.toml")
+    first.assert_outcomes(failed=1)
+    first.stdout.fnmatch_lines(["judge it again with: pytest --scenario-dir *"])
+    (left,) = user.path.glob("build/runs/*/scenario.toml")
+    statement = tomllib.loads(left.read_text())["statement"]
+    assert statement["name"] == "detects"
+    assert statement["limits"] == {"within": 1.5}
+    assert statement["test"].endswith("::test_it")
+    result = again(user)  # the scenario's [expect] alone would pass
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*scenario.toml: K at 300: * samples, allowed *"])
+    assert len(list(user.path.glob("build/runs/*"))) == 1, "one more of the same"
+    again(user, "--dut", "inproc").assert_outcomes(passed=1)
+
+
+def test_property_that_failed_with_every_seed_fails_again_only_if_it_does_with_every_seed(
+    user: pytest.Pytester,
+) -> None:
+    user.makepyfile(
+        """
+        from harness.properties import with_some_seed
+
+        def test_it(play):
+            assert with_some_seed(play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
+        """
+    )
+    run(user, "--dut", "inproc").assert_outcomes(failed=1)
+    (left,) = user.path.glob("build/runs/*/scenario.toml")
+    table = tomllib.loads(left.read_text())
+    assert (table["seed"], table["statement"]["tries"]) == (7, 3)
+    again(user).assert_outcomes(failed=1)
+    left.write_text(left.read_text().replace("tries = 3", "tries = 3000").replace("1e-05", "2e-3"))
+    again(user).assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize(
+    ("told", "complaint"),
+    [
+        ('name = "no_such"', "statement: name: there is none that is called 'no_such': there are *detects*"),
+        (
+            'name = "detects"\n[statement.limits]\nwihtin = 1.0',
+            "statement: limits: unknown key 'wihtin' (known: within)",
+        ),
+        ('name = "estimates"', "statement: limits: the key 'within' is lacking"),
+        ('name = "estimates"\nlimits.within = "x"', "statement: limits: within: must be a number *"),
+    ],
+)
+def test_statement_that_says_nothing_is_told_in_one_line(user: pytest.Pytester, told: str, complaint: str) -> None:
+    folder = user.mkdir("suite")
+    (folder / "wrong.toml").write_text(SHORT.format(head="", expect="") + f"\n[statement]\n{told}\n")
+    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines([f"*wrong.toml: {complaint.replace('[', '[[]')}"])
+
+
+def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:
+    folder = user.mkdir("suite")
+    (folder / "one.toml").write_text(SHORT.format(head='dut = "inproc:./evil.so"', expect=""))
+    result = run(user, "--scenario-dir", "suite")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*the scenario is for inproc:./evil.so, which is not opened on the word of a file: *"])
+    run(user, "--scenario-dir", "suite", "--dut", "inproc").assert_outcomes(passed=1)
+    user.makeini("[pytest]\nanalogrig_dut = inproc:./evil.so")
+    result = run(user, "--scenario-dir", "suite")
+    result.stdout.fnmatch_lines(["*evil.so*"])
+    assert "on the word of a file" not in result.stdout.str()
+
+
+FALLS_APART = """
+import pathlib, sys
+
+from hypothesis import given
+
+from harness.strategies import profile, seeds
+
+@profile()
+@given(seed=seeds())
+def test_it(play, seed):
+    found = play("short.toml", seed).estimates(within=1e-9)
+    left = sorted(pathlib.Path("build/runs").glob("*"))
+    print("<left", seed, *(path.name for path in left), ">", flush=True)
+    if left:
+        (folder,) = left
+        assert {"run.npz", "scenario.toml"} == {path.name for path in folder.iterdir()}
+        STOP
+    assert found
+"""
+
+
+def test_property_that_is_ended_while_it_shrinks_has_left_a_counterexample(user: pytest.Pytester) -> None:
+    user.makepyfile(FALLS_APART.replace("STOP", "import os; os.kill(os.getpid(), 9)"))
+    result = run(user, "-s", "--dut", "inproc")
+    assert result.ret == -9
+    again(user).assert_outcomes(failed=1)
+
+
+def test_counterexample_is_replaced_while_it_shrinks_and_ends_as_the_simplest(user: pytest.Pytester) -> None:
+    user.makepyfile(FALLS_APART.replace("STOP", "pass"))
+    result = run(user, "-s", "--dut", "inproc")
+    result.assert_outcomes(failed=1)
+    (left,) = user.path.glob("build/runs/*")
+    assert tomllib.loads((left / "scenario.toml").read_text())["seed"] == 0
+    assert (left / "report.html").is_file()
+    assert [path.name for path in left.parent.iterdir()] == [left.name], "something is left besides"
