@@ -10,17 +10,20 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 from xml.etree import ElementTree as ET
 
 import pytest
 
 from emulator.excitation import Excitation
-from harness import cli
+from harness import cli, config
 from harness.bench import Bench
 from harness.devices import host_child
 from harness.dut import open_dut
+from harness.errors import ConfigurationError
 from harness.rigs.description import open_rig
 from harness.scenario import Scenario
+from harness.statement import Play, Statement, judged
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 
@@ -417,24 +420,38 @@ def test_property_that_failed_with_every_seed_fails_again_only_if_it_does_with_e
     again(user).assert_outcomes(passed=1)
 
 
+KEEPS_HOLD_OFF = """
+[statement]
+name = "alarms_keep_hold_off_and_warm_up"
+limits = {{ hold_off_n = 20, warm_up_n = 40, at_least = {at_least} }}
+"""
+
+
+def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_limits_of_the_file(
+    user: pytest.Pytester,
+) -> None:
+    folder = user.mkdir("suite")
+    for name, at_least in (("good", 3), ("strict", 300)):
+        told = SHORT.format(head="", expect="") + KEEPS_HOLD_OFF.format(at_least=at_least)
+        (folder / f"{name}.toml").write_text(told)
+    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*strict.toml: * alarms, where at least 300 were due"])
+
+
 @pytest.mark.parametrize(
     ("told", "complaint"),
     [
-        ('name = "no_such"', "statement: name: there is none that is called 'no_such': there are *detects*"),
-        (
-            'name = "detects"\n[statement.limits]\nwihtin = 1.0',
-            "statement: limits: unknown key 'wihtin' (known: within)",
-        ),
-        ('name = "estimates"', "statement: limits: the key 'within' is lacking"),
-        ('name = "estimates"\nlimits.within = "x"', "statement: limits: within: must be a number *"),
+        ({"name": "no_such"}, "name: there is none that is called 'no_such': there are .*detects"),
+        ({"name": "detects", "limits": {"wihtin": 1.0}}, "limits: unknown key 'wihtin' .known: within."),
+        ({"name": "estimates"}, "limits: the key 'within' is lacking"),
+        ({"name": "estimates", "limits": {"within": "x"}}, "limits: within: must be a number"),
     ],
 )
-def test_statement_that_says_nothing_is_told_in_one_line(user: pytest.Pytester, told: str, complaint: str) -> None:
-    folder = user.mkdir("suite")
-    (folder / "wrong.toml").write_text(SHORT.format(head="", expect="") + f"\n[statement]\n{told}\n")
-    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines([f"*wrong.toml: {complaint.replace('[', '[[]')}"])
+def test_statement_that_says_nothing_is_refused_before_anything_is_played(told: dict[str, Any], complaint: str) -> None:
+    statement = config.build(Statement, told, "the file: statement")
+    with pytest.raises(ConfigurationError, match=f"the file: statement: {complaint}"):
+        judged(statement, cast(Play, None), Scenario.load("thesis"), 1, "the file")
 
 
 def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:
