@@ -134,6 +134,8 @@ class Summary:
     """Mean information bound of the changes that were detected and could be."""
     error: Mapping[str, float]
     """rms relative error of M, B and K at the end."""
+    doubt: str
+    """The seed of the first inconclusive trial, and why it is that; empty: there is none."""
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
@@ -166,6 +168,9 @@ class Summary:
             error={
                 name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5 for i, name in enumerate("MBK") if errors
             },
+            doubt=next(
+                (f"seed {row['seed']}: {row.get('why', '')}" for row in rows if row["outcome"] == "inconclusive"), ""
+            ),
         )
 
 
@@ -223,8 +228,11 @@ def text(results: Results) -> str:
         rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
-    note = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"
-    return "\n".join([head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", f"  {note}"])
+    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
+    notes += [f"{total.inconclusive} trials inconclusive, such as {total.doubt}"] if total.inconclusive else []
+    return "\n".join(
+        [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
+    )
 
 
 def as_json(results: Results) -> dict[str, Any]:

@@ -45,21 +45,26 @@ def add_workers(command: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign.conduct import conduct, journal_of
+    from harness.campaign.conduct import conduct, journal_of, unreachable
     from harness.campaign.report import write_page
     from harness.campaign.results import as_json, text
-    from harness.campaign.spec import CampaignSpec, Plan
-    from harness.errors import DeviceError, LinkError, RigError, WorkerError
+    from harness.campaign.spec import CampaignSpec, Plan, one_worker_only
+    from harness.errors import WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
-        with workers(arguments, plan.one_worker_only(), len(list(plan.chunks()))) as crew:
+        with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
+            lacking = {} if out.exists() or arguments.cluster else unreachable(plan)
+            if len(lacking) == len(plan.devices):
+                return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
+            for name, why in lacking.items():
+                complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
             results = conduct(plan, crew, out, progress(plan))
     except KeyboardInterrupt:
         return complain(f"interrupted: {kept}", INTERRUPTED)
-    except (DeviceError, LinkError, RigError, WorkerError) as error:
+    except WorkerError as error:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
     page = out.with_suffix(".html")
     write_page(results, page)

@@ -37,7 +37,6 @@ def add(commands: Any) -> None:
         type=int,
         nargs="?",
         const=_ESTIMATES,
-        default=0,
         metavar="N",
         help=f"for rates too rare to be waited for: N estimates from branches with louder noise ({_ESTIMATES})",
     )
@@ -51,15 +50,14 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign.spec import one_worker_only, rig_table
+    from harness.campaign.spec import device_table, one_worker_only, rig_table
     from harness.certificate import certify, question_of
-    from harness.devices import describe
     from harness.errors import DeviceError, LinkError, RigError, WorkerError
     from harness.scenario import Scenario
 
     question = question_of(
         rig_table(arguments.rig),
-        describe(arguments.dut).as_table(),
+        device_table(arguments.dut),
         Scenario.load(arguments.scenario),
         far=arguments.far,
         confidence=arguments.confidence,
@@ -69,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> int:
         first_seed=arguments.seed,
     )
     try:
-        with workers(arguments, one_worker_only(question.device), question.useful_workers) as crew:
+        with workers(arguments, one_worker_only(question.rig, question.device), question.useful_workers) as crew:
             answer = certify(question, crew, _progress())
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
@@ -79,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sentence(question: Question, answer: Certificate) -> str:
     way = "sequential test" if question.sequential else f"fixed length, at most {question.allowed} alarms allowed"
-    way = "a rare rate" if question.rare else way
+    way = way if question.rare is None else "a rare rate"
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
         f" confidence {question.confidence:g} ({way}): {answer.outcome.upper()}\n  {answer.reason}"
