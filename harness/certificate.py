@@ -39,7 +39,7 @@ from harness.trials import are_possible
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
 """About so many samples in a run: in this process, or over a line."""
 
-WORTH_A_WORKER_N = 3_000_000
+WORTH_A_WORKER_N = 500_000
 """Samples that a process plays in about the time that another takes to start."""
 
 WORTH_A_WORKER_ESTIMATES = 16

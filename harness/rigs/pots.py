@@ -41,8 +41,6 @@ _PLACEHOLDERS = ("pot", "dial", "step")
 class Pots(Protocol):
     """Pots that can be set."""
 
-    exact: bool
-    """The instants of their turns are known to the sample."""
     slow: bool
     """A hand turns them, and is on its way for many samples; otherwise each jumps, one after the other."""
 
@@ -172,7 +170,6 @@ def _check_placeholders(key: str, template: str, *, needed: bool = True) -> None
 class _OneByOne:
     """Pots that are set one after another, in settling and in turning alike."""
 
-    exact = False
     slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
@@ -289,7 +286,6 @@ class _Box(_OneByOne):
 
 
 class _Operator:
-    exact = False
     slow = True
 
     def __init__(self, terminal: Path) -> None:
@@ -332,7 +328,6 @@ class _Operator:
 
 
 class _Nobody:
-    exact = False
     slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:

@@ -22,9 +22,9 @@ from harness.errors import SelfTestError
 from harness.rigs.rig import Rig
 from harness.self_test import checks, noise
 from harness.self_test.findings import Check, Findings
-from harness.self_test.record import HIGH_V, LOW_V, Record
+from harness.self_test.record import HIGH_V, LOW_V, SelfTestRecord
 from harness.self_test.response import Answer, Response, SecondOrder
-from harness.self_test.timing import Edges, Levels, averaged_n, lateness
+from harness.self_test.timing import Levels, SeenEdges, averaged_n, lateness
 
 LEAST_SWING_V = 0.25
 """A channel that moves by less shows no signal."""
@@ -40,10 +40,10 @@ def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
     :raises SelfTestError: it could not be made: no signal, a drop-out, another program.
     :raises RigError: the rig failed.
     """
-    return Findings(str(rig.description().get("name", "")), program, examined(Record.taken(rig, seed, program)))
+    return Findings(str(rig.description().get("name", "")), program, examined(SelfTestRecord.taken(rig, seed, program)))
 
 
-def examined(record: Record) -> tuple[Check, ...]:
+def examined(record: SelfTestRecord) -> tuple[Check, ...]:
     """What the record shows, as far as what is wrong leaves the rest a meaning.
 
     :raises SelfTestError: there is no signal in it, or a drop-out.
@@ -68,11 +68,11 @@ def examined(record: Record) -> tuple[Check, ...]:
     return (*leads, *clipping, *range_use, *seen.quantities())
 
 
-def _moves(record: Record, channel: str) -> bool:
+def _moves(record: SelfTestRecord, channel: str) -> bool:
     return record.swing_v(channel) > LEAST_SWING_V
 
 
-def _clipping(record: Record, channel: str) -> Check:
+def _clipping(record: SelfTestRecord, channel: str) -> Check:
     clipped = record.clipped[channel]
     share, samples = float(clipped.mean()), len(clipped)
     at_top = clipped & (record.codes[channel] > record.channels[channel].codes / 2)
@@ -90,12 +90,12 @@ class _Known:
 class _Seen:
     """A record whose force is a square wave, and what is read from it."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: SelfTestRecord) -> None:
         """:raises SelfTestError: the square wave is broken."""
         self._record = record
         self._codes = record.codes["force"]
         self._levels = Levels.of(self._codes)
-        self._edges = Edges.of(self._levels.state, record.half_period_n)
+        self._edges = SeenEdges.of(self._levels.state, record.half_period_n)
         channel = record.channels["force"]
         self._low_v, self._high_v = (
             channel.low_v + channel.lsb_v * float(self._codes[self._levels.state == level].mean()) for level in (0, 1)

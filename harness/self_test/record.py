@@ -41,7 +41,7 @@ def scenario(program: str) -> Scenario:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class SelfTestRecord:
     """What was played and what was seen of it."""
 
     program: str
@@ -54,7 +54,7 @@ class Record:
     """By channel: (n,)"""
 
     @classmethod
-    def taken(cls, rig: Rig, seed: int, program: str) -> Record:
+    def taken(cls, rig: Rig, seed: int, program: str) -> SelfTestRecord:
         """Plays the self-test.
 
         :raises ConfigurationError: the rig cannot play it.

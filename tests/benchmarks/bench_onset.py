@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from harness.onset.jump import NoOnset, Onset
-from harness.onset.turn import Turn
+from harness.onset.turn import SlowTurn
 from harness.statistics import lower_rate
 from tests.harness.onsets import Clock, Trial, still
 
@@ -50,7 +50,7 @@ def ramps(trials: int = RAMPS_N) -> Iterator[Figure]:
         begun_s = time.process_time()
         found = [trial.turned() for trial in played]
         each_ms = 1e3 * (time.process_time() - begun_s) / trials
-        pairs = [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, Turn)]
+        pairs = [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, SlowTurn)]
         begins = [each.begin.low <= trial.sample <= each.begin.high for trial, each in pairs]
         ends = [each.end.low <= trial.sample + trial.ramp_n <= each.end.high for trial, each in pairs]
         yield _coverage(f"ramp, clock {clock}: begins within the interval", begins, trials)

@@ -26,7 +26,7 @@ from harness.self_test import checks
 from harness.self_test.conduct import self_test
 from harness.self_test.findings import Check, Findings
 from harness.self_test.response import SecondOrder
-from harness.self_test.timing import Edges, Levels, Line, averaged_n, lateness
+from harness.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))
@@ -312,7 +312,7 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
         late_n = float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
-        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         found_n, error_n = lateness(codes, levels, edges, numbered(line, edges), 0.0)
         assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
 
@@ -323,7 +323,7 @@ def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
         line, late_n = Line(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged)
         levels = Levels.of(codes)
-        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         assert averaged_n(edges) == pytest.approx(averaged, abs=0.03)
         found_n, _ = lateness(codes, levels, edges, numbered(line, edges), 0.0)
         assert found_n == pytest.approx(late_n, abs=5e-3)
@@ -343,7 +343,7 @@ def square_wave(line: Line, late_n: float, averaged: float) -> Codes:
     return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
 
 
-def numbered(line: Line, edges: Edges) -> Line:
+def numbered(line: Line, edges: SeenEdges) -> Line:
     """The same line, its instants those next to the middle edge as the edges have them."""
     turns = np.rint((edges.line().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
