@@ -55,13 +55,14 @@ def begin(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from harness.campaign.conduct import conduct, journal_of, unreachable
-    from harness.campaign.report import write_page
+    from harness.campaign.report import page_of, write_page
     from harness.campaign.results import as_json, text
     from harness.campaign.spec import CampaignSpec, Plan, one_worker_only
     from harness.errors import WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
+    page = page_of(out)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
         with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
@@ -75,7 +76,6 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(f"interrupted: {kept}", INTERRUPTED)
     except WorkerError as error:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
-    page = out.with_suffix(".html")
     write_page(results, page)
     if arguments.json:
         show(json.dumps({**as_json(results), "results": str(out), "page": str(page)}))

@@ -497,6 +497,7 @@ def test_command_says_what_came_out_and_writes_the_page(
     assert [cell["stiffness_factor"] for cell in said["cells"]] == ["0.8", "0.9"]
     assert out.read_bytes() == reference.read_bytes()
     assert Path(said["page"]).read_text().startswith("<!doctype html>")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 0
 
 
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -628,6 +629,25 @@ def test_file_of_somebody_else_in_the_place_of_the_journal_is_left_alone(tmp_pat
         conduct(planned(tmp_path), ThisProcess(), out)
     assert journal_of(out).read_bytes() == content
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "standing", "said"),
+    [
+        ("out.json", "out.html", "out.html: is no page of a campaign"),
+        ("out.html", "other", "the page of the results is to be called so"),
+        ("out.json", "out.json", "out.json: not the results of a campaign"),
+    ],
+)
+def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
+    tmp_path: Path, out: str, standing: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path)
+    (tmp_path / standing).write_text("my own")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / out), "--workers", "1"]) == 2
+    assert said in capsys.readouterr().err
+    assert (tmp_path / standing).read_text() == "my own"
+    assert not journal_of(tmp_path / out).exists()
 
 
 def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Path) -> None:
