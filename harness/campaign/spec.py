@@ -137,6 +137,8 @@ class CampaignSpec:
     name: str = ""
 
     def __post_init__(self) -> None:
+        if "/" in self.name or self.name in {".", ".."} or not self.name.isprintable():
+            raise ValueError(f"name must be one that a file can have, not {self.name!r}")
         if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
         for name in ("rigs", "devices"):

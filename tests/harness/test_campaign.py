@@ -104,6 +104,8 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
         ("[grid]\nmass_kg = [90.0]\n[draw]\nmass_kg = [80.0, 90.0]", "mass_kg: in the grid and drawn as well"),
         ("trials = 0", "trials must be 1 to"),
         ("devices = []", "devices must name at least one"),
+        ("name = '../../elsewhere'", "name must be one that a file can have, not '../../elsewhere'"),
+        ('name = "two\\nlines"', r"name must be one that a file can have, not 'two\\nlines'"),
         ("[grid]\nmass_kg = [10.0]", "pot M: .*M_kg = 10"),
         ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has tweaks of its own"),
         ("[grid]\nmass_factor = [0.5]\n", None),
