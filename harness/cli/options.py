@@ -66,8 +66,7 @@ def factor(text: str) -> float:
     raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
 
 
-def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
-    shown = "$ANALOGRIG_DUT or host" if default is not None else "that of the recording"
+def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
     command.add_argument(
         "--dut",
         default=default,
