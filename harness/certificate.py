@@ -1,7 +1,7 @@
 """Whether a device raises false alarms rarely enough: the one question that every owner asks, with its error stated.
 
-A plant that does not change is played in runs of one length, with seeds in order. What counts as a trial is a sample
-that the estimator took in once it was warm; every alarm is a false one. Rates for which that would take too long are
+A plant that does not change is played in runs of one length, with seeds in order. What counts as a trial is a sample in
+which the trigger was armed (harness.exposure); every alarm is a false one. Rates for which that would take too long are
 estimated by branches with louder noise instead (harness.rare), so many times over, each time off a play of its own.
 """
 
@@ -39,7 +39,7 @@ from harness.trials import are_possible
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
 """About so many samples in a run: in this process, or over a line."""
 
-WORTH_A_WORKER_N = 3_000_000
+WORTH_A_WORKER_N = 500_000
 """Samples that a process plays in about the time that another takes to start."""
 
 WORTH_A_WORKER_ESTIMATES = 16
@@ -147,16 +147,13 @@ def certify(
     text = json.dumps(dataclasses.asdict(question), sort_keys=True)
     work = functools.partial(count_run, text, run_n)
     alarms = samples = 0
-    warm_up_n = device_of(question.device).estimator.warm_up_n
     try:
         for count in _in_order(workers, work, question.first_seed):
-            counted = max(count.updated - warm_up_n, 0)
-            alarms, samples = alarms + count.alarms, samples + counted
+            alarms, samples = alarms + count.alarms, samples + count.armed
             if progress is not None:
                 progress(samples, most, alarms)
-            if count.fault or not counted:
-                fault = count.fault or "the device took in no sample that counts"
-                return Certificate("inconclusive", fault, alarms, samples, (0.0, 1.0))
+            if count.fault:
+                return Certificate("inconclusive", count.fault, alarms, samples, (0.0, 1.0))
             answer = _sequential(question, alarms, samples) if question.sequential else None
             if samples >= most:
                 answer = answer or _at_the_end(question, alarms, samples)

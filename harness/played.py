@@ -14,6 +14,7 @@ from typing import Concatenate, ParamSpec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from harness.exposure import exposure
 from harness.run import Run
 from harness.statistics import upper_rate
 from harness.summary import latency_text
@@ -167,23 +168,18 @@ def _too_late(tweak: TweakVerdict, within: float | None) -> str:
 def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
     """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand.
 
-    It does not hold if one of them is not valid. A play counts once, and without the samples in which its device was
-    warming up.
+    It does not hold if one of them is not valid. A play counts once, with the samples in which its trigger was armed
+    (``harness.exposure``).
     """
     plays = list({id(each.run): each for each in played}.values())
     invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
     if invalid:
         return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {len(plays)} plays, such as: {invalid[0]}")
     events = sum(len(each.verdict.false_alarms) for each in plays)
-    samples = sum(_exposed_n(each.run) for each in plays)
+    samples = sum(exposure(each.run).armed for each in plays)
     if not samples:
-        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: they are all warm-up")
+        why = exposure(plays[0].run).no_evidence if plays else "there is none"
+        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: {why}")
     bound = upper_rate(events, samples, confidence)
     why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
     return Finding(bound <= rate, why)
-
-
-def _exposed_n(run: Run) -> int:
-    """Samples after which the device could have raised an alarm."""
-    warm_up_n = int(run.conditions.dut["estimator"].get("warm_up_n", 0))
-    return sum(max(0, end - start - warm_up_n) for start, end in run.records)

@@ -104,7 +104,7 @@ def false_alarm_rate(
     settings = dataclasses.replace(device.estimator, force_zero=rig.force_zero)
     if settings.trigger != "cusum":
         raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
-    estimator = Estimator(settings, library=device.library_path if isinstance(device, InprocDevice) else LIBRARY)
+    estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
     first = settings.warm_up_n + _LEAD_IN_N
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
     (play,) = rig.perform(played, seed, block_samples=played.samples).blocks

@@ -7,7 +7,8 @@ many, --seed 2 others. What became of each is written as soon as it is known. AR
 ended early, and after a change of core or tests tries again what the change may have altered: the mutants of functions
 that were rewritten, and the survivors that nobody has explained.
 
-The tests are loaded once and forked for each mutant, and what they simulate is kept: two to ten seconds a mutant.
+The tests are loaded and collected once and forked for each mutant, those first that notice most in the least time, and
+what they simulate is kept.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import itertools
 import json
 import multiprocessing
 import os
@@ -29,8 +31,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -50,7 +52,7 @@ __all__ = [
     "recalled",
     "sampled",
     "sources",
-    "tried",
+    "try_all",
     "write",
 ]
 
@@ -59,20 +61,19 @@ CORE = ROOT / "estimator_c" / "core"
 EXPLAINED = ROOT / "estimator_c" / "evidence" / "MUTATION.md"
 GENERATED = ROOT / "build" / "generated"
 
-QUICK = ("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py")
-SEARCHING = (
-    *("tests/harness/test_twin.py", "tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_numerics.py"),
-    "tests/estimator_c/test_est_adversarial.py",
+TESTS = (
+    *("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py"),
+    *("tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_est_adversarial.py"),
+    *("tests/estimator_c/test_numerics.py", "tests/harness/test_twin.py"),
 )
-"""The slower ones."""
-
 LONG = "not ten_million and not long_free_running and not rarer_than_promised"
-DEADLINE_S = 60
-"""A mutant may not come to an end. In seconds of the processor: the machine may be busy."""
+DEADLINE_S = 8
+"""A mutant may not come to an end. For each test, the longest of which takes two; in seconds of the processor: the
+machine may be busy."""
 
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
-    *("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"),
+    *("-fsanitize=bounds-strict", "-fsanitize-undefined-trap-on-error"),
     *(f"-I{path}" for path in (CORE.parent / "device", CORE.parent / "isolation", GENERATED)),
 )
 """One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""
@@ -310,7 +311,7 @@ def _kept(simulate: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, 
 
 
 def _load_tests() -> None:
-    """Makes every test use the library of the mutant, and runs them all once on the core as it is."""
+    """Makes every test use the library of the mutant."""
     sys.path.insert(0, str(ROOT))
     hypothesis.settings.register_profile(
         "mutants",
@@ -331,54 +332,83 @@ def _load_tests() -> None:
     estimator.__init__ = start_mutant
 
 
-class _Reporter:
-    """Remembers the first test that fails."""
+class _Session:
+    """A session of pytest: each test once on the core as it is, then ``work``, which has them run again in forks.
 
-    failed = ""
+    :param noticed: how many mutants each test is known to have noticed.
+    """
+
+    def __init__(self, noticed: Mapping[str, int], work: Callable[[_Session], None]) -> None:
+        self._noticed, self._work = noticed, work
+        self._tests: list[pytest.Item] = []
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._outside = sys.stdout
+        self._failed = ""
+        self._before_each: Callable[[], None] = lambda: None
+
+    def run(self) -> None:
+        """RuntimeError if a test fails on the core as it is."""
+        options = "-q --assert=plain -p no:xdist -p no:cacheprovider -o timeout=0 -s -p no:faulthandler".split()
+        with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
+            status = pytest.main([*options, "-k", LONG, f"--rootdir={ROOT}", *TESTS], plugins=[self])
+        if self._failed or status != pytest.ExitCode.OK:
+            raise RuntimeError(f"the tests fail on the core as it is: {self._failed or status!r}")
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """In place of pytest's own."""
+        self._tests = session.items
+        if not self._first_failure():
+            self._tests.sort(key=self._price)
+            with contextlib.redirect_stdout(self._outside):
+                self._work(self)
+        return True
+
+    def _price(self, test: pytest.Item) -> float:
+        """Seconds for each mutant noticed."""
+        return self._seconds[test.nodeid] / (1 + self._noticed.get(_name(test.nodeid), 0))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.failed and not self.failed:
-            self.failed = report.nodeid.rsplit("/", 1)[-1]
+        """Remembers what failed first, and how long each test takes."""
+        self._seconds[report.nodeid] += report.duration
+        if report.failed and not self._failed:
+            self._failed = _name(report.nodeid)
+
+    def _first_failure(self) -> str:
+        for test, following in itertools.zip_longest(self._tests, self._tests[1:]):
+            self._before_each()
+            test.ihook.pytest_runtest_protocol(item=test, nextitem=following)
+            if self._failed:
+                break
+        return self._failed
+
+    def first_failure(self) -> str:
+        """On the present library, in a fork; a crash, or no end, counts as one."""
+        receiver, sender = os.pipe()
+        child = os.fork()
+        if child == 0:
+            self._before_each = _set_deadline
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, 1)
+            os.dup2(nothing, 2)
+            os.write(sender, self._first_failure().encode())
+            os._exit(0)
+        os.close(sender)
+        with os.fdopen(receiver) as pipe:
+            said = pipe.read()
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if status == -signal.SIGXCPU:
+            return "no end"
+        return said if status == 0 else f"crash: {status}"
 
 
-def _first_failure(tests: Sequence[str]) -> str:
-    reporter = _Reporter()
-    options = [
-        "-x",
-        "-q",
-        "--assert=plain",
-        "-p",
-        "no:xdist",
-        "-p",
-        "no:cacheprovider",
-        "-o",
-        "timeout=0",
-        "-s",
-        "-k",
-        LONG,
-    ]
-    status = pytest.main([*options, f"--rootdir={ROOT}", *tests], plugins=[reporter])
-    return reporter.failed or ("" if status == 0 else f"status {int(status)}")
+def _set_deadline() -> None:
+    now = resource.getrusage(resource.RUSAGE_SELF)
+    ends = int(now.ru_utime + now.ru_stime) + DEADLINE_S
+    resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
 
 
-def _in_a_fork(tests: Sequence[str]) -> str:
-    """The first failure on the present library; a crash, or no end, counts as one."""
-    receiver, sender = os.pipe()
-    child = os.fork()
-    if child == 0:
-        resource.setrlimit(resource.RLIMIT_CPU, (DEADLINE_S, resource.RLIM_INFINITY))
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, 1)
-        os.dup2(nothing, 2)
-        os.write(sender, _first_failure(tests).encode())
-        os._exit(0)
-    os.close(sender)
-    with os.fdopen(receiver) as pipe:
-        said = pipe.read()
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status == -signal.SIGXCPU:
-        return "no end"
-    return said if status == 0 else f"crash: {status}"
+def _name(nodeid: str) -> str:
+    return nodeid.rsplit("/", 1)[-1]
 
 
 # ---- the mutants
@@ -430,13 +460,19 @@ class _Build:
         return out
 
 
+_begun: list[tuple[_Session, tuple[_Build, _Build], str]] = []
+"""The session, the core as it is, and its hash."""
+
+
 def _hash(program: Path) -> str:
-    done = subprocess.run([program], capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = subprocess.run([program], capture_output=True, text=True, preexec_fn=_set_deadline, check=False)
     return done.stdout + str(done.returncode)
 
 
-def _try(mutant: Mutant, plain: tuple[_Build, _Build], expected: str) -> Outcome:
+def _try(mutant: Mutant) -> Outcome:
+    """In a worker of the pool, a fork of the process that has begun the session."""
     global _library  # noqa: PLW0603 - the tests, in a fork of this process, look there
+    session, plain, expected = _begun[-1]
     with tempfile.TemporaryDirectory() as scratch:
         try:
             tested = plain[0].copy(Path(scratch, "tested"))
@@ -445,38 +481,37 @@ def _try(mutant: Mutant, plain: tuple[_Build, _Build], expected: str) -> Outcome
             _library = tested.linked("-shared")
         except subprocess.CalledProcessError:
             return Outcome(mutant, "invalid")
-        failed = _in_a_fork(QUICK)
+        failed = session.first_failure()
         if failed:
             return Outcome(mutant, "killed", failed)
         hashed = plain[1].copy(Path(scratch, "hashed"))
         hashed.differs(mutant)
-        try:
-            same = _hash(hashed.linked()) == expected
-        except subprocess.TimeoutExpired:
-            same = False
-        failed = _in_a_fork(SEARCHING)
-        return Outcome(mutant, "killed" if failed else "survived", failed or ("same bits" if same else "other bits"))
+        same = _hash(hashed.linked()) == expected
+        return Outcome(mutant, "survived", "same bits" if same else "other bits")
 
 
-def tried(chosen: Sequence[Mutant], jobs: int = 2) -> Iterator[Outcome]:
-    """What becomes of each; RuntimeError if the tests fail on the core as it is."""
+def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tell: Callable[[Outcome], None]) -> None:
+    """Tells what becomes of each as soon as it is known; RuntimeError if the tests fail on the core as it is.
+
+    :param noticed: how many mutants each test is known to have noticed.
+    """
     global _library  # noqa: PLW0603
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as scratch:
         plain = (_Build(Path(scratch, "tested"), TESTED), _Build(Path(scratch, "hashed"), HASHED))
         _library = plain[0].linked("-shared")
         expected = _hash(plain[1].linked())
+
+        def work(session: _Session) -> None:
+            _begun.append((session, plain, expected))
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+                for future in as_completed([pool.submit(_try, mutant) for mutant in chosen]):
+                    outcome = future.result()
+                    where = (outcome.mutant.file, outcome.mutant.function)
+                    tell(dataclasses.replace(outcome, source=sources()[where]))
+
         _load_tests()
-        with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
-            failed = _first_failure((*QUICK, *SEARCHING))
-        if failed:
-            raise RuntimeError(f"the tests fail on the core as it is: {failed}")
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
-            work = functools.partial(_try, plain=plain, expected=expected)
-            for future in as_completed([pool.submit(work, mutant) for mutant in chosen]):
-                outcome = future.result()
-                where = (outcome.mutant.file, outcome.mutant.function)
-                yield dataclasses.replace(outcome, source=sources()[where])
+        _Session(noticed, work).run()
 
 
 def main() -> int:
@@ -494,11 +529,15 @@ def main() -> int:
     chosen = chosen[: arguments.sample]
     known = explained()
     outcomes = recalled(arguments.out, every, known) if arguments.resume else {}
-    for outcome in tried([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs):
+    noticed = Counter(outcome.by for outcome in outcomes.values() if outcome.fate == "killed")
+
+    def tell(outcome: Outcome) -> None:
         outcomes[outcome.mutant] = outcome
         write(arguments.out, outcomes.values())
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             print(shown(outcome.mutant.key), flush=True)
+
+    try_all([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs, noticed, tell)
     fates = Counter(outcome.fate for outcome in outcomes.values())
     print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
     survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}

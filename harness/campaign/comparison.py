@@ -144,7 +144,7 @@ def _missed(trial: Row, _: Row | None) -> list[float]:
 
 
 def _false_alarms(trial: Row, _: Row | None) -> list[float]:
-    return [trial["false_alarms"] / trial["samples"]]
+    return [trial["false_alarms"] / trial["armed"]] if trial["armed"] else []
 
 
 def _error(i: int) -> Callable[[Row, Row | None], list[float]]:

@@ -19,7 +19,7 @@ from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
 from harness.campaign.workers import Workers
 from harness.statistics import ConfidenceSequence, Decision
 
-_EXPOSURE = {"missed": "visible", "false_alarms": "samples"}
+_EXPOSURE = {"missed": "visible", "false_alarms": "armed"}
 """Of what each quantity that can stop a cell is a rate."""
 
 
@@ -77,15 +77,17 @@ Progress = Callable[[Tally], None]
 def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None = None) -> Results:
     """Play the plan to ``out``. Interrupted by whatever, it goes on where it was when it is asked for again.
 
-    :raises ConfigurationError: ``out`` holds what another plan gave; or a trial cannot be played.
+    :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
     :raises RecordingError: ``out`` cannot be written.
     :raises WorkerError: the workers cannot be had or kept.
-    :raises LinkError, DeviceError, RigError: a device or rig cannot be had.
     """
     if out.exists():
         return Results.load(out).of_plan(plan, out)
     tally = Tally(plan, len(plan.cells()))
-    with Journal(journal_of(out), plan.digest()) as journal:
+    with Journal(journal_of(out), plan) as journal:
+        if out.exists():  # another one has ended meanwhile
+            journal.remove()
+            return Results.load(out).of_plan(plan, out)
         for chunk, rows in journal.rows.items():
             tally.add(chunk, rows)
         work: Any = functools.partial(play_chunk, plan.as_json())

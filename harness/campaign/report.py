@@ -145,7 +145,7 @@ def _row(names: Sequence[str], summary: Summary) -> str:
         *(f"{summary.missed:,}", f"{summary.visible:,}"),
         f"{summary.miss_rate[1]:.2g}" if summary.visible else "–",
         f"{summary.false_alarms:,}",
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.samples else "–",
+        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "–",
         *("–" if each is None else f"{each:.1f}" for each in averages),
     )
     cells = "".join(f'<th scope="row">{html.escape(name)}</th>' for name in names)

@@ -7,21 +7,20 @@ same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from harness import config
-from harness.devices import DeviceDescription, InprocDevice, describe, from_table
+from harness.campaign import build
+from harness.campaign.difference import differences, named
+from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import ConfigurationError
-from harness.links.wire import LIBRARY
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.rigs.recording import RecordingRig
@@ -201,6 +200,9 @@ class Plan:
     scenario: Mapping[str, Any]
     rigs: tuple[Mapping[str, Any], ...]
     devices: tuple[Mapping[str, Any], ...]
+    """With the ``build`` of each."""
+    analogrig: str
+    """The build of analogrig itself."""
 
     @classmethod
     def of(cls, spec: CampaignSpec) -> Plan:
@@ -212,7 +214,8 @@ class Plan:
             spec=spec,
             scenario=scenario.as_table(),
             rigs=tuple(rig_table(name) for name in spec.rigs),
-            devices=tuple(describe(name).as_table() for name in spec.devices),
+            devices=tuple(device_table(name) for name in spec.devices),
+            analogrig=build.of_analogrig(),
         )
         plan._check()
         return plan
@@ -221,17 +224,21 @@ class Plan:
     def from_json(cls, text: str) -> Plan:
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
-    def as_json(self) -> str:
-        """The same plan gives the same text."""
+    def as_table(self) -> dict[str, Any]:
+        """In plain values: all that decides the results, and nothing else."""
         table = dataclasses.asdict(self)
         table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
-        return json.dumps(table, sort_keys=True, separators=(",", ":"))
+        return table
 
-    def digest(self) -> str:
-        """SHA-256 of all that decides the results."""
-        own = [device.library_path for device in map(device_of, self.devices) if isinstance(device, InprocDevice)]
-        built = "".join(_content(path) for path in own if path != LIBRARY)  # it may be another one by the next time
-        return hashlib.sha256((self.as_json() + built).encode()).hexdigest()
+    def as_json(self) -> str:
+        """The same plan gives the same text."""
+        return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
+
+    def check_same(self, table: Any, where: str) -> None:
+        """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
+        found = list(differences(table, json.loads(self.as_json())))
+        if found:
+            raise ConfigurationError(f"{where} ({named(found, ('there', 'here'))}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
         """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
@@ -253,10 +260,14 @@ class Plan:
             self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
         )
 
+    def drawn(self, seed: int) -> dict[str, float]:
+        """The values of a trial that are drawn, by their axes."""
+        rng = np.random.default_rng([seed, _DRAWS])
+        return {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+
     def case(self, cell: Cell, seed: int) -> Case:
         """:raises ConfigurationError: the values make no scenario."""
-        rng = np.random.default_rng([seed, _DRAWS])
-        drawn = {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+        drawn = self.drawn(seed)
         values = {**cell.values, **drawn}
         try:
             scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
@@ -303,16 +314,29 @@ def open_table(table: Mapping[str, Any]) -> Rig:
     return open_rig(table["name"])
 
 
+def device_table(name: str) -> Mapping[str, Any]:
+    """A device by its name, as plain values that ``device_of`` takes, with its ``build``.
+
+    :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read.
+    """
+    device = describe(name)
+    return {**device.as_table(), "build": build.of_device(device)}
+
+
 def device_of(table: Mapping[str, Any]) -> DeviceDescription:
-    return from_table(table, f"device {table['name']}")
+    """The device of such a table, whatever its build is by now."""
+    return from_table({key: value for key, value in table.items() if key != "build"}, f"device {table['name']}")
 
 
-def _content(path: Path) -> str:
-    """:raises ConfigurationError: it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror or error}") from error
+def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
+    """As ``device_of``; of the build that the table names, if it does.
+
+    :raises ConfigurationError: it is another by now.
+    """
+    device = device_of(table)
+    if "build" in table:
+        build.check_device(device, table["build"])
+    return device
 
 
 def one_worker_only(table: Mapping[str, Any]) -> str:

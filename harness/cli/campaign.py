@@ -43,7 +43,16 @@ def add_workers(command: argparse.ArgumentParser) -> None:
     )
 
 
+def begin(arguments: argparse.Namespace) -> None:
+    """Let the processes that will play be made while this one finds out what; most likely there will be several."""
+    from harness.campaign.workers import prepare
+
+    if not arguments.cluster and arguments.workers != 1 and len(os.sched_getaffinity(0)) > 1:
+        prepare()
+
+
 def _run(arguments: argparse.Namespace) -> int:
+    begin(arguments)
     from harness.campaign.conduct import conduct, journal_of
     from harness.campaign.report import write_page
     from harness.campaign.results import as_json, text

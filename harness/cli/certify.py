@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.campaign import add_workers, workers
+from harness.cli.campaign import add_workers, begin, workers
 from harness.cli.options import add_rig, seed
 from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, watched
 
@@ -50,6 +50,7 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    begin(arguments)
     from harness.campaign.spec import one_worker_only, rig_table
     from harness.certificate import certify, question_of
     from harness.devices import describe

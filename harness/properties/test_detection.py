@@ -16,10 +16,9 @@ from harness.information import detectable
 from harness.played import Finding, Played
 from harness.properties import Play, is_playable, with_some_seed
 from harness.rigs.rig import Rig
-from harness.scenario import Scenario, Tweak
+from harness.scenario import Expectations, Scenario, Tweak
 from harness.statistics import Decision, SequentialTest, lower_rate
 from harness.strategies import WARM_UP_N, profile, scenarios, seeds
-from harness.verdict import Expectations
 
 ARL0 = 1e5
 MOST_INFORMATION = 6.0

@@ -68,7 +68,7 @@ class Coin:
 
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
         for task in tasks:
-            yield task, Count(int(self._rng.binomial(100, self._rate)), 100 + 150)
+            yield task, Count(int(self._rng.binomial(100, self._rate)), 100)
 
 
 def outcomes(rate: float, n: int, **settings: Any) -> list[Certificate]:
@@ -104,12 +104,12 @@ class LastFirst:
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
         while True:
             for task in reversed(list(itertools.islice(tasks, 5))):
-                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)
+                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100)
 
 
 class InTurn:
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
-        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)) for task in tasks)
+        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100)) for task in tasks)
 
 
 def test_answer_does_not_depend_on_the_workers() -> None:
@@ -179,7 +179,8 @@ def observed(
     seed: int, latency_n: int | None, *, false_alarms: int = 0, cell: str = "a", theta: str = "0"
 ) -> tuple[tuple[object, ...], Row]:
     change = [latency_n, 3, latency_n is None, False]
-    row = {"seed": seed, "outcome": "passed", "samples": 1000, "false_alarms": false_alarms, "changes": [change]}
+    counts = {"samples": 1000, "armed": 850, "false_alarms": false_alarms}
+    row = {"seed": seed, "outcome": "passed", **counts, "changes": [change]}
     return (cell, seed), {**row, "errors": [0.01, 0.02, 0.03], "theta": theta}
 
 
