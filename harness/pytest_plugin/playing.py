@@ -211,7 +211,9 @@ def _unwritten() -> tuple[type[Exception], ...]:
 
 def properties(item: pytest.Item) -> list[tuple[str, Any]]:
     """What JUnit shall know of the plays of a test."""
-    return [each for played in record_of(item).plays for each in _properties(played).items()]
+    record = record_of(item)
+    found = [("found", f"{record.found[0]!r}"[1:-1])] if record.found else []
+    return [*(each for played in record.plays for each in _properties(played).items()), *found]
 
 
 def _properties(played: Played) -> Mapping[str, Any]:

@@ -21,6 +21,8 @@ from harness.devices import host_child
 from harness.dut import open_dut
 from harness.rigs.description import open_rig
 from harness.scenario import Scenario
+from tests.harness.firmware import needs_firmware
+from tests.harness.processes import ends
 
 SHORT = """\
 samples = 400
@@ -59,6 +61,13 @@ def run(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     return user.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:xdist", *arguments)
 
 
+def refused(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
+    """A run that ends before anything heavy is asked for, and so may be one in this process."""
+    result = user.runpytest_inprocess("-p", "no:cacheprovider", *arguments)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    return result
+
+
 def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]:
     """Those of the first test case."""
     case = ET.parse(user.path / file).getroot().find(".//testcase")  # noqa: S314 - written a moment ago
@@ -80,37 +89,89 @@ def test_play_of_a_scenario_is_a_test_and_junit_knows_its_figures(user: pytest.P
     assert told["overruns"] == "0"
 
 
-def test_option_is_taken_from_command_line_then_environment_then_ini(
+LEVELS = {
+    "default": ("emulator", "host", "None", "build/runs", "ci"),
+    "ini": ("emulator-ideal", "inproc", "of_ini", "runs/ini", "soak"),
+    "environment": ("emulator-0-10v", "any-edges", "of_environment", "runs/environment", "nightly"),
+    "command line": ("emulator-skewed", "inproc?exchange=block", "of_command_line", "runs/command_line", "ci"),
+    "indirect": ("emulator-real", "mean-between-faults", "of_indirect", "runs/indirect", "soak"),
+}
+NAMES = ("rig", "dut", "scenario_dir", "runs_dir", "hil_profile")
+TELLS_ALL = """
+import pytest
+
+def test_it(rig, dut, scenario_dir, runs_dir, hil_profile):
+    print("<", rig.description()["name"], dut.name, scenario_dir, runs_dir, hil_profile, ">")
+"""
+
+
+def test_each_option_is_taken_from_parameter_then_command_line_then_environment_then_ini(
     user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    user.makepyfile("def test_it(hil_profile, runs_dir):\n    print(f'<{hil_profile} {runs_dir}>')")
-    run(user, "-s").stdout.fnmatch_lines(["*<ci build/runs>*"])
-    user.makeini("[pytest]\nanalogrig_hil_profile = soak\nanalogrig_runs_dir = a")
-    run(user, "-s").stdout.fnmatch_lines(["*<soak a>*"])
-    monkeypatch.setenv("ANALOGRIG_HIL_PROFILE", "nightly")
-    run(user, "-s").stdout.fnmatch_lines(["*<nightly a>*"])
-    run(user, "-s", "--hil-profile", "ci").stdout.fnmatch_lines(["*<ci a>*"])
+    path = user.makepyfile(TELLS_ALL)
+    told: dict[str, tuple[str, ...]] = {}
+
+    def tell(level: str, *arguments: str) -> None:
+        (line,) = [line for line in run(user, "-s", path.name, *arguments).outlines if "<" in line]
+        told[level] = tuple(line.partition("< ")[2].removesuffix(" >").split())
+
+    for _, _, folder, *_ in LEVELS.values():
+        user.mkdir(folder)
+    tell("default")
+    options = [f"analogrig_{name} = {value}" for name, value in zip(NAMES, LEVELS["ini"], strict=True)]
+    user.makeini("\n".join(["[pytest]", *options]))
+    tell("ini")
+    for name, value in zip(NAMES, LEVELS["environment"], strict=True):
+        monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
+    tell("environment")
+    given = [f"--{name.replace('_', '-')}={value}" for name, value in zip(NAMES, LEVELS["command line"], strict=True)]
+    tell("command line", *given)
+    of_parameters = [
+        f'@pytest.mark.parametrize("{name}", ["{value}"], indirect=True)\n'
+        for name, value in zip(NAMES, LEVELS["indirect"], strict=True)
+    ]
+    path.write_text(TELLS_ALL.replace("def test_it", "".join(of_parameters) + "def test_it"))
+    tell("indirect", *given)
+    assert told == LEVELS
 
 
-def test_indirect_parametrization_of_a_fixture_comes_first(user: pytest.Pytester) -> None:
-    user.makepyfile(
-        """
-        import pytest
-
-        @pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
-        @pytest.mark.parametrize("dut", ["inproc"], indirect=True)
-        def test_it(bench):
-            assert bench.rig.description()["name"] == "emulator-ideal"
-            assert bench.dut.name == "inproc"
-        """
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("hil_profile", "tea", "must be one of ci, nightly, soak, not 'tea'"),
+        ("scenario_dir", "nowhere", "nowhere is no folder"),
+        ("runs_dir", "short.toml/runs", "short.toml is no folder"),
+    ],
+)
+def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, name: str, value: str, complaint: str
+) -> None:
+    path = user.makepyfile(
+        "import pytest\n\n"
+        f"@pytest.mark.parametrize({name!r}, [{value!r}], indirect=True)\ndef test_it({name}):\n    pass\n"
     )
-    run(user, "--rig", "no-such-rig", "--dut", "no-such-device").assert_outcomes(passed=1)
+    result = user.runpytest_inprocess("-p", "no:cacheprovider", path.name)
+    result.stdout.fnmatch_lines([f"parameter {name} of *::test_it*: {complaint}"])
+    user.makeini(f"[pytest]\nanalogrig_{name} = {value}")
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: *tox.ini: analogrig_{name}: {complaint}"])
+    monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: ANALOGRIG_{name.upper()}: {complaint}"])
+    flag = f"--{name.replace('_', '-')}"
+    refused(user, path.name, f"{flag}={value}").stderr.fnmatch_lines([f"ERROR: {flag}: {complaint}"])
 
 
-def test_profile_that_does_not_exist_is_a_usage_error_in_one_line(user: pytest.Pytester) -> None:
-    result = run(user, "--hil-profile", "tea")
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
-    result.stderr.fnmatch_lines(["*--hil-profile: must be one of ci, nightly, soak, not 'tea'*"])
+def test_rig_or_device_that_does_not_exist_fails_in_one_line_with_who_named_it(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user.makepyfile("def test_rig(rig):\n    pass\n\ndef test_device(dut):\n    pass\n")
+    monkeypatch.setenv("ANALOGRIG_DUT", "no-such")
+    result = run(user, "--rig", "none")
+    result.assert_outcomes(errors=2)
+    result.stdout.fnmatch_lines(
+        ["--rig: no rig is called 'none': *", "ANALOGRIG_DUT: no device is called 'no-such': *"]
+    )
+    assert "Traceback" not in result.stdout.str()
+    assert "another exception" not in result.stdout.str()
 
 
 def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) -> None:
@@ -137,8 +198,7 @@ def recorded(folder: Path) -> Path:
 
 def test_need_that_no_rig_knows_ends_the_collection_in_one_line_with_those_known(user: pytest.Pytester) -> None:
     user.makepyfile("import pytest\n\n@pytest.mark.needs('twaek')\ndef test_it(rig):\n    pass\n")
-    result = run(user)
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result = refused(user)
     result.stderr.fnmatch_lines(["ERROR: *::test_it: needs: no rig is known to 'twaek': there are excite, tweak"])
     assert len(result.errlines) <= 2
 
@@ -231,19 +291,32 @@ def test_inconclusive_play_fails_the_test_with_its_reason(user: pytest.Pytester)
     result.stdout.fnmatch_lines(["*INCONCLUSIVE: device deaf: no estimate for sample *"])
 
 
-def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Pytester) -> None:
+@pytest.mark.parametrize("dut", ["host", pytest.param("qemu-m4", marks=needs_firmware)])
+def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Pytester, dut: str) -> None:
     user.makepyfile(
-        """
+        f"""
+        import os, signal, sys
+
+        sys.path.append({str(Path(__file__).parents[2])!r})
+        from tests.harness.processes import descendants
+
         def test_first(play, dut):
             dut.configure(dut.estimator.__class__(warm_up_n=33))
-            dut.close()
+            device = descendants(os.getpid())[-1]
+            os.kill(device, signal.SIGSTOP)
+            print("<stopped", device, ">")
+            play("short.toml")
 
         def test_second(play, dut):
             assert dut.estimator.warm_up_n != 33
             assert play("short.toml").detects()
         """
     )
-    run(user, "--dut", "host").assert_outcomes(passed=2)
+    result = run(user, "--dut", dut, "-rA")
+    result.assert_outcomes(failed=1, passed=1)
+    result.stdout.fnmatch_lines([f"device {dut}: no * within 2 s *"])
+    (stopped,) = re.findall("<stopped ([0-9]+) >", result.stdout.str())
+    assert ends(int(stopped))
 
 
 SHARED = """
@@ -270,8 +343,7 @@ def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pyteste
 
 def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
     user.makepyfile(SHARED)
-    result = user.runpytest_subprocess("-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result = refused(user, "-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
     result.stderr.fnmatch_lines(["ERROR: device serial:/dev/null: one worker owns it, and --dist loadfile may not: *"])
 
 
