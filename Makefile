@@ -88,7 +88,7 @@ fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers,
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
 fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/README.md
-	@$(BIN)/python -m tests.instrument.hostile $(FUZZ_S) 0
+	@$(BIN)/python -m tests.served.hostile $(FUZZ_S) 0
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)

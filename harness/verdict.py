@@ -25,7 +25,7 @@ from harness import config, information
 from harness.catalogue import Change, SteppedFlag
 from harness.plant import PARAMETERS, physical_parameters
 from harness.run import LOST, Run, Segment
-from harness.scenario import Expectations
+from harness.scenario import MISSING, Expectations
 
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
@@ -174,8 +174,8 @@ def is_captured(run: Run) -> bool:
 
 
 def missing_text(run: Run) -> str:
-    """What the samples are that count as missing: ``clipped and missing for the device``."""
-    return "missing for the device or not in the log" if is_captured(run) else "clipped and missing for the device"
+    """What the samples are that count as missing."""
+    return "missing for the device or not in the log" if is_captured(run) else MISSING
 
 
 def judge(run: Run) -> Verdict:
@@ -390,16 +390,14 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
-    if run.conditions.counters.get("refused"):
-        reasons.append(f"the device refused {run.conditions.counters['refused']} samples")
+    reasons += refusals(run.conditions.counters.get("refused", 0))
     reasons += _losses(run)
-    missing = int(run.missing.sum())
-    if run.samples and missing > expect.max_missing_fraction * run.samples:
-        reasons.append(
-            f"{missing} of {run.samples} samples were {missing_text(run)},"
-            f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
-        )
-    return reasons
+    return reasons + expect.gaps(run.samples, int(run.missing.sum()), missing_text(run))
+
+
+def refusals(refused: int) -> list[str]:
+    """Why a run in which the device refused so many samples is not valid; empty if it is."""
+    return [f"the device refused {refused} samples"] if refused else []
 
 
 def _losses(run: Run) -> list[str]:
