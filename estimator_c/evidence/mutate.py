@@ -54,6 +54,7 @@ __all__ = [
     "recalled",
     "sampled",
     "sources",
+    "table",
     "try_all",
     "write",
 ]
@@ -530,6 +531,16 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
         _Session(noticed, work).run()
 
 
+def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
+    """Of each file how many mutants there are, were tried, and what became of them; as the README has it."""
+    rows = ["| | mutants | tried | noticed | the same machine code | do not compile | not noticed |", f"|{'---|' * 7}"]
+    for name, count in [*Counter(mutant.file for mutant in every).most_common(), ("all", len(every))]:
+        fates = [outcome.fate for outcome in outcomes if name in ("all", outcome.mutant.file)]
+        counts = (fates.count(fate) for fate in ("killed", "equivalent", "invalid", "survived"))
+        rows.append(f"| {' | '.join(map(str, (name, count, len(fates), *counts)))} |")
+    return "\n".join(rows)
+
+
 def main() -> int:
     """Prints what survived; the exit status is 1 if something is unexplained."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -553,9 +564,9 @@ def main() -> int:
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             print(shown(outcome.mutant.key), flush=True)
 
-    try_all([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs, noticed, tell)
-    fates = Counter(outcome.fate for outcome in outcomes.values())
-    print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
+    if left := [mutant for mutant in chosen if mutant not in outcomes]:
+        try_all(left, arguments.jobs, noticed, tell)
+    print(table(every, list(outcomes.values())))
     survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}
     stale = known.keys() - survivors if len(outcomes) == len(every) else set()
     for key in sorted(stale):
