@@ -221,6 +221,12 @@ def test_gap_ends_the_doubt_in_favour_of_the_reading_that_explains_most(estimato
     assert result.counters["slips"] == 0
 
 
+def statistic_of_the_twin(
+    config: EstimatorConfig, u: NDArray[np.float64], y: NDArray[np.float64], valid: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    return np.array([step.statistic for step in Twin(config).run(u.tolist(), y.tolist(), valid.tolist())])
+
+
 def statistics_in_doubt(
     slip: int, lag_n: int, config: EstimatorConfig, b: list[float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -237,9 +243,9 @@ def statistics_in_doubt(
     y = np.round(lfilter(b, [1.0, 0.5, 0.8], felt[1:-1]) + rng.normal(0.0, 1.0, n))
     valid = np.ones(n, bool)
     valid[at + np.flatnonzero(np.abs(np.diff(u[at:])) > 100.0)[0] + 1 + lag_n] = False
-    twin = Twin(config).run((u / 1000.0).tolist(), (y / 1000.0).tolist(), valid.tolist())
+    twin = statistic_of_the_twin(config, u / 1000.0, y / 1000.0, valid)
     estimator = harness.estimator.Estimator(config).run(u / 1000.0, y / 1000.0, valid)
-    return estimator.statistic[valid].astype(np.float64), np.array([step.statistic for step in twin])[valid]
+    return estimator.statistic[valid].astype(np.float64), twin[valid]
 
 
 IN_DOUBT = EstimatorConfig(
