@@ -83,7 +83,7 @@ class Trials:
             its = slice(block.first, block.first + len(u))
             force[its] = u
             found.append(block.first + self._estimator.alarms(u, y, valid, status=flags[its]))
-        flags, alarms = _FLAGS[flags], np.concatenate(found)
+        flags, alarms = flags_of(flags), np.concatenate(found)
         return alarms, flags, exposure.exposed(force, flags, alarms, self._tables[1]["estimator"])
 
     def run(self, scenario: Scenario, seed: int) -> Run:
@@ -110,7 +110,7 @@ class Trials:
             theta=np.concatenate([steps.theta for steps in parts]),
             innovation=np.concatenate([steps.innovation for steps in parts]),
             statistic=statistic,
-            flags=_FLAGS[np.concatenate([steps.status for steps in parts])],
+            flags=flags_of(np.concatenate([steps.status for steps in parts])),
             alarm_index=alarms,
             alarm_kind=np.full(len(alarms), trigger, np.uint8),
             alarm_statistic=statistic[alarms],
@@ -141,3 +141,8 @@ class Trials:
 def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
     """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
     return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)
+
+
+def flags_of(status: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """StepStatus as the flags of a Run; (n,) each."""
+    return _FLAGS.take(status)

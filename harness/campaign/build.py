@@ -30,7 +30,11 @@ def of_analogrig() -> str:
     whole = hashlib.sha256()
     for path in sources:
         whole.update(path.read_bytes())
-    return f"{version('analogrig')} {whole.hexdigest()[:DIGITS]}"
+    return f"{_version()} {whole.hexdigest()[:DIGITS]}"
+
+
+def _version() -> str:
+    return version("analogrig")
 
 
 def of_device(device: DeviceDescription) -> str:
@@ -49,9 +53,9 @@ def of_device(device: DeviceDescription) -> str:
 def check_analogrig(planned: str) -> None:
     """:raises ConfigurationError: the campaign was begun by another version. Its compilers may have been others: the
     estimates are the same bits."""
-    own = of_analogrig()
-    if own.partition(" ")[0] != planned.partition(" ")[0]:
-        raise ConfigurationError(f"this worker has analogrig {own}, the campaign was begun by {planned}")
+    own, begun_by = _version(), planned.partition(" ")[0]
+    if own != begun_by:
+        raise ConfigurationError(f"this worker has analogrig {own}, the campaign was begun by {begun_by}")
 
 
 def check_device(device: DeviceDescription, planned: str) -> None:

@@ -14,9 +14,12 @@ from typing import Any
 
 from harness.campaign.journal import Journal
 from harness.campaign.results import Results
-from harness.campaign.spec import Chunk, Plan
+from harness.campaign.spec import Chunk, Plan, device_as_planned
 from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
 from harness.campaign.workers import Workers
+from harness.devices import InprocDevice
+from harness.dut import connect
+from harness.errors import DeviceError, LinkError
 from harness.statistics import ConfidenceSequence, Decision
 
 _EXPOSURE = {"missed": "visible", "false_alarms": "armed"}
@@ -103,6 +106,21 @@ def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None =
         results.save(out)
         journal.remove()
     return results
+
+
+def unreachable(plan: Plan) -> dict[str, str]:
+    """Why devices cannot be had from here, by their names. Those within a process are not tried: a library may end it.
+
+    :raises ConfigurationError: a device refuses its configuration.
+    """
+    found = {}
+    for device in map(device_as_planned, plan.devices):
+        try:
+            if not isinstance(device, InprocDevice):
+                connect(device).close()
+        except (LinkError, DeviceError) as error:
+            found[device.name] = str(error)
+    return found
 
 
 def journal_of(out: Path) -> Path:
