@@ -603,6 +603,32 @@ def describe(name: str) -> DeviceDescription:
     return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
 
 
+def of_scenario(filed: str, given: str, otherwise: str) -> str:
+    """The device to play a scenario on: the one that the user has given, that of the scenario's file, or another.
+
+    What a file names elsewhere is not opened on its word alone: the user must have named the same.
+
+    :raises ConfigurationError: the user has not; or there is no such device.
+    """
+    if not filed or not (place := describe(filed).elsewhere):
+        return given or filed or otherwise
+    if given:
+        return filed if describe(given).elsewhere == place else given
+    if describe(otherwise).elsewhere == place:
+        return filed
+    raise ConfigurationError(
+        f"the scenario is for {place}, which is not opened on the word of a file: say --dut {place}, or another"
+    )
+
+
+def recorded(description: Mapping[str, Any]) -> DeviceDescription:
+    """That of a record of ``Dut.description()``.
+
+    :raises ConfigurationError: it describes no device.
+    """
+    return from_table({key: value for key, value in description.items() if key != "identity"}, "the recorded device")
+
+
 def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:
     """A description from plain values; ``where`` leads every error.
 

@@ -15,6 +15,7 @@ from emulator.suspension import PROGRAMS
 from harness import config
 from harness.plant import Plant
 from harness.run import Segment
+from harness.statement import Statement
 
 MAX_RAMP_N = 100_000
 
@@ -134,6 +135,10 @@ class Scenario:
     """Of all that is random, unless the user says another."""
     rig: str = ""
     """The rig that plays it, unless the user says another; a .toml file is meant from the scenario's own folder."""
+    dut: str = ""
+    """The device that it is for, likewise."""
+    statement: Statement | None = None
+    """What a test asserted of it, and did not find; None: what is expected is what counts."""
     description: str = ""
     name: str = ""
 
@@ -162,9 +167,10 @@ class Scenario:
         """
         path = config.locate("scenarios", name)
         scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
-        if scenario.rig.endswith(".toml"):
-            scenario = dataclasses.replace(scenario, rig=str(path.parent / scenario.rig))
-        return scenario
+        rig, dut = (
+            str(path.parent / each) if each.endswith(".toml") else each for each in (scenario.rig, scenario.dut)
+        )
+        return dataclasses.replace(scenario, rig=rig, dut=dut)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:

@@ -37,7 +37,9 @@ OPTIONS = (
     "-main=main",
     "-eva-auto-loop-unroll=12",
     "-eva-slevel=60",
-    "-eva-slevel-function=main:4",
+    "-eva-slevel-function=main:2",
+    "-eva-widening-delay=1",
+    "-eva-widening-period=1",
     "-eva-split-return-function=orders_valid:0,est_config_valid:0,est_init:0",
     "-warn-special-float=none",
 )

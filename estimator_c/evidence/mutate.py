@@ -24,6 +24,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import pickle
 import re
 import resource
 import shutil
@@ -31,7 +32,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections import Counter, defaultdict
+import time
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -52,6 +54,7 @@ __all__ = [
     "recalled",
     "sampled",
     "sources",
+    "table",
     "try_all",
     "write",
 ]
@@ -296,16 +299,25 @@ def write(record: Path, outcomes: Iterable[Outcome]) -> None:
 _library = Path()
 
 
-def _kept(simulate: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
-    """A simulation whose results are kept: tests may write into what they get."""
-    known: dict[Any, tuple[Any, Any]] = {}
+KEPT = {
+    "tests.estimator_c.test_est_trigger": ("suspension", "statistic_of_the_twin"),
+    "tests.estimator_c.test_est_estimation": ("batch",),
+    "tests.estimator_c.test_numerics": ("wide",),
+    "tests.harness.test_twin": ("followed",),
+}
+"""Functions of the tests that take time and do not ask the core. A module comes before those that import from it."""
 
-    def kept(plants: list[Any], edges: Any, *rest: Any) -> tuple[Any, Any]:
-        key = (tuple(plants), edges.tobytes(), rest)
+
+def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """One whose results are kept: tests may write into what they get."""
+    known: dict[bytes, bytes] = {}
+
+    @functools.wraps(function)
+    def kept(*arguments: Any) -> Any:
+        key = pickle.dumps(arguments)
         if key not in known:
-            known[key] = simulate(plants, edges, *rest)
-        u, y = known[key]
-        return u.copy(), y.copy()
+            known[key] = pickle.dumps(function(*arguments))
+        return pickle.loads(known[key])  # noqa: S301 - our own
 
     return kept
 
@@ -320,8 +332,10 @@ def _load_tests() -> None:
     hypothesis.settings.load_profile("mutants")
     driver = importlib.import_module("tests.estimator_c.est_driver")
     driver.compile_driver = lambda _: _library  # type: ignore[attr-defined]
-    trigger = importlib.import_module("tests.estimator_c.test_est_trigger")
-    trigger.suspension = _kept(trigger.suspension)  # type: ignore[attr-defined]
+    for name, functions in KEPT.items():
+        module = importlib.import_module(name)
+        for function in functions:
+            setattr(module, function, _kept(getattr(module, function)))
     estimator = importlib.import_module("harness.estimator").Estimator
     start = estimator.__init__
 
@@ -333,7 +347,9 @@ def _load_tests() -> None:
 
 
 class _Session:
-    """A session of pytest: each test once on the core as it is, then ``work``, which has them run again in forks.
+    """A session of pytest: each test twice on the core as it is, to fill what is kept and to see how long it takes.
+
+    Then ``work``, which has them run again in forks.
 
     :param noticed: how many mutants each test is known to have noticed.
     """
@@ -341,7 +357,7 @@ class _Session:
     def __init__(self, noticed: Mapping[str, int], work: Callable[[_Session], None]) -> None:
         self._noticed, self._work = noticed, work
         self._tests: list[pytest.Item] = []
-        self._seconds: defaultdict[str, float] = defaultdict(float)
+        self._seconds: dict[str, float] = {}
         self._outside = sys.stdout
         self._failed = ""
         self._before_each: Callable[[], None] = lambda: None
@@ -357,7 +373,7 @@ class _Session:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """In place of pytest's own."""
         self._tests = session.items
-        if not self._first_failure():
+        if not (self._first_failure() or self._first_failure()):
             self._tests.sort(key=self._price)
             with contextlib.redirect_stdout(self._outside):
                 self._work(self)
@@ -368,15 +384,16 @@ class _Session:
         return self._seconds[test.nodeid] / (1 + self._noticed.get(_name(test.nodeid), 0))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Remembers what failed first, and how long each test takes."""
-        self._seconds[report.nodeid] += report.duration
+        """Remembers what failed first."""
         if report.failed and not self._failed:
             self._failed = _name(report.nodeid)
 
     def _first_failure(self) -> str:
         for test, following in itertools.zip_longest(self._tests, self._tests[1:]):
             self._before_each()
+            start = time.process_time()
             test.ihook.pytest_runtest_protocol(item=test, nextitem=following)
+            self._seconds[test.nodeid] = time.process_time() - start
             if self._failed:
                 break
         return self._failed
@@ -514,6 +531,16 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
         _Session(noticed, work).run()
 
 
+def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
+    """Of each file how many mutants there are, were tried, and what became of them; as the README has it."""
+    rows = ["| | mutants | tried | noticed | the same machine code | do not compile | not noticed |", f"|{'---|' * 7}"]
+    for name, count in [*Counter(mutant.file for mutant in every).most_common(), ("all", len(every))]:
+        fates = [outcome.fate for outcome in outcomes if name in ("all", outcome.mutant.file)]
+        counts = (fates.count(fate) for fate in ("killed", "equivalent", "invalid", "survived"))
+        rows.append(f"| {' | '.join(map(str, (name, count, len(fates), *counts)))} |")
+    return "\n".join(rows)
+
+
 def main() -> int:
     """Prints what survived; the exit status is 1 if something is unexplained."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -537,9 +564,9 @@ def main() -> int:
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             print(shown(outcome.mutant.key), flush=True)
 
-    try_all([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs, noticed, tell)
-    fates = Counter(outcome.fate for outcome in outcomes.values())
-    print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
+    if left := [mutant for mutant in chosen if mutant not in outcomes]:
+        try_all(left, arguments.jobs, noticed, tell)
+    print(table(every, list(outcomes.values())))
     survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}
     stale = known.keys() - survivors if len(outcomes) == len(every) else set()
     for key in sorted(stale):

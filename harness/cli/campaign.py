@@ -6,12 +6,11 @@ import argparse
 import contextlib
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show
+from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, watched
 
 if TYPE_CHECKING:
     from harness.campaign.conduct import Tally
@@ -115,23 +114,15 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
-    """One line on standard error, at most once a second; None when nobody watches."""
-    if not sys.stderr.isatty():
+    """None when nobody watches."""
+    line = watched()
+    if line is None:
         return None
-    import time
-
     from harness.campaign.results import anytime_text
 
     most = len(plan.cells()) * plan.spec.trials
-    next_s = 0.0
 
     def tell(tally: Tally) -> None:
-        nonlocal next_s
-        if time.monotonic() >= next_s or tally.trials == most:
-            next_s = time.monotonic() + 1.0
-            end = "\n" if tally.trials == most else ""
-            line = f"{tally.trials} of {most} trials; {anytime_text(tally.total())}"
-            sys.stderr.write(f"\r{line:<110}{end}")
-            sys.stderr.flush()
+        line.show(f"{tally.trials} of {most} trials; {anytime_text(tally.total())}", is_last=tally.trials == most)
 
     return tell

@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from harness.cli.campaign import add_workers, begin, workers
-from harness.cli.options import seed
-from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+from harness.cli.options import add_rig, seed
+from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, watched
 
 if TYPE_CHECKING:
     from harness.certificate import Certificate, Question
@@ -41,7 +40,7 @@ def add(commands: Any) -> None:
         help=f"for rates too rare to be waited for: N estimates from branches with louder noise ({_ESTIMATES})",
     )
     command.add_argument("--scenario", default="healthy", metavar="NAME", help="one without changes (%(default)s)")
-    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", "emulator"), metavar="NAME", help="the rig")
+    add_rig(command)
     command.add_argument("--dut", default=os.environ.get("ANALOGRIG_DUT", "host"), metavar="NAME", help="the device")
     command.add_argument("--seed", type=seed, default=0, metavar="N", help="of the first run (%(default)d)")
     add_workers(command)
@@ -94,11 +93,11 @@ def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
 
 
 def _progress() -> Callable[[int, int, int], None] | None:
-    if not sys.stderr.isatty():
+    line = watched()
+    if line is None:
         return None
 
     def tell(samples: int, most: int, alarms: int) -> None:
-        sys.stderr.write(f"\r{samples} of {most} samples, {alarms} alarms{'' if samples < most else chr(10)}")
-        sys.stderr.flush()
+        line.show(f"{samples} of {most} samples, {alarms} alarms", is_last=samples >= most)
 
     return tell

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from harness.information import QUANTISATION_VARIANCE_LSB2
 from harness.plant import PARAMETERS, Plant, SampledPlant
-from harness.run import CHANNELS, Channel, missing_to_device
+from harness.run import CHANNELS, MEASURED, Channel, missing_to_device
 
 Array = NDArray[np.float64]
 
@@ -60,10 +60,10 @@ class Signals:
         cls, codes: NDArray[np.uint16], clipped: NDArray[np.bool_], channels: Mapping[str, Channel], period_s: float
     ) -> Self:
         """Of codes and clipped (n, 4), columns as CHANNELS."""
-        columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in ("force", "displacement")}
+        columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in MEASURED}
         noise_n, noise_m = (
             (channels[name].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(channels[name].lsb)
-            for name in ("force", "displacement")
+            for name in MEASURED
         )
         valid = ~missing_to_device(clipped)
         return cls(columns["force"], columns["displacement"], valid, period_s, noise_n, noise_m)

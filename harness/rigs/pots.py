@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
+import serial
+
 from harness.errors import ConfigurationError, LinkError, RigError
 from harness.links.wire import DEFAULT_BAUD, PortWire
 
@@ -119,6 +121,12 @@ class SerialPots(_Boxed):
         super().__post_init__()
         if not self.url:
             raise ValueError("url must say where the box is: a serial port, or any URL of pyserial")
+        try:
+            serial.serial_for_url(self.url, do_not_open=True)
+        except ValueError as error:
+            raise ValueError(f"url {self.url}: {error}") from error
+        except OSError:  # what is not there may be there when it is opened
+            pass
         if not 1 <= self.baud <= 100_000_000:
             raise ValueError(f"baud must be 1 to 100000000, not {self.baud}")
         _check_placeholders("line", self.line)

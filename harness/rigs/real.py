@@ -31,8 +31,8 @@ from harness.rigs.instrument import Instrument, PotBox, Record, Turn, located
 from harness.rigs.lock import Lock
 from harness.rigs.pots import NoPots, Pots
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
-from harness.rigs.wiring import MEASURED, InstrumentPots, RealDescription, check_wiring
-from harness.run import CHANNELS, Channel, Segment
+from harness.rigs.wiring import InstrumentPots, RealDescription, check_wiring
+from harness.run import CHANNELS, MEASURED, Channel, Segment
 from harness.scenario import Scenario
 
 LEAD_N = 500

@@ -11,8 +11,7 @@ from emulator import SuspensionComputer
 from harness.errors import ConfigurationError
 from harness.rigs.instrument import Datasheet
 from harness.rigs.pots import PotsDescription
-
-MEASURED = ("force", "displacement")
+from harness.run import MEASURED
 
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from harness.errors import SelfTestError
 from harness.rigs.rig import Rig
+from harness.run import MEASURED
 from harness.self_test import checks, noise
 from harness.self_test.findings import Check, Findings
 from harness.self_test.record import HIGH_V, LOW_V, SelfTestRecord
@@ -28,8 +29,6 @@ from harness.self_test.timing import Levels, SeenEdges, averaged_n, lateness
 
 LEAST_SWING_V = 0.25
 """A channel that moves by less shows no signal."""
-
-_CHANNELS = ("force", "displacement")
 
 
 def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
@@ -48,10 +47,10 @@ def examined(record: SelfTestRecord) -> tuple[Check, ...]:
 
     :raises SelfTestError: there is no signal in it, or a drop-out.
     """
-    clipping = tuple(_clipping(record, channel) for channel in _CHANNELS)
+    clipping = tuple(_clipping(record, channel) for channel in MEASURED)
     if off_scale := tuple(each for each in clipping if each.value > 0.5 and not _moves(record, each.channel)):
         return off_scale
-    for channel in _CHANNELS:
+    for channel in MEASURED:
         if not _moves(record, channel):
             raise SelfTestError(
                 f"no signal on {channel}, which moves by {record.swing_v(channel):.2g} V: is the generator on, the"
@@ -64,7 +63,7 @@ def examined(record: SelfTestRecord) -> tuple[Check, ...]:
     leads = (identity, *seen.polarity())
     if any(each.state == "wrong" for each in leads):
         return leads
-    range_use = (checks.range_use(name, record.swing_codes(name), record.channels[name].codes) for name in _CHANNELS)
+    range_use = (checks.range_use(name, record.swing_codes(name), record.channels[name].codes) for name in MEASURED)
     return (*leads, *clipping, *range_use, *seen.quantities())
 
 
@@ -234,7 +233,7 @@ class _Seen:
     def _gains(self) -> tuple[float, float]:
         """Deviation of the displacement's static gain, by the force as measured and as commanded."""
         record, response = self._record, self._response
-        force, displacement = (record.channels[name].unit_per_v for name in _CHANNELS)
+        force, displacement = (record.channels[name].unit_per_v for name in MEASURED)
         measured = response.gain * record.plant.stiffness_n_per_m * displacement / force - 1.0
         if self._clipped:
             return measured, measured

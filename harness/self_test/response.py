@@ -82,7 +82,6 @@ class Response:
     """Of the rising or the falling instant, whichever is larger."""
     residual: NDArray[np.float64]
     """(m,): of the samples used, in the unit of the displacement."""
-    residual_rms: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,5 +168,4 @@ class Answer:
             period_error_n=float(errors[4]),
             instant_error_n=float(errors[5:].max()),
             residual=y - design @ linear,
-            residual_rms=rms,
         )

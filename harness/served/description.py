@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields, replace
 
-from emulator.program import CHANNELS
 from emulator.sampler import Card
 from harness.served.acquisition import AcquisitionFaults
 from harness.served.inputs import InputFaults
-from harness.served.table import Wiring
+from harness.served.table import SEEN, Wiring
 
 _ON_BOTH = {"noise_lsb", "gain_error", "offset_lsb", "skew_s", "clock_drift_ppm"}
 _OF_THE_CARD = {"bits", "rate_hz", "ranges_v", "throughput_hz"}
-_SEEN = (CHANNELS.index("force"), CHANNELS.index("displacement"))
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class InstrumentDescription:
 
         :raises ValueError: together they are too large.
         """
-        own, (first, second) = self.inputs, _SEEN
+        own, (first, second) = self.inputs, SEEN
         lsb_v, noise_lsb = card.lsb_v, card.noise_lsb
         gain_error, offset_lsb, skew_s = (
             card.per_channel(name).tolist() for name in ("gain_error", "offset_lsb", "skew_s")

@@ -19,8 +19,9 @@ from emulator.excitation import TICKS_PER_SAMPLE, Edges, Excitation
 from emulator.machine import Mode
 from emulator.program import CHANNELS, SOURCE
 from emulator.suspension import SuspensionComputer
+from harness.run import MEASURED
 
-SEEN = tuple(CHANNELS.index(name) for name in ("force", "displacement"))
+SEEN = tuple(CHANNELS.index(name) for name in MEASURED)
 
 FIRST_RATE_HZ = 160e3
 AT_A_TIME_N = 1 << 16

@@ -207,16 +207,27 @@ def test_change_just_behind_the_range_is_not_taken_for_one_in_it() -> None:
     assert said == f"the plant seems to have changed before or after the samples {sample - 100} to {sample - 2}"
 
 
-@pytest.mark.parametrize("search", [range(400, 500), range(700, 800)], ids=["long before it", "long after it"])
-def test_change_far_outside_of_the_range_is_not_taken_for_one_in_it(search: range) -> None:
+@pytest.mark.parametrize(
+    ("search", "said"),
+    [
+        (range(400, 500), "the plant seems to have changed before or after the samples 400 to 499"),
+        (range(700, 800), "what a plant that changes once leaves of the samples has"),
+    ],
+    ids=["long before it", "long after it"],
+)
+def test_change_far_outside_of_the_range_is_not_taken_for_one_in_it(search: range, said: str) -> None:
     signals = simulated([(0, FRONT), (600, SOFT)], 1200, seed=17)
-    assert isinstance(onset(signals, FRONT, SOFT, search), NoOnset)
+    found = onset(signals, FRONT, SOFT, search)
+    assert isinstance(found, NoOnset)
+    assert not found.unchanged
+    assert found.reason.startswith(said)
 
 
 def test_another_change_nearby_is_kept_out() -> None:
     signals = simulated([(0, FRONT), (600, SOFT), (700, FRONT.scaled("M", 0.5).scaled("K", 0.7))], 1200, seed=35)
     crowded = onset(signals, FRONT, SOFT, range(500, 650))
-    assert isinstance(crowded, NoOnset) or crowded.high - crowded.low > 2
+    assert isinstance(crowded, Onset)
+    assert crowded.high - crowded.low > 5
     assert onset(signals, FRONT, SOFT, range(500, 650), within=range(700)) == Onset(600, 600, 600)
     with pytest.raises(ValueError, match=r"leaves range\(550, 700\), in which the plant changes no other time"):
         onset(signals, FRONT, SOFT, range(500, 650), within=range(550, 700))
@@ -239,16 +250,18 @@ def test_range_that_leaves_the_record_is_a_mistake_of_the_caller(search: range) 
 
 
 def test_begin_and_end_of_an_even_turn_are_within_their_intervals() -> None:
-    """On machines of real components."""
-    beside = 0
+    """On machines of real components. The mean width of a hundred begins is 21 to 22 samples (README), of ten instants
+    it is below twice that."""
+    beside, widths = 0, []
     for seed in range(5):
         trial = Trial.ramp(seed, "free" if seed % 2 else "card")
         out = trial.turned()
         assert isinstance(out, SlowTurn), out
         beside += not out.begin.low <= trial.sample <= out.begin.high
         beside += not out.end.low <= trial.sample + trial.ramp_n <= out.end.high
-        assert out.end.high - out.begin.low <= 1.5 * trial.ramp_n + 120
+        widths += [each.high - each.low + 1 for each in (out.begin, out.end)]
     assert beside == 0
+    assert np.mean(widths) < 44.0
 
 
 def test_gentle_turn_of_a_hand_is_found_from_its_begin_to_its_end() -> None:
