@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +14,12 @@ from harness import config
 from harness.campaign.spec import Cell, Plan
 from harness.campaign.trial import Row, samples_of
 from harness.errors import ConfigurationError, RecordingError
+from harness.plant import PARAMETERS
+from harness.scenario import MAX_SAMPLES
 from harness.statistics import ConfidenceSequence
 from harness.storage import replacing
 
-FORMAT, FORMAT_VERSION = "analogrig-campaign", 1
+FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 
 MAX_FILE_BYTES = 4_000_000_000
 
@@ -39,7 +42,7 @@ class Results:
 
         :raises RecordingError: the file cannot be written.
         """
-        head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": json.loads(self.plan.as_json())}
+        head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": self.plan.as_table()}
         with replacing(path) as file:
             file.write(f'{json.dumps(head, sort_keys=True)[:-1]}, "cells": [\n'.encode())
             for i, rows in enumerate(self.rows):
@@ -63,7 +66,7 @@ class Results:
         try:
             results = cls(config.build(Plan, table["plan"], str(path)), tuple(map(tuple, table["cells"])))
             results._check()
-        except (ConfigurationError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (ConfigurationError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise RecordingError(f"{path}: damaged results of a campaign ({error})") from error
         return results
 
@@ -72,10 +75,7 @@ class Results:
 
         :raises ConfigurationError: they are another's.
         """
-        if self.plan.digest() != plan.digest():
-            raise ConfigurationError(
-                f"{path}: holds the results of another campaign: choose another --out, or remove it"
-            )
+        plan.check_same(json.loads(self.plan.as_json()), f"{path}: holds the results of another campaign")
         return self
 
     def cells(self) -> list[tuple[Cell, Summary]]:
@@ -91,20 +91,37 @@ class Results:
         return next((each for each in ("failed", "inconclusive") if each in outcomes), "passed")
 
     def _check(self) -> None:
-        if len(self.rows) != len(self.plan.cells()):
-            raise ValueError(f"{len(self.rows)} cells, where the plan has {len(self.plan.cells())}")
-        for row in (row for rows in self.rows for row in rows):
-            _check_row(row)
+        if len(self.rows) != self.plan.size:
+            raise ValueError(f"{len(self.rows)} cells, where the plan has {self.plan.size}")
+        spec = self.plan.spec
+        for rows in self.rows:
+            for row in rows:
+                _check_row(row)
+            if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
+                raise ValueError("rows of other seeds than the plan has")
+            if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
+                raise ValueError(f"a cell of {len(rows)} trials")
 
 
 def _check_row(row: Any) -> None:
+    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``trial.row``."""
     if row["outcome"] not in ("passed", "failed", "inconclusive"):
         raise ValueError("a row without an outcome")
-    counts = [row[name] for name in ("seed", "samples", "false_alarms")]
-    if not all(type(count) is int and count >= 0 for count in counts) or row["false_alarms"] > row["samples"]:
+    counts = [row[name] for name in ("false_alarms", "armed", "samples")]
+    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in counts) or counts != sorted(counts):
         raise ValueError("a row whose counts cannot be")
     if not all(_is_change(*change) for change in row["changes"]):
         raise ValueError("a change that is none")
+    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
+        raise ValueError("errors that are none")
+    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
+        raise ValueError("a text that is none")
+    if not all(map(_is_number, row.get("drawn", {}).values())):
+        raise ValueError("a drawn value that is none")
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
 def _is_change(latency_n: object, bound_n: object, missed: object, late: object) -> bool:
@@ -121,9 +138,11 @@ class Summary:
     failed: int
     inconclusive: int
     samples: int
+    armed: int
+    """Those in which the trigger was armed."""
     false_alarms: int
     false_alarm_rate: tuple[float, float]
-    """Bounds, per sample."""
+    """Bounds, per sample in which the trigger was armed."""
     visible: int
     missed: int
     late: int
@@ -135,6 +154,8 @@ class Summary:
     """Mean information bound of the changes that were detected and could be."""
     error: Mapping[str, float]
     """rms relative error of M, B and K at the end."""
+    doubt: str
+    """The seed of the first inconclusive trial, and why it is that; empty: there is none."""
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
@@ -150,9 +171,10 @@ class Summary:
             failed=sum(row["outcome"] == "failed" for row in rows),
             inconclusive=len(rows) - len(valid),
             samples=counts["samples"],
+            armed=counts["armed"],
             false_alarms=counts["false_alarms"],
             false_alarm_rate=ConfidenceSequence(
-                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["samples"], events=counts["false_alarms"]
+                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["armed"], events=counts["false_alarms"]
             ).bounds,
             visible=counts["visible"],
             missed=counts["missed"],
@@ -164,8 +186,13 @@ class Summary:
             latency_p95_n=float(latencies[-(-95 * len(latencies) // 100) - 1]) if latencies else None,
             bound_n=statistics.fmean(bounds) if bounds else None,
             error={
-                name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5 for i, name in enumerate("MBK") if errors
+                name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5
+                for i, name in enumerate(PARAMETERS)
+                if errors
             },
+            doubt=next(
+                (f"seed {row['seed']}: {row.get('why', '')}" for row in rows if row["outcome"] == "inconclusive"), ""
+            ),
         )
 
 
@@ -184,7 +211,7 @@ def anytime_text(counts: Mapping[str, int]) -> str:
     parts = []
     for name, exposure, expected, unit in (
         ("missed", "visible", _EXPECTED_MISS_RATE, "changes"),
-        ("false_alarms", "samples", _EXPECTED_FALSE_ALARM_RATE, "samples"),
+        ("false_alarms", "armed", _EXPECTED_FALSE_ALARM_RATE, "samples"),
     ):
         if counts[exposure]:
             known = ConfidenceSequence(CONFIDENCE, expected, trials=counts[exposure], events=counts[name])
@@ -223,8 +250,11 @@ def text(results: Results) -> str:
         rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
-    note = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"
-    return "\n".join([head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", f"  {note}"])
+    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
+    notes += [f"{total.inconclusive} trials inconclusive, such as {total.doubt}"] if total.inconclusive else []
+    return "\n".join(
+        [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
+    )
 
 
 def as_json(results: Results) -> dict[str, Any]:
@@ -247,6 +277,6 @@ def _numbers(summary: Summary) -> list[str]:
         ),
         f"{summary.miss_rate[1]:.2g}" if summary.visible else "-",
         str(summary.false_alarms),
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.samples else "-",
+        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "-",
         *("-" if each is None else f"{each:.1f}" for each in averages),
     ]
