@@ -1,4 +1,4 @@
-/// The covariance of theta in factors: P = U D U' with U unit upper triangular, in units of the noise variance. A product of
+/// The covariance of theta in factors: P = U D U' / weight with U unit upper triangular, in units of the noise variance. A product of
 /// this form cannot lose symmetry, and stays positive as long as D does.
 
 #ifndef EST_FACTORS_H_INCLUDED
@@ -6,14 +6,13 @@
 
 #include "est_shape.h"
 
-/// No d leaves the range that makes sense. Without the upper limit the variance of a direction that is not excited grows by
-/// 1 / forgetting per equation, without end ("covariance blow-up", thesis 3.6); no direction needs to be less certain than it
-/// was at the start. Without the lower one, certain beyond the precision of float32 by any measure of the data, a direction
-/// excited beyond all measure would be lost to underflow.
-EST_INLINE float est_limited(const float d, const float upper) {
-    const float positive = d + 1.0e-30F;
-    return (positive < upper) ? positive : upper;
-}
+/// Without a lower limit, certain beyond the precision of float32 by any measure of the data, a direction excited beyond all
+/// measure would be lost to underflow.
+#define EST_D_MIN 1.0e-30F
+
+/// Below this weight the d's are due for a look at their upper limit; below the second one also if the step is a long one.
+#define EST_WEIGHT_DUE 0.5F
+#define EST_WEIGHT_OVERDUE 0.25F
 
 /// The variance of parameter j before anything is known, and at most.
 EST_INLINE float est_factors_prior(const est_config_t* const config, const est_shape_t shape, const uint_fast8_t j) {
@@ -26,7 +25,9 @@ void est_factors_reset(est_factors_t* self, const est_config_t* config);
 /// covariance factorizations for Kalman filtering" (1976), by rank-one updates, which need no work space.
 void est_factors_walk(est_factors_t* self, const est_config_t* config);
 
-/// Every parameter is less certain by this factor.
+/// Every parameter is less certain by this factor, but no d beyond the prior, and the weight 1 again. Without that limit the
+/// variance of a direction that is not excited grows by 1 / forgetting per equation, without end ("covariance blow-up", thesis
+/// 3.6); no direction needs to be less certain than it was at the start.
 void est_factors_inflate(est_factors_t* self, const est_config_t* config, float factor);
 
 /// One diagonal element of P.

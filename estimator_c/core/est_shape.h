@@ -33,12 +33,32 @@
 #define EST_OUTLINE static inline
 #endif
 
-/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUT_PAST_MAX, which are small.
+/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUTS_KEPT, which are small.
 #if defined(__GNUC__) && (defined(EST_FIXED_NA) || !defined(__OPTIMIZE_SIZE__))
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define EST_UNROLL
 #endif
+
+/// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
+/// faster one. An edge that may have come early or late wants one more.
+#ifdef EST_FIXED_NA
+#define EST_INPUTS_KEPT (EST_FIXED_NB + EST_FIXED_NK + EST_WITH_EDGES)
+#else
+#define EST_INPUTS_KEPT (EST_NB_MAX + EST_NK_MAX + EST_WITH_EDGES)
+#endif
+
+/// Whether anything wants to know of the edges of u.
+#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
+
+/// One instruction where there is one.
+EST_INLINE float est_magnitude(const float x) {
+#ifdef __GNUC__
+    return __builtin_fabsf(x);
+#else
+    return (x > 0.0F) ? x : (0.0F - x);
+#endif
+}
 
 /// The orders of the model.
 typedef struct {
