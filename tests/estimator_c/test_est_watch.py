@@ -53,14 +53,14 @@ def test_a_gap_ends_the_doubt_about_an_edge(estimator: Estimator) -> None:
     valid = np.ones(N)
     refreshes = []
     for valid[12] in (1, 0):
-        assert estimator.init(refresh_n=9)
+        assert estimator.init(refresh_n=14)
         refreshes.append(estimator.run(u[:20], y[:20], valid[:20]).counters["refreshes"])
     assert refreshes == [0, 1]
 
 
 @pytest.mark.parametrize("refresh_n", [9, 10])
 def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refresh_n: int) -> None:
-    """EST_DOUBT_N of est_edges.h. C, due before, is compared with A at the first equation after them, and taken at the second."""
+    """EST_DOUBT_N of est_edges.h. C, due before, is compared with A at the first equation after, taken at the second."""
     u, y = front()
     edge = 10
     refreshes = []

@@ -50,7 +50,7 @@ def test_ten_million_samples_without_excitation_do_no_harm(estimator: Estimator,
 
 
 class WideFactors:
-    """Bierman's measurement update (1977, section V.3), in long double. No d is beyond its limit once P has grown twofold."""
+    """Bierman's measurement update (1977, section V.3), in long double; the d's are limited each time the weight halves."""
 
     def __init__(self, prior: list[np.longdouble]) -> None:
         self.prior = np.array(prior, np.longdouble)
