@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 
 from harness.estimator_config import EstimatorConfig
 
@@ -155,6 +156,14 @@ class Doubt:
     """Their shares in the whitened equations, newest first."""
 
 
+class Refresh(Enum):
+    """What is next to be done about C."""
+
+    WAITS = 0
+    COMPARES = 1
+    TAKES = 2
+
+
 def cusum(before: float, innovation: float, variance: float) -> float:
     """The logarithm of the likelihood ratio of a fourfold variance, from zero on."""
     return max(0.0, before + 0.375 * innovation * innovation / variance - 0.69314718)
@@ -179,8 +188,8 @@ class Twin:
         self.residuals = [0.0] * config.nc
         self.pending = self._past_n
         self.settled = False  # the gains of the whitening have come to C
-        self.equations = 0  # since A was last compared with C
-        self.refresh_due = False  # with the next equation
+        self.equations = 0  # since C was last considered
+        self.refresh = Refresh.WAITS
         self.since_n = 0  # samples since an edge of u
         self.statistic = 0.0
         self.rivals = [0.0, 0.0]
@@ -210,7 +219,10 @@ class Twin:
         if self.pending:
             self.pending -= 1
             self.theta, self.slipped = self.slipped or self.theta, None
-            self.refresh_due = False
+            if self.refresh is Refresh.TAKES:
+                self._take_c()
+                self.equations = 0
+            self.refresh = Refresh.WAITS
             if not self.pending:
                 self.whitener.restart()
                 self.settled = False
@@ -281,13 +293,13 @@ class Twin:
         return step
 
     @property
-    def _compares(self) -> bool:
-        """A with C, at this equation, or takes C from A."""
+    def _considers_c(self) -> bool:
+        """At this equation."""
         return bool(self.config.refresh_n) and self.equations + 1 >= self.config.refresh_n
 
     def _limit(self) -> None:
         """No d beyond the prior, from time to time: in a step that is short otherwise, if there is one in time."""
-        long = not self.settled or self.doubt is not None or self._compares
+        long = not self.settled or self.doubt is not None or self._considers_c
         if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
             self.covariance.inflate(1.0)
 
@@ -324,29 +336,41 @@ class Twin:
         if config.noise_estimated:
             square = min(innovation**2 / variance, NOISE_CLIP * self.noise_variance)
             self.noise_variance += NOISE_RATE * (square / NOISE_KEPT - self.noise_variance)
-        if self._compares:
+        if self._considers_c:
             self._refresh()
         self.equations += 1
 
     def _refresh(self) -> None:
-        """C is compared with A at one equation and taken from it at the next."""
-        wanted, self.refresh_due = self.refresh_due, False
+        """Whether A is worth taking C from, whether C is still near to it, and to take it are for three equations."""
+        stage, self.refresh = self.refresh, Refresh.WAITS
         remembers_edge = (1.0 - self.config.forgetting) * self.since_n < REFRESH_MEMORIES
-        if self.doubt is not None or not (wanted or remembers_edge):
+        if self.doubt is not None:
             return
-        c = [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
-        step = max(abs(new - old) for new, old in zip(c, self.whitener.c, strict=True))
-        if not wanted:
-            self.refresh_due = step > REFRESH_STEP
-        if self.refresh_due:
+        if stage is Refresh.TAKES:
+            self._take_c()
+        elif stage is Refresh.COMPARES:
+            self._compare_c()
+        elif remembers_edge:
+            self.refresh = Refresh.COMPARES
+
+    @property
+    def _contracted(self) -> Vector:
+        return [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
+
+    def _compare_c(self) -> None:
+        step = max(abs(new - old) for new, old in zip(self._contracted, self.whitener.c, strict=True))
+        if step <= REFRESH_STEP:
+            self.equations = -1
             return
+        self.refresh = Refresh.TAKES
+        if step > REFRESH_STRIDE or not self.settled:  # the whitening begins anew, and takes C with it
+            self.pending = 1
+
+    def _take_c(self) -> None:
         self.equations = -1
-        if wanted and _stable(c):
-            self.whitener.c = c
-            if step > REFRESH_STRIDE:
-                self.pending = 1
-            else:
-                self.whitener.rows = [(list(c), 1.0) for _ in range(max(len(c), 1))]
+        if _stable(self._contracted):
+            self.whitener.c = self._contracted
+            self.whitener.rows = [(self._contracted, 1.0) for _ in range(max(self.config.na, 1))]
             self.refreshes += 1
 
     # ---- changes
@@ -400,7 +424,7 @@ class Twin:
         if self.config.reset == "all":
             self.theta = [0.0] * len(self.theta)
         self.covariance.reset()
-        self.equations, self.refresh_due = 0, False
+        self.equations, self.refresh = 0, Refresh.WAITS
         self.statistic, self.mean, self.mean_n = 0.0, 0.0, 0
         self.quiet_n = self.config.hold_off_n
         self._forget()

@@ -147,7 +147,7 @@ static void follow_slip(est_t* const self, const bool late) {
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
-    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
+    est_factors_inflate(&self->factors, self->config, est_shape_of(self->config), SLIP_DOUBT);
     if (late) {
         shift(b, nb, 0.0F);
         return;  // MISRA D4
@@ -157,12 +157,36 @@ static void follow_slip(est_t* const self, const bool late) {
     }
 }
 
-/// What an alarm or a slip leaves to do to theta and P.
+/// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
+/// 3.5: noise on the output).
+EST_INLINE void contracted(const est_t* const self, float* const c) {
+    const uint_fast8_t na     = est_shape_of(self->config).na;
+    float              factor = 1.0F;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        factor *= CONTRACTION;
+        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
+    }
+}
+
+static void refresh_prefilter(est_t* const self) {
+    float c[EST_NA_MAX];
+    contracted(self, c);
+    self->refresh_in = self->config->refresh_n;
+    if (est_whitener_accepts(c, EST_NA_MAX)) {
+        est_whitener_set(&self->whitener, c, EST_NA_MAX);
+        count(&self->counters.refreshes);
+    }
+}
+
+/// What an alarm, a slip or a C that moves far leaves to do.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
+    } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
+        refresh_prefilter(self);
     } else {
         // they are as they should be
     }
@@ -337,59 +361,42 @@ EST_INLINE bool further(const est_whitener_t* const whitener, const float* const
     return out;
 }
 
-/// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
-/// 3.5: noise on the output).
-EST_INLINE void contracted(const est_t* const self, float* const c) {
-    const uint_fast8_t na     = est_shape_of(self->config).na;
-    float              factor = 1.0F;
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        factor *= CONTRACTION;
-        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
-    }
-}
-
-static bool wants_refresh(const est_t* const self) {
-    float c[EST_NA_MAX];
-    contracted(self, c);
-    return further(&self->whitener, c, REFRESH_STEP);
-}
-
-static void refresh_prefilter(est_t* const self) {
-    float c[EST_NA_MAX];
-    contracted(self, c);
-    if (!est_whitener_accepts(c, EST_NA_MAX)) {
-        return;  // MISRA D4
-    }
-    if (further(&self->whitener, c, REFRESH_STRIDE)) {
-        restart(self, 1U);
-    }
-    est_whitener_set(&self->whitener, c, EST_NA_MAX);
-    count(&self->counters.refreshes);
-}
-
 static bool remembers_edge(const est_t* const self) {
     return ((1.0F - self->config->forgetting) * (float)self->edges.since_n) < REFRESH_MEMORIES;
 }
 
-/// Not while edges are in doubt: theta may have followed what did not happen. C is compared with A at one equation and taken
-/// from it at the next, so that neither step is a long one.
-static void consider_refresh(est_t* const self) {
-    const bool wanted = self->renewal == EST_RENEWAL_PREFILTER;
-    self->refresh_in  = 1U;
-    self->renewal     = EST_RENEWAL_NONE;
-    if (self->edges.age_n > 0U) {
+/// Where C moves far, or the gains are on their way to it anyway, the whitening begins anew: C is then taken with the next
+/// sample, which has no equation.
+static void compare_prefilter(est_t* const self) {
+    float c[EST_NA_MAX];
+    contracted(self, c);
+    if (!further(&self->whitener, c, REFRESH_STEP)) {
+        self->refresh_in = self->config->refresh_n;
         return;  // MISRA D4
     }
-    if (wanted) {
-        self->refresh_in = self->config->refresh_n;
+    self->renewal = EST_RENEWAL_PREFILTER;
+    if (!self->settled || further(&self->whitener, c, REFRESH_STRIDE)) {
+        restart(self, 1U);
+    }
+}
+
+/// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so that no
+/// step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
+static void consider_refresh(est_t* const self) {
+    const uint8_t stage = self->renewal;
+    self->renewal       = EST_RENEWAL_NONE;
+    self->refresh_in    = 1U;
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        return;  // MISRA D4
+    }
+    if (stage == EST_RENEWAL_PREFILTER) {
         refresh_prefilter(self);
-    } else if (!remembers_edge(self)) {
-        // nor is A to be believed then
-    } else if (wants_refresh(self)) {
-        self->renewal = EST_RENEWAL_PREFILTER;
+    } else if (stage == EST_RENEWAL_COMPARE) {
+        compare_prefilter(self);
+    } else if (remembers_edge(self)) {
+        self->renewal = EST_RENEWAL_COMPARE;
     } else {
-        self->refresh_in = self->config->refresh_n;
+        // A comes from noise
     }
 }
 
@@ -443,6 +450,7 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
         est_factors_walk(&self->factors, config);
+        est_factors_inflate(&self->factors, config, est_shape_of(config), 1.0F);
     }
     keep_residual(self, phi);
     if (config->noise_estimated) {
@@ -450,29 +458,27 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     }
 }
 
-/// The variance of the next equation's noise while the gains are on their way.
-static float next_variance(est_t* const self) {
-    const float variance = est_whitener_advance(&self->whitener);
-    self->settled        = variance <= 1.0F;
-    return variance;
-}
-
 /// P is kept bounded in a step that has nothing else to do besides, if there is one in time.
-static void limit_factors(est_t* const self) {
-    const bool short_step = self->settled && (self->edges.age_n == 0U) && (self->refresh_in != 1U);
-    if (short_step || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
-        est_factors_inflate(&self->factors, self->config, 1.0F);
+EST_SHAPED void limit_factors(est_t* const self, const est_shape_t shape) {
+    const bool busy = (EST_WITH_EDGES && (self->edges.age_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
+    if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
+        est_factors_inflate(&self->factors, self->config, shape, 1.0F);
     }
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
-    if (self->factors.weight < EST_WEIGHT_DUE) {
-        limit_factors(self);
+    float weight_min  = EST_WEIGHT_DUE;
+    equation.variance = 1.0F;
+    if (!self->settled) {
+        equation.variance = est_whitener_advance(&self->whitener, &self->settled);
+        weight_min        = EST_WEIGHT_OVERDUE;
+    }
+    if (self->factors.weight < weight_min) {
+        limit_factors(self, shape);
     }
     est_equation_fill(self, shape, y, equation.phi);
-    equation.variance = self->settled ? 1.0F : next_variance(self);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     float readings[EST_OTHER_READINGS];
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {

@@ -239,10 +239,11 @@ typedef struct {
 
 /// The values of est_t.renewal. Private.
 #define EST_RENEWAL_NONE 0U
-#define EST_RENEWAL_PREFILTER 1U  ///< nothing, but C is to be taken from A with it
-#define EST_RENEWAL_RESET 2U      ///< P := P0, after an alarm
-#define EST_RENEWAL_EARLY 3U      ///< theta as before, but the edges of u come one sample earlier, and less certain
-#define EST_RENEWAL_LATE 4U       ///< one sample later
+#define EST_RENEWAL_COMPARE 1U    ///< nothing, but A is to be compared with C at the next one
+#define EST_RENEWAL_PREFILTER 2U  ///< nothing, but C is to be taken from A
+#define EST_RENEWAL_RESET 3U      ///< P := P0, after an alarm
+#define EST_RENEWAL_EARLY 4U      ///< theta as before, but the edges of u come one sample earlier, and less certain
+#define EST_RENEWAL_LATE 5U       ///< one sample later
 
 /// The state of an estimator. The fields are private; read them through the functions below. The small ones come first: an
 /// offset below 128 bytes is a shorter instruction.
@@ -254,7 +255,7 @@ typedef struct {
     uint8_t             renewal;    ///< what is to be done to P before the next equation
     bool                known;      ///< the sample before this one is known; if not, samples are pending
     bool                settled;    ///< the gains of the whitener are c, and its variance is 1
-    uint16_t            refresh_in;  ///< equations to come before A is compared with C; 0: never
+    uint16_t            refresh_in;  ///< equations to come before C is considered; 0: never
     float               noise_variance;  ///< [codes^2]
     float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
     float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...

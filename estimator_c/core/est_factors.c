@@ -5,7 +5,7 @@ void est_factors_reset(est_factors_t* const self, const est_config_t* const conf
     float*            column = self->upper;
     self->weight             = 1.0F;
     for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
-        self->d[j] = est_factors_prior(config, shape, j);
+        self->d[j] = est_is_offset(shape, j) ? config->p0_offset : config->p0;
         for (uint_fast8_t i = 0U; i < j; i++) {
             *column++ = 0.0F;  // MISRA D3
         }
@@ -35,19 +35,6 @@ static void walk_row(est_factors_t* const self, const uint_fast8_t row, const fl
 void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
     for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
         walk_row(self, i, config->random_walk * self->weight);
-    }
-    est_factors_inflate(self, config, 1.0F);
-}
-
-void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
-    const est_shape_t shape = est_shape_of(config);
-    const float       scale = factor / self->weight;
-    self->weight            = 1.0F;
-    EST_UNROLL
-    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
-        const float d     = self->d[j] * scale;
-        const float prior = est_factors_prior(config, shape, j);
-        self->d[j]        = (d < prior) ? d : prior;
     }
 }
 

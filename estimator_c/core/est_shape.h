@@ -26,6 +26,13 @@
 #define EST_INLINE static inline
 #endif
 
+/// Inline for each shape; a build for size has it once.
+#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
+#define EST_SHAPED static __attribute__((noinline, unused))
+#else
+#define EST_SHAPED EST_INLINE
+#endif
+
 /// A build for size would rather call a short function than have it everywhere.
 #if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
 #define EST_OUTLINE static __attribute__((noinline, unused))
@@ -86,6 +93,11 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
 /// The number of parameters.
 EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
     return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
+}
+
+/// Whether parameter j is the offset, which has a prior of its own.
+EST_INLINE bool est_is_offset(const est_shape_t shape, const uint_fast8_t j) {
+    return shape.offset && ((j + 1U) == est_shape_count(shape));
 }
 
 #endif  // EST_SHAPE_H_INCLUDED

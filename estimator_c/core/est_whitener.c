@@ -44,7 +44,7 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
 }
 
 /// One row of the Cholesky factor of the banded covariance matrix of the noise. c[] is zero beyond its order.
-float est_whitener_advance(est_whitener_t* const self) {
+float est_whitener_advance(est_whitener_t* const self, bool* const settled) {
     float gain[EST_NA_MAX];
     float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
     float variance = autocovariance(self->c, 0U);
@@ -61,6 +61,7 @@ float est_whitener_advance(est_whitener_t* const self) {
     }
     if (variance < SETTLED) {
         variance = 1.0F;
+        *settled = true;
         est_whitener_set(self, self->c, EST_NA_MAX);
     } else {
         remember(self, gain, variance);

@@ -49,9 +49,9 @@ EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
 
-/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; 1 iff the gains have
-/// settled: they and the variance stay as they are from then on, until the next restart.
-float est_whitener_advance(est_whitener_t* self);
+/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1. If that is 1
+/// the gains have settled, which is noted, and stay as they are until the next restart.
+float est_whitener_advance(est_whitener_t* self, bool* settled);
 
 /// One sample of one signal. A loop of fixed length is the faster one; the gains beyond the order of C are zero.
 EST_INLINE float est_filter(const float* const gain, est_past_t* const past, const float x) {

@@ -50,7 +50,7 @@ def test_ten_million_samples_without_excitation_do_no_harm(estimator: Estimator,
 
 
 class WideFactors:
-    """Bierman's measurement update (1977, section V.3), in long double; the d's are limited each time the weight halves."""
+    """Bierman's measurement update (1977, section V.3), in long double; each time the weight halves d is limited."""
 
     def __init__(self, prior: list[np.longdouble]) -> None:
         self.prior = np.array(prior, np.longdouble)
