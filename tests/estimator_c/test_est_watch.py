@@ -60,7 +60,7 @@ def test_a_gap_ends_the_doubt_about_an_edge(estimator: Estimator) -> None:
 
 @pytest.mark.parametrize("refresh_n", [9, 10])
 def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refresh_n: int) -> None:
-    """EST_DOUBT_N of est_edges.h. C, due before, is considered after them, compared at the next equation, then taken."""
+    """EST_DOUBT_N of est_edges.h. C, due before, is considered after them, compared an equation later, then taken."""
     u, y = front()
     edge = 10
     refreshes = []
