@@ -23,6 +23,9 @@
 /// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
 #define SLIP_DOUBT 1000.0F
 
+/// P must not grow without bound between two looks at it.
+#define FORGETTING_MIN 0.5F
+
 /// C is the estimate of A with its zeros moved towards the origin by this factor: a C whose zeros lie on the unit circle
 /// would remember for ever.
 #define CONTRACTION 0.99F
@@ -77,7 +80,7 @@ static bool variances_valid(const est_config_t* const config) {
     return within(config->p0, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->p0_offset, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->noise_variance, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
-           within(config->random_walk, 0.0F, EST_VARIANCE_MAX) && within(config->forgetting, 0.5F, 1.0F);
+           within(config->random_walk, 0.0F, EST_VARIANCE_MAX) && within(config->forgetting, FORGETTING_MIN, 1.0F);
 }
 
 static bool codes_valid(const est_config_t* const config) {
@@ -147,7 +150,7 @@ static void follow_slip(est_t* const self, const bool late) {
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
-    est_factors_inflate(&self->factors, self->config, est_shape_of(self->config), SLIP_DOUBT);
+    est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
     if (late) {
         shift(b, nb, 0.0F);
         return;  // MISRA D4
@@ -159,7 +162,7 @@ static void follow_slip(est_t* const self, const bool late) {
 
 /// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
 /// 3.5: noise on the output).
-EST_INLINE void contracted(const est_t* const self, float* const c) {
+EST_SHAPED void contracted(const est_t* const self, float* const c) {
     const uint_fast8_t na     = est_shape_of(self->config).na;
     float              factor = 1.0F;
     EST_UNROLL
@@ -183,6 +186,7 @@ static void refresh_prefilter(est_t* const self) {
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
+        self->refresh_in = self->config->refresh_n;
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
@@ -351,7 +355,7 @@ static void follow_noise(est_t* const self, const float innovation, const float 
 }
 
 /// Whether one of the coefficients is further from the C in use than this.
-EST_INLINE bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
+EST_SHAPED bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
     bool out = false;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -371,28 +375,26 @@ static void compare_prefilter(est_t* const self) {
     float c[EST_NA_MAX];
     contracted(self, c);
     if (!further(&self->whitener, c, REFRESH_STEP)) {
+        self->renewal    = EST_RENEWAL_NONE;
         self->refresh_in = self->config->refresh_n;
         return;  // MISRA D4
     }
     self->renewal = EST_RENEWAL_PREFILTER;
     if (!self->settled || further(&self->whitener, c, REFRESH_STRIDE)) {
-        restart(self, 1U);
+        self->pending_n = 1U;
     }
 }
 
 /// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so that no
 /// step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
 static void consider_refresh(est_t* const self) {
-    const uint8_t stage = self->renewal;
-    self->renewal       = EST_RENEWAL_NONE;
-    self->refresh_in    = 1U;
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        return;  // MISRA D4
-    }
-    if (stage == EST_RENEWAL_PREFILTER) {
-        refresh_prefilter(self);
-    } else if (stage == EST_RENEWAL_COMPARE) {
+        self->renewal = EST_RENEWAL_NONE;
+    } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self);
+    } else if (self->renewal == EST_RENEWAL_PREFILTER) {
+        self->renewal = EST_RENEWAL_NONE;
+        refresh_prefilter(self);
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {
@@ -415,8 +417,7 @@ static void estimate_afresh(est_t* const self) {
         zero(self->theta, EST_THETA_MAX);
         est_factors_reset(&self->factors, self->config);
     }
-    self->refresh_in = self->config->refresh_n;
-    self->renewal     = EST_RENEWAL_RESET;
+    self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
 }
 
@@ -450,7 +451,7 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
         est_factors_walk(&self->factors, config);
-        est_factors_inflate(&self->factors, config, est_shape_of(config), 1.0F);
+        est_factors_inflate(&self->factors, config, 1.0F);
     }
     keep_residual(self, phi);
     if (config->noise_estimated) {
@@ -462,16 +463,22 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
 EST_SHAPED void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->edges.age_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
-        est_factors_inflate(&self->factors, self->config, shape, 1.0F);
+        if (EST_SHAPES_APART) {
+            est_factors_scale(&self->factors, self->config, shape, 1.0F);
+        } else {
+            est_factors_inflate(&self->factors, self->config, 1.0F);
+        }
     }
 }
 
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
-    float weight_min  = EST_WEIGHT_DUE;
-    equation.variance = 1.0F;
-    if (!self->settled) {
+    float weight_min;
+    if (self->settled) {
+        equation.variance = 1.0F;
+        weight_min        = EST_WEIGHT_DUE;
+    } else {
         equation.variance = est_whitener_advance(&self->whitener, &self->settled);
         weight_min        = EST_WEIGHT_OVERDUE;
     }
@@ -486,11 +493,12 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     const float precision =
         est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION && (self->refresh_in > 0U)) {
+    if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
-        if (self->refresh_in == 0U) {
-            consider_refresh(self);
-        }
+    } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
+        consider_refresh(self);
+    } else {
+        // C stays
     }
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
@@ -560,11 +568,11 @@ est_config_t est_config_default(void) {
 
 bool est_init(est_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));
-    if (!est_config_valid(config)) {
+    if (EST_WITH_CHECKS && !est_config_valid(config)) {
         return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
-    self->adaptive       = adaptive(config);
+    self->adaptive       = EST_WITH_ADAPTATION && adaptive(config);
     self->refresh_in     = config->refresh_n;
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
@@ -630,5 +638,5 @@ bool est_invariants_hold(const est_t* const self) {
             return false;  // MISRA D4
         }
     }
-    return within(self->factors.weight, FLT_MIN, 1.0F) && within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
+    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) && within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
 }

@@ -190,11 +190,13 @@ typedef struct {
     uint16_t refreshes; ///< how often C was taken from the estimate of A
 } est_counters_t;
 
+#define EST_UPPER_N ((EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U)
+
 /// P = U D U' / weight with U unit upper triangular. Private to est_factors.c.
 typedef struct {
     float weight;  ///< forgetting to the power of the equations since the d's were last limited
     float d[EST_THETA_MAX];
-    float upper[(EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
+    float upper[EST_UPPER_N];  ///< U by columns, without its diagonal
 } est_factors_t;
 
 /// The gains of so many equations are needed to find those of the next.
@@ -279,7 +281,7 @@ bool est_config_valid(const est_config_t* config);
 
 /// Makes the estimator ready for the first sample: theta zero, P = P0, counters zero.
 /// The configuration is not copied: it must stay as it is for as long as the estimator is used (it may be in flash).
-/// Returns false iff the configuration is not valid; the state is then unusable.
+/// Returns false iff the configuration is not valid; the state is then unusable. A build with -DEST_WITH_CHECKS=0 does not ask.
 /// Cost: as one est_step(). May be called from an interrupt.
 bool est_init(est_t* self, const est_config_t* config);
 

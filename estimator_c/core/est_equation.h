@@ -40,7 +40,7 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
 }
 
 /// What theta does not foresee of y(k), the element after the regressor.
-EST_INLINE float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
+EST_SHAPED float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
     float out = phi[n];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {

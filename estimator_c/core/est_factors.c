@@ -1,15 +1,18 @@
 #include "est_factors.h"
 
+void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
+    est_factors_scale(self, config, est_shape_of(config), factor);
+}
+
 void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
-    const est_shape_t shape  = est_shape_of(config);
-    float*            column = self->upper;
-    self->weight             = 1.0F;
-    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
-        self->d[j] = est_is_offset(shape, j) ? config->p0_offset : config->p0;
-        for (uint_fast8_t i = 0U; i < j; i++) {
-            *column++ = 0.0F;  // MISRA D3
-        }
+    self->weight = 1.0F;
+    for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
+        self->d[j] = EST_VARIANCE_MAX;
     }
+    for (uint_fast8_t i = 0U; i < EST_UPPER_N; i++) {
+        self->upper[i] = 0.0F;
+    }
+    est_factors_inflate(self, config, 1.0F);  // no d beyond the prior
 }
 
 /// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.

@@ -14,13 +14,13 @@
 #define EST_WEIGHT_DUE 0.5F
 #define EST_WEIGHT_OVERDUE 0.25F
 
-/// Every parameter is less certain by this factor, but no d beyond the prior, and the weight 1 again. Without that limit the
+/// Every parameter of this shape is less certain by this factor, but no d beyond the prior, and the weight 1 again. Without that limit the
 /// variance of a direction that is not excited grows by 1 / forgetting per equation, without end ("covariance blow-up", thesis
 /// 3.6); no direction needs to be less certain than it was at the start.
-EST_SHAPED void est_factors_inflate(est_factors_t* const      self,
-                                    const est_config_t* const config,
-                                    const est_shape_t         shape,
-                                    const float               factor) {
+EST_INLINE void est_factors_scale(est_factors_t* const      self,
+                                  const est_config_t* const config,
+                                  const est_shape_t         shape,
+                                  const float               factor) {
     const float p0        = config->p0;
     const float p0_offset = config->p0_offset;
     const float scale     = factor / self->weight;
@@ -32,6 +32,9 @@ EST_SHAPED void est_factors_inflate(est_factors_t* const      self,
         self->d[j]        = (d < prior) ? d : prior;
     }
 }
+
+/// The same for the shape of the configuration.
+void est_factors_inflate(est_factors_t* self, const est_config_t* config, float factor);
 
 void est_factors_reset(est_factors_t* self, const est_config_t* config);
 

@@ -19,6 +19,12 @@
 #define EST_WITH_WATCH 1  ///< stuck_n, idle_n
 #endif
 
+/// Without, est_init() takes the configuration at its word. For a build whose configuration is a constant that est_config_valid()
+/// has accepted elsewhere, as in a test on the host.
+#ifndef EST_WITH_CHECKS
+#define EST_WITH_CHECKS 1
+#endif
+
 /// gcc would rather call a long function than inline it for each shape.
 #ifdef __GNUC__
 #define EST_INLINE static inline __attribute__((always_inline))
@@ -29,8 +35,10 @@
 /// Inline for each shape; a build for size has it once.
 #if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
 #define EST_SHAPED static __attribute__((noinline, unused))
+#define EST_SHAPES_APART 0
 #else
 #define EST_SHAPED EST_INLINE
+#define EST_SHAPES_APART 1
 #endif
 
 /// A build for size would rather call a short function than have it everywhere.
@@ -50,9 +58,14 @@
 /// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
 /// faster one. An edge that may have come early or late wants one more.
 #ifdef EST_FIXED_NA
-#define EST_INPUTS_KEPT (EST_FIXED_NB + EST_FIXED_NK + EST_WITH_EDGES)
+#define EST_INPUTS_WANTED (EST_FIXED_NB + EST_FIXED_NK)
 #else
-#define EST_INPUTS_KEPT (EST_NB_MAX + EST_NK_MAX + EST_WITH_EDGES)
+#define EST_INPUTS_WANTED (EST_NB_MAX + EST_NK_MAX)
+#endif
+#if EST_WITH_EDGES
+#define EST_INPUTS_KEPT (EST_INPUTS_WANTED + 1U)
+#else
+#define EST_INPUTS_KEPT EST_INPUTS_WANTED
 #endif
 
 /// Whether anything wants to know of the edges of u.

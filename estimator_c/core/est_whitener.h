@@ -54,7 +54,7 @@ void est_whitener_restart(est_whitener_t* self);
 float est_whitener_advance(est_whitener_t* self, bool* settled);
 
 /// One sample of one signal. A loop of fixed length is the faster one; the gains beyond the order of C are zero.
-EST_INLINE float est_filter(const float* const gain, est_past_t* const past, const float x) {
+EST_SHAPED float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {
