@@ -88,7 +88,7 @@ fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers,
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
 fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/README.md
-	@$(BIN)/python -m tests.instrument.hostile $(FUZZ_S) 0
+	@$(BIN)/python -m tests.served.hostile $(FUZZ_S) 0
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
@@ -108,8 +108,8 @@ bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every com
 analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer, cppcheck with MISRA, clang-tidy
 	@$(BIN)/pytest -q tests/estimator_c/test_evidence.py
 
-eva: $(PRODUCTS) ## Frama-C over the core, each shape of the model: nothing undefined can happen; an hour
-	@$(BIN)/python -m estimator_c.evidence.eva
+eva: $(PRODUCTS) ## Frama-C over the core, all orders of the model: nothing undefined can happen; 4 minutes; ARGS="--jobs 1" takes one processor
+	@$(BIN)/python -m estimator_c.evidence.eva $(ARGS)
 
 mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sample 60" takes so many mutants; build/mutation.json
 	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)

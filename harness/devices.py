@@ -128,6 +128,11 @@ class DeviceDescription:
         return ""
 
     @property
+    def program(self) -> Path | None:
+        """The file that is run; None: what runs is not of this computer."""
+        return None
+
+    @property
     def elsewhere(self) -> str:
         """As the command line names it, if it is not safe to open it on the word of a recording."""
         return ""
@@ -273,6 +278,10 @@ class HostDevice(EitherDevice):
 
     kind: ClassVar[str] = "host"
 
+    @property
+    def program(self) -> Path:
+        return HOST_PROGRAM
+
     def wire(self) -> Wire:
         return host_wire()
 
@@ -329,8 +338,7 @@ class InprocDevice(EitherDevice):
         return {"library": where} if where else {}
 
     @property
-    def library_path(self) -> Path:
-        """That is loaded."""
+    def program(self) -> Path:
         return Path(self.library).absolute() if self.library else LIBRARY
 
     @property
@@ -342,7 +350,7 @@ class InprocDevice(EitherDevice):
         return ""
 
     def wire(self) -> Wire:
-        return MemoryWire(boot_nonce=secrets.randbits(32), library=self.library_path)
+        return MemoryWire(boot_nonce=secrets.randbits(32), library=self.program)
 
     def bus(self) -> CanBus:
         from harness.links.can_device import MemoryBus
@@ -410,14 +418,17 @@ class QemuDevice(EitherDevice):
     def only_one(self) -> str:
         return ""
 
+    @property
+    def program(self) -> Path:
+        folder = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
+        return (Path(self.firmware) if self.firmware else folder / f"analogrig-{self.core}.elf").absolute()
+
     def _image(self) -> Path:
         """:raises LinkError: it is not there."""
-        folder = Path(os.environ.get("ANALOGRIG_FIRMWARE", FIRMWARE))
-        path = Path(self.firmware) if self.firmware else folder / f"analogrig-{self.core}.elf"
-        if not path.is_file():
+        if not self.program.is_file():
             cure = "" if self.firmware else ": run `make firmware`, or say where it is in ANALOGRIG_FIRMWARE"
-            raise LinkError(f"there is no firmware {path}{cure}")
-        return path.absolute()
+            raise LinkError(f"there is no firmware {self.firmware or self.program}{cure}")
+        return self.program
 
 
 def _on_one_processor() -> list[str]:
@@ -544,7 +555,7 @@ class CanDevice(FrameDevice):
         from harness.links.can_bus import ChildBus, PythonCanBus
         from harness.links.can_device import InhabitedBus
 
-        who = self.device or ("inproc" if config["interface"] == "virtual" else "none")
+        who = self._who(str(config["interface"]))
         if who == "inproc":
             return InhabitedBus(bus, PythonCanBus(config), boot_nonce=secrets.randbits(32))
         if who == "none":
@@ -556,6 +567,14 @@ class CanDevice(FrameDevice):
         except BaseException:
             child.end()
             raise
+
+    @property
+    def program(self) -> Path | None:
+        return {"inproc": LIBRARY, "host": HOST_PROGRAM}.get(self._who(self.interface))
+
+    def _who(self, interface: str) -> str:
+        """Who answers on such a bus."""
+        return self.device or ("inproc" if interface == "virtual" else "none")
 
     def hint(self, link_name: str) -> str:
         return f"the bus was opened as {self.kind}:{link_name}: is the device on it, at the same bit rate?"
@@ -582,6 +601,24 @@ def describe(name: str) -> DeviceDescription:
         return KINDS[kind].named(name, name[len(kind) :].removeprefix(":"))
     path = config.locate("devices", name)
     return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
+
+
+def of_scenario(filed: str, given: str, otherwise: str) -> str:
+    """The device to play a scenario on: the one that the user has given, that of the scenario's file, or another.
+
+    What a file names elsewhere is not opened on its word alone: the user must have named the same.
+
+    :raises ConfigurationError: the user has not; or there is no such device.
+    """
+    if not filed or not (place := describe(filed).elsewhere):
+        return given or filed or otherwise
+    if given:
+        return filed if describe(given).elsewhere == place else given
+    if describe(otherwise).elsewhere == place:
+        return filed
+    raise ConfigurationError(
+        f"the scenario is for {place}, which is not opened on the word of a file: say --dut {place}, or another"
+    )
 
 
 def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:

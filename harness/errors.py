@@ -8,6 +8,7 @@ AnalogrigError
 │   ├── RigClosed               the instrument cannot be reached, or is gone
 │   ├── RigRefused              the instrument refused a command
 │   ├── RecordIncomplete        the record that it gave is not whole
+│   ├── RecordStale             the record that it gave is an old one
 │   └── SelfTestError           its self-test could not be made
 ├── WorkerError                 the workers of a campaign cannot be had or kept
 ├── LinkError                   the link failed
@@ -53,6 +54,10 @@ class RigRefused(RigError):  # noqa: N818 - the word of the field
 
 class RecordIncomplete(RigError):  # noqa: N818 - the word of the field
     """The record that the instrument gave is not whole."""
+
+
+class RecordStale(RigError):  # noqa: N818 - the word of the field
+    """The record that the instrument gave is an old one."""
 
 
 class SelfTestError(RigError):

@@ -6,15 +6,18 @@ assertion about it fails.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Concatenate, ParamSpec
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from harness.exposure import exposure
 from harness.run import Run
+from harness.statement import Finding, Statement, make_known, said
 from harness.statistics import upper_rate
 from harness.summary import latency_text
 from harness.verdict import TweakVerdict, Verdict, judge
@@ -22,35 +25,31 @@ from harness.verdict import TweakVerdict, Verdict, judge
 Arguments = ParamSpec("Arguments")
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Whether something holds, and why or why not. Its truth is that of the statement."""
-
-    holds: bool
-    why: str
-
-    def __bool__(self) -> bool:
-        return self.holds
-
-    def __repr__(self) -> str:
-        return f"<{'yes' if self.holds else 'no'}: {self.why}>"
-
-
 def _of_a_valid_play(
     statement: Callable[Concatenate[Played, Arguments], Finding],
 ) -> Callable[Concatenate[Played, Arguments], Finding]:
-    """Nothing holds of a play that is not valid."""
+    """Nothing holds of a play that is not valid; what is found is noted."""
 
     @functools.wraps(statement)
     def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
-        if not played.verdict.valid:
-            return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
-        return statement(played, *args, **kwargs)
+        if played.verdict.valid:
+            finding = statement(played, *args, **kwargs)
+        else:
+            finding = Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
+        stated = said(checked, played, *args, **kwargs)
+        finding = dataclasses.replace(finding, statement=stated, run=played.run)
+        played.note(finding)
+        return finding
 
+    make_known(checked, is_experiment=False)
     return checked
 
 
-@dataclass(frozen=True)
+def _to_nobody(_: Finding) -> None:
+    """Outside the plugin nobody asks why a test has failed."""
+
+
+@dataclass(frozen=True, repr=False)
 class Played:
     """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``play`` hands
     one on only if it is asked to."""
@@ -58,10 +57,22 @@ class Played:
     run: Run
     repeat: str = ""
     """The command that repeats it; empty: no names or files say what was played."""
+    note: Callable[[Finding], None] = field(default=_to_nobody, compare=False)
+    """Told whatever is found of it."""
+
+    def __repr__(self) -> str:
+        conditions = self.run.conditions
+        words = f"{conditions.scenario['name']}, seed {conditions.seed}"
+        return f"<{words}: {self.run.samples} samples on {conditions.rig['name']}, device {conditions.dut['name']}>"
 
     @functools.cached_property
     def verdict(self) -> Verdict:
         return judge(self.run)
+
+    @_of_a_valid_play
+    def passes(self) -> Finding:
+        """What the scenario's ``[expect]`` asks: no change missed or late, no false alarm."""
+        return Finding(self.verdict.outcome == "passed", "; ".join(self.verdict.reasons) or "all that is expected")
 
     @_of_a_valid_play
     def detects(self, within: float | None = None) -> Finding:
@@ -167,23 +178,37 @@ def _too_late(tweak: TweakVerdict, within: float | None) -> str:
 def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
     """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand.
 
-    It does not hold if one of them is not valid. A play counts once, and without the samples in which its device was
-    warming up.
+    It does not hold if one of them is not valid. A play counts once, with the samples in which its trigger was armed
+    (``harness.exposure``).
     """
     plays = list({id(each.run): each for each in played}.values())
+    finding = _rate_below(rate, plays, confidence)
+    if plays:
+        finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence), run=plays[0].run)
+        plays[0].note(finding)
+    return finding
+
+
+def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Finding:
     invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
     if invalid:
         return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {len(plays)} plays, such as: {invalid[0]}")
     events = sum(len(each.verdict.false_alarms) for each in plays)
-    samples = sum(_exposed_n(each.run) for each in plays)
+    samples = sum(exposure(each.run).armed for each in plays)
     if not samples:
-        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: they are all warm-up")
+        why = exposure(plays[0].run).no_evidence if plays else "there is none"
+        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: {why}")
     bound = upper_rate(events, samples, confidence)
     why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
     return Finding(bound <= rate, why)
 
 
-def _exposed_n(run: Run) -> int:
-    """Samples after which the device could have raised an alarm."""
-    warm_up_n = int(run.conditions.dut["estimator"].get("warm_up_n", 0))
-    return sum(max(0, end - start - warm_up_n) for start, end in run.records)
+def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statement | None:
+    """What is said of them, if a scenario and its first seed tell them all."""
+    conditions = [each.run.conditions for each in plays]
+    first = conditions[0]
+    if any(
+        each.seed != first.seed + number or each.scenario != first.scenario for number, each in enumerate(conditions)
+    ):
+        return None
+    return Statement("rate_of_plays_below", {"rate": rate, "confidence": confidence, "plays": len(plays)})

@@ -28,12 +28,14 @@ from numpy.typing import NDArray
 from harness.devices import DeviceDescription, InprocDevice
 from harness.errors import ConfigurationError, DeviceError
 from harness.estimator import Estimator
+from harness.estimator_config import EstimatorConfig
+from harness.exposure import exposed
 from harness.links.wire import LIBRARY
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.rig import Block
 from harness.run import CHANNELS
 from harness.scenario import Scenario
-from harness.trials import entered
+from harness.trials import entered, flags_of
 
 BRANCHES_N = 2_000
 """Off each play."""
@@ -98,24 +100,27 @@ def false_alarm_rate(
 
     :param scenario: one without changes; its number of samples does not matter.
     :raises ConfigurationError: the trigger has no ground to come back to; or as Trials.
-    :raises DeviceError: the statistic neither comes to an alarm nor back.
+    :raises DeviceError: the statistic neither comes to an alarm nor back, or the device was not excited.
     :raises LinkError: the library was not built.
     """
     settings = dataclasses.replace(device.estimator, force_zero=rig.force_zero)
     if settings.trigger != "cusum":
         raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
-    estimator = Estimator(settings, library=device.library_path if isinstance(device, InprocDevice) else LIBRARY)
+    estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
     first = settings.warm_up_n + _LEAD_IN_N
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
     (play,) = rig.perform(played, seed, block_samples=played.samples).blocks
-    return _Climbs(rig, estimator, play, np.random.default_rng([seed, _BRANCHES])).estimate(first, branches)
+    return _Climbs(rig, settings, estimator, play, np.random.default_rng([seed, _BRANCHES])).estimate(first, branches)
 
 
 class _Climbs:
     """From the ground of one play."""
 
-    def __init__(self, rig: EmulatorRig, estimator: Estimator, play: Block, rng: np.random.Generator) -> None:
+    def __init__(
+        self, rig: EmulatorRig, settings: EstimatorConfig, estimator: Estimator, play: Block, rng: np.random.Generator
+    ) -> None:
         self._rig = rig
+        self._settings = settings
         self._estimator = estimator
         self._play = play
         self._rng = rng
@@ -141,6 +146,9 @@ class _Climbs:
         self._estimator.restart()
         steps = self._estimator.run(*(signal[:end] for signal in entered(self._play)))
         self._samples += end
+        force = self._play.codes[:end, CHANNELS.index("force")]
+        if fault := exposed(force, flags_of(steps.status), steps.alarms, self._settings.as_table()).no_evidence:
+            raise DeviceError(fault)
         alarms = steps.alarms[steps.alarms >= first]
         end = int(alarms[0]) + 1 if len(alarms) else end
         return first + np.flatnonzero(steps.statistic[first:end] <= 0.0), end - first

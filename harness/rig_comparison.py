@@ -17,13 +17,10 @@ from numpy.typing import NDArray
 from harness.bench import Bench
 from harness.campaign.comparison import Comparison, compare
 from harness.campaign.trial import Row, row
-from harness.run import CHANNELS, Run
+from harness.run import CHANNELS, MEASURED, Run
 from harness.scenario import Scenario
 from harness.statistics import mean_interval, rate_interval, upper_rate
 from harness.verdict import judge
-
-COMPARED = ("force", "displacement")
-"""The channels that every rig has."""
 
 _THIRD_DIFFERENCE = (1.0, -3.0, 3.0, -1.0)
 _NORMAL_MAD = 1.482602
@@ -175,7 +172,7 @@ def _compared(pairs: Sequence[_Pair], invalid: tuple[str, ...], scenario: str, c
         confidence=confidence,
         plays=len(pairs),
         invalid=invalid,
-        signals=tuple(signal_difference(runs, name, confidence) for name in COMPARED),
+        signals=tuple(signal_difference(runs, name, confidence) for name in MEASURED),
         latency=_latency(rows_a, rows_b, confidence),
         false_alarms=(_false_alarms(rows_a, confidence), _false_alarms(rows_b, confidence)),
         verdicts=compare(keyed_a, keyed_b, alpha=round(1.0 - confidence, 12)),

@@ -34,6 +34,9 @@ _FAR = 1e9
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """Order of the columns of ``Run.codes`` and ``Run.clipped``."""
 
+MEASURED = ("force", "displacement")
+"""Those that every rig has, and that the device is given."""
+
 LOST = 0x20
 """In the flags of a sample, beside SteppedFlag: it was lost on the way to the device, for which it is missing."""
 UNREPORTED = 0x40
@@ -94,7 +97,7 @@ class Channel:
 
 def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n,) of (n, 4): a sample whose force or displacement was clipped is no measurement."""
-    used = [CHANNELS.index("force"), CHANNELS.index("displacement")]
+    used = [CHANNELS.index(name) for name in MEASURED]
     return np.asarray(clipped[:, used].any(axis=1))
 
 
@@ -314,7 +317,7 @@ class Run:
             )
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
             and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
-            "channels": {"force", "displacement"} <= set(conditions.channels) <= set(CHANNELS)
+            "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
             "sample times": all(0.0 < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale)),
             "number of samples": n <= conditions.samples_asked,

@@ -15,7 +15,7 @@ from emulator.suspension import PROGRAMS
 from harness import config
 from harness.plant import Plant
 from harness.run import Segment
-from harness.verdict import Expectations
+from harness.statement import Statement
 
 MAX_RAMP_N = 100_000
 
@@ -32,6 +32,9 @@ MOST_SEED = 2**63
 
 MAX_SAMPLES = 10_000_000
 """A run is kept in memory, some 70 bytes a sample."""
+
+MISSING = "clipped and missing for the device"
+"""What the samples are that count as missing."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,42 @@ class Tweak:
 
 
 @dataclass(frozen=True)
+class Expectations:
+    """What a scenario asks of the device; its ``[expect]`` table."""
+
+    missed: int = 0
+    """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
+    false_alarms: int = 0
+    """At most so many in the whole run."""
+    arl0: float = 1e5
+    """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
+    late_information_ratio: float = 4.0
+    """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
+    late_slack_n: int = 15
+    """... so many samples ago."""
+    max_missing_fraction: float = 0.25
+    """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
+
+    def __post_init__(self) -> None:
+        if not self.arl0 > 1.0:
+            raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
+        if not self.late_information_ratio >= 1.0:
+            raise ValueError(f"late_information_ratio must be at least 1, not {self.late_information_ratio:g}")
+        if not 0.0 <= self.max_missing_fraction <= 1.0:
+            raise ValueError(f"max_missing_fraction must be in 0 .. 1, not {self.max_missing_fraction:g}")
+        for name in ("missed", "false_alarms", "late_slack_n"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative")
+
+    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+        """Why a run of which so many samples were missing is not valid; empty if it is."""
+        if missing <= self.max_missing_fraction * samples:
+            return []
+        allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
+        return [f"{missing} of {samples} samples were {words}, {allowed}"]
+
+
+@dataclass(frozen=True)
 class Scenario:
     """``fixtures/scenarios/*.toml``, or a user's own file."""
 
@@ -96,6 +135,10 @@ class Scenario:
     """Of all that is random, unless the user says another."""
     rig: str = ""
     """The rig that plays it, unless the user says another; a .toml file is meant from the scenario's own folder."""
+    dut: str = ""
+    """The device that it is for, likewise."""
+    statement: Statement | None = None
+    """What a test asserted of it, and did not find; None: what is expected is what counts."""
     description: str = ""
     name: str = ""
 
@@ -124,9 +167,10 @@ class Scenario:
         """
         path = config.locate("scenarios", name)
         scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
-        if scenario.rig.endswith(".toml"):
-            scenario = dataclasses.replace(scenario, rig=str(path.parent / scenario.rig))
-        return scenario
+        rig, dut = (
+            str(path.parent / each) if each.endswith(".toml") else each for each in (scenario.rig, scenario.dut)
+        )
+        return dataclasses.replace(scenario, rig=rig, dut=dut)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:

@@ -63,6 +63,15 @@ def lower_rate(events: int, trials: int, confidence: float) -> float:
     return float(betaincinv(events, trials - events + 1, 1.0 - confidence))
 
 
+def poisson_mean(events: int, confidence: float) -> float:
+    """The largest mean number of rare events with which so few are not a surprise: ``upper_rate`` times trials, for
+    many of them; errors as there."""
+    _check(events, MOST_EVENTS, confidence)
+    from scipy.special import gammaincinv
+
+    return float(gammaincinv(events + 1, confidence))
+
+
 def rate_interval(events: int, trials: int, confidence: float) -> tuple[float, float]:
     """Both bounds, each wrong with half of 1 - confidence; errors as ``upper_rate``."""
     one_sided = 0.5 * (1.0 + confidence)

@@ -24,8 +24,7 @@ from emulator.excitation import Excitation
 from emulator.suspension import PROGRAMS
 from harness.plant import PARAMETERS, Plant
 from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
-from harness.scenario import PLANTS, PlantChoice, Scenario, Tweak
-from harness.verdict import Expectations
+from harness.scenario import PLANTS, Expectations, PlantChoice, Scenario, Tweak
 
 FIELDS = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}

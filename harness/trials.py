@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness import exposure
 from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
+from harness.exposure import Exposure
 from harness.links.wire import LIBRARY
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.rig import Block, Performance, Rig
@@ -54,7 +56,7 @@ class Trials:
         self._rig = rig
         zero = rig.force_zero
         self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
-        library = device.library_path if isinstance(device, InprocDevice) else LIBRARY
+        library = device.program if isinstance(device, InprocDevice) else LIBRARY
         self._estimator = Estimator(self._device.estimator, library=library)
         # Runs share their tables: to write them anew for each takes as long as to play a thousand samples.
         self._tables = rig.description(), self._device.as_table()
@@ -71,10 +73,18 @@ class Trials:
         found = [block.first + self._estimator.alarms(*entered(block)) for block in performance.blocks]
         return np.concatenate(found)
 
-    @property
-    def counters(self) -> Mapping[str, int]:
-        """The estimator's, of the last trial."""
-        return self._estimator.counters
+    def exposed(self, scenario: Scenario, seed: int) -> tuple[NDArray[np.int64], NDArray[np.uint8], Exposure]:
+        """As ``alarms``; beside them the flags of all samples, (n,) as of a Run, and in which an alarm could come."""
+        self._estimator.restart()
+        force, flags = np.empty(scenario.samples, np.uint16), np.empty(scenario.samples, np.uint8)
+        found = []
+        for block in self._rig.perform(scenario, seed, BLOCK_SAMPLES).blocks:
+            u, y, valid = entered(block)
+            its = slice(block.first, block.first + len(u))
+            force[its] = u
+            found.append(block.first + self._estimator.alarms(u, y, valid, status=flags[its]))
+        flags, alarms = flags_of(flags), np.concatenate(found)
+        return alarms, flags, exposure.exposed(force, flags, alarms, self._tables[1]["estimator"])
 
     def run(self, scenario: Scenario, seed: int) -> Run:
         """One trial, for ``judge``; errors as ``alarms``."""
@@ -100,7 +110,7 @@ class Trials:
             theta=np.concatenate([steps.theta for steps in parts]),
             innovation=np.concatenate([steps.innovation for steps in parts]),
             statistic=statistic,
-            flags=_FLAGS[np.concatenate([steps.status for steps in parts])],
+            flags=flags_of(np.concatenate([steps.status for steps in parts])),
             alarm_index=alarms,
             alarm_kind=np.full(len(alarms), trigger, np.uint8),
             alarm_statistic=statistic[alarms],
@@ -131,3 +141,8 @@ class Trials:
 def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
     """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
     return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)
+
+
+def flags_of(status: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """StepStatus as the flags of a Run; (n,) each."""
+    return _FLAGS.take(status)

@@ -25,6 +25,7 @@ from harness import config, information
 from harness.catalogue import Change, SteppedFlag
 from harness.plant import PARAMETERS, physical_parameters
 from harness.run import LOST, Run, Segment
+from harness.scenario import MISSING, Expectations
 
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
@@ -34,35 +35,6 @@ Outcome = Literal["passed", "failed", "inconclusive"]
 Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not judged"]
 """Of a change: unseeable carried too little information; undecided depends on its instant, which is not known so well;
 not judged was not found in the samples."""
-
-
-@dataclass(frozen=True)
-class Expectations:
-    """What a scenario asks of the device; its ``[expect]`` table."""
-
-    missed: int = 0
-    """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
-    false_alarms: int = 0
-    """At most so many in the whole run."""
-    arl0: float = 1e5
-    """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
-    late_information_ratio: float = 4.0
-    """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
-    late_slack_n: int = 15
-    """... so many samples ago."""
-    max_missing_fraction: float = 0.25
-    """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
-
-    def __post_init__(self) -> None:
-        if not self.arl0 > 1.0:
-            raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
-        if not self.late_information_ratio >= 1.0:
-            raise ValueError(f"late_information_ratio must be at least 1, not {self.late_information_ratio:g}")
-        if not 0.0 <= self.max_missing_fraction <= 1.0:
-            raise ValueError(f"max_missing_fraction must be in 0 .. 1, not {self.max_missing_fraction:g}")
-        for name in ("missed", "false_alarms", "late_slack_n"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative")
 
 
 NAMES = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
@@ -202,8 +174,8 @@ def is_captured(run: Run) -> bool:
 
 
 def missing_text(run: Run) -> str:
-    """What the samples are that count as missing: ``clipped and missing for the device``."""
-    return "missing for the device or not in the log" if is_captured(run) else "clipped and missing for the device"
+    """What the samples are that count as missing."""
+    return "missing for the device or not in the log" if is_captured(run) else MISSING
 
 
 def judge(run: Run) -> Verdict:
@@ -418,16 +390,14 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
-    if run.conditions.counters.get("refused"):
-        reasons.append(f"the device refused {run.conditions.counters['refused']} samples")
+    reasons += refusals(run.conditions.counters.get("refused", 0))
     reasons += _losses(run)
-    missing = int(run.missing.sum())
-    if run.samples and missing > expect.max_missing_fraction * run.samples:
-        reasons.append(
-            f"{missing} of {run.samples} samples were {missing_text(run)},"
-            f" more than the {expect.max_missing_fraction:.0%} that the scenario allows"
-        )
-    return reasons
+    return reasons + expect.gaps(run.samples, int(run.missing.sum()), missing_text(run))
+
+
+def refusals(refused: int) -> list[str]:
+    """Why a run in which the device refused so many samples is not valid; empty if it is."""
+    return [f"the device refused {refused} samples"] if refused else []
 
 
 def _losses(run: Run) -> list[str]:

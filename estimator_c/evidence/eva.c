@@ -1,13 +1,16 @@
-/// What Frama-C's Eva analyses: any configuration of one shape (-DNA=2U and so on), then any samples, for ever. Numbers may be
-/// anything that a float can hold, NaN and the infinities included. eva.py runs it.
+/// What Frama-C's Eva analyses: whether any configuration at all is valid; then, with one that is and has these orders (-DNA=2U
+/// and so on), any samples, for ever. Numbers may be anything that a float can hold, NaN and the infinities included. eva.py runs it.
 
 #include "est.h"
 
-#include "__fc_builtin.h"
+volatile float    any_number;
+volatile unsigned any_whole_number;
 
-volatile float any_number;
+static unsigned any_up_to(const unsigned most) { return any_whole_number % (most + 1U); }
 
-static bool any_truth(void) { return Frama_C_interval(0, 1) != 0; }
+static uint8_t any_byte(void) { return (uint8_t)any_up_to(UINT8_MAX); }
+
+static bool any_truth(void) { return any_up_to(1U) != 0U; }
 
 static float own_trigger(void* const context, const float innovation, const float variance, const bool anew) {
     (void)context;
@@ -17,17 +20,17 @@ static float own_trigger(void* const context, const float innovation, const floa
     return any_number;
 }
 
-static est_config_t any_config(void) {
-    return (est_config_t){ .na              = NA,
-                           .nb              = NB,
-                           .nk              = NK,
-                           .nc              = NC,
-                           .offset          = OFFSET,
+static est_config_t any_config(const uint8_t na, const uint8_t nb, const uint8_t nc, const bool offset) {
+    return (est_config_t){ .na              = na,
+                           .nb              = nb,
+                           .nk              = any_byte(),
+                           .nc              = nc,
+                           .offset          = offset,
                            .noise_estimated = any_truth(),
-                           .refresh_n       = (uint16_t)Frama_C_interval(0, UINT16_MAX),
-                           .stuck_n         = (uint8_t)Frama_C_interval(0, UINT8_MAX),
-                           .idle_n          = (uint16_t)Frama_C_interval(0, UINT16_MAX),
-                           .edge_instants   = (est_edge_instants_t)Frama_C_interval(0, 3),
+                           .refresh_n       = (uint16_t)any_up_to(UINT16_MAX),
+                           .stuck_n         = any_byte(),
+                           .idle_n          = (uint16_t)any_up_to(UINT16_MAX),
+                           .edge_instants   = (est_edge_instants_t)any_up_to(3U),
                            .forgetting      = any_number,
                            .random_walk     = any_number,
                            .p0              = any_number,
@@ -37,11 +40,11 @@ static est_config_t any_config(void) {
                            .edge_codes      = any_number,
                            .code_low        = any_number,
                            .code_high       = any_number,
-                           .trigger         = { .kind       = (est_trigger_kind_t)Frama_C_interval(0, 5),
-                                                .reset      = (est_reset_t)Frama_C_interval(0, 2),
+                           .trigger         = { .kind       = (est_trigger_kind_t)any_up_to(5U),
+                                                .reset      = (est_reset_t)any_up_to(2U),
                                                 .absolute   = any_truth(),
-                                                .hold_off_n = (uint16_t)Frama_C_interval(0, UINT16_MAX),
-                                                .warm_up_n  = (uint16_t)Frama_C_interval(0, UINT16_MAX),
+                                                .hold_off_n = (uint16_t)any_up_to(UINT16_MAX),
+                                                .warm_up_n  = (uint16_t)any_up_to(UINT16_MAX),
                                                 .ceiling    = any_number,
                                                 .custom     = own_trigger } };
 }
@@ -51,13 +54,18 @@ static void read_all(const est_t* const estimator) {
         (void)est_theta(estimator, i);
         (void)est_variance(estimator, i);
     }
+    for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
+        (void)est_prefilter(estimator, i);
+    }
     (void)est_noise_variance(estimator);
     (void)est_counters(estimator);
     (void)est_invariants_hold(estimator);
 }
 
 int main(void) {
-    const est_config_t config = any_config();
+    const est_config_t whatever = any_config(any_byte(), any_byte(), any_byte(), any_truth());
+    (void)est_config_valid(&whatever);
+    const est_config_t config = any_config(NA, NB, NC, OFFSET != 0U);
     est_t              estimator;
     if (!est_init(&estimator, &config)) {
         return 1;

@@ -1,16 +1,18 @@
 """That nothing undefined can happen in the core: Frama-C's Eva, an abstract interpreter, over eva.c. `make eva`.
 
-For every shape of the model, any configuration and any samples: no access outside an array or by a stale pointer, no
-read of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the infinities are
-numbers here: samples may be such. What keeps them out of the state is asked of est_invariants_hold() after every step
-of the fuzzer and of the tests; intervals cannot show it, since they know of no relation between P, theta and the data.
+For all orders of the model, any delay, any configuration and any samples: no access outside an array or by a stale
+pointer, no read of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the
+infinities are numbers here: samples may be such. What keeps them out of the state is asked of est_invariants_hold()
+after every step of the fuzzer and of the tests; intervals cannot show it, since they know of no relation between P,
+theta and the data.
 
-What was found of each shape is written to build/eva.json as soon as it is known; shapes that are there for this very
-core are not analysed again.
+What was found of each set of orders is written to build/eva.json as soon as it is known; those that are there for this
+very core are not analysed again.
 """
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import itertools
 import json
@@ -33,12 +35,17 @@ THETA_MAX, NC_MAX = 6, 2
 OPTIONS = (
     "-eva",
     "-main=main",
-    "-eva-precision=2",
-    "-eva-split-return=auto",
-    "-eva-no-memexec",
+    "-eva-auto-loop-unroll=12",
+    "-eva-slevel=60",
+    "-eva-slevel-function=main:2",
+    "-eva-widening-delay=1",
+    "-eva-widening-period=1",
+    "-eva-split-return-function=orders_valid:0,est_config_valid:0,est_init:0",
     "-warn-special-float=none",
 )
-"""States are told apart by what functions return: only then does est_init() == true mean a valid configuration."""
+"""Within a function as many paths are told apart as it has (with an edge in doubt or not, each turn of a loop), but a
+call has one outcome, or there would be their product. Only of these three functions what they return is told apart:
+est_init() == true then means a valid configuration. The loop of main() is one of any samples."""
 
 SIZES = re.compile(r"^(\s*(?:const )?(?:float|est_past_t)\s+\w+)((?:\[[^]]*\])+)", re.MULTILINE)
 """Of the arrays that are declared."""
@@ -46,25 +53,24 @@ SIZES = re.compile(r"^(\s*(?:const )?(?:float|est_past_t)\s+\w+)((?:\[[^]]*\])+)
 
 @dataclass(frozen=True)
 class Shape:
-    """The orders of the model."""
+    """The orders of the model; the delay is any."""
 
     na: int
     nb: int
-    nk: int
     nc: int
     offset: int
 
     @property
     def defines(self) -> list[str]:
         """As eva.c wants it."""
-        orders = {"NA": self.na, "NB": self.nb, "NK": self.nk, "NC": self.nc, "OFFSET": self.offset}
+        orders = {"NA": self.na, "NB": self.nb, "NC": self.nc, "OFFSET": self.offset}
         return [f"-DEST_NC_MAX={NC_MAX}U", *(f"-D{name}={value}U" for name, value in orders.items())]
 
 
-DEFAULT = Shape(2, 3, 0, 0, 1)
+DEFAULT = Shape(2, 3, 0, 1)
 SHAPES = tuple(
     shape
-    for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), (0, 1), range(NC_MAX + 1), (0, 1)))
+    for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), range(NC_MAX + 1), (0, 1)))
     if shape.na + shape.nb + shape.nc + shape.offset <= THETA_MAX
 )
 
@@ -143,9 +149,12 @@ def main() -> int:
     if shutil.which("frama-c") is None:
         sys.stderr.write("make eva needs Frama-C: apt-get install frama-c-base\n")
         return 2
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", type=int, default=2)
+    jobs = parser.parse_args().jobs
     known = _known()
     left = [shape for shape in SHAPES if shape not in known]
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(jobs) as pool:
         for shape, found in zip(left, pool.map(analysed, left), strict=True):
             known[shape] = found
             _write(known)

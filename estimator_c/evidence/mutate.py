@@ -7,7 +7,8 @@ many, --seed 2 others. What became of each is written as soon as it is known. AR
 ended early, and after a change of core or tests tries again what the change may have altered: the mutants of functions
 that were rewritten, and the survivors that nobody has explained.
 
-The tests are loaded once and forked for each mutant, and what they simulate is kept: two to ten seconds a mutant.
+The tests are loaded and collected once and forked for each mutant, those first that notice most in the least time, and
+what they simulate is kept.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import dataclasses
 import functools
 import hashlib
 import importlib
+import itertools
 import json
 import multiprocessing
 import os
+import pickle
 import re
 import resource
 import shutil
@@ -29,8 +32,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -50,7 +54,8 @@ __all__ = [
     "recalled",
     "sampled",
     "sources",
-    "tried",
+    "table",
+    "try_all",
     "write",
 ]
 
@@ -59,20 +64,19 @@ CORE = ROOT / "estimator_c" / "core"
 EXPLAINED = ROOT / "estimator_c" / "evidence" / "MUTATION.md"
 GENERATED = ROOT / "build" / "generated"
 
-QUICK = ("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py")
-SEARCHING = (
-    *("tests/harness/test_twin.py", "tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_numerics.py"),
-    "tests/estimator_c/test_est_adversarial.py",
+TESTS = (
+    *("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py"),
+    *("tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_est_adversarial.py"),
+    *("tests/estimator_c/test_numerics.py", "tests/harness/test_twin.py"),
 )
-"""The slower ones."""
-
 LONG = "not ten_million and not long_free_running and not rarer_than_promised"
-DEADLINE_S = 60
-"""A mutant may not come to an end. In seconds of the processor: the machine may be busy."""
+DEADLINE_S = 8
+"""A mutant may not come to an end. For each test, the longest of which takes two; in seconds of the processor: the
+machine may be busy."""
 
 FLAGS = (
     *("-std=c99", "-O1", "-w", "-fPIC", "-ffp-contract=off", "-D__OPTIMIZE_SIZE__=1", "-DEST_NC_MAX=2U", "-DNDEBUG"),
-    *("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error"),
+    *("-fsanitize=bounds-strict", "-fsanitize-undefined-trap-on-error"),
     *(f"-I{path}" for path in (CORE.parent / "device", CORE.parent / "isolation", GENERATED)),
 )
 """One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""
@@ -295,22 +299,31 @@ def write(record: Path, outcomes: Iterable[Outcome]) -> None:
 _library = Path()
 
 
-def _kept(simulate: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
-    """A simulation whose results are kept: tests may write into what they get."""
-    known: dict[Any, tuple[Any, Any]] = {}
+KEPT = {
+    "tests.estimator_c.test_est_trigger": ("suspension", "statistic_of_the_twin"),
+    "tests.estimator_c.test_est_estimation": ("batch",),
+    "tests.estimator_c.test_numerics": ("wide",),
+    "tests.harness.test_twin": ("followed",),
+}
+"""Functions of the tests that take time and do not ask the core. A module comes before those that import from it."""
 
-    def kept(plants: list[Any], edges: Any, *rest: Any) -> tuple[Any, Any]:
-        key = (tuple(plants), edges.tobytes(), rest)
+
+def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """One whose results are kept: tests may write into what they get."""
+    known: dict[bytes, bytes] = {}
+
+    @functools.wraps(function)
+    def kept(*arguments: Any) -> Any:
+        key = pickle.dumps(arguments)
         if key not in known:
-            known[key] = simulate(plants, edges, *rest)
-        u, y = known[key]
-        return u.copy(), y.copy()
+            known[key] = pickle.dumps(function(*arguments))
+        return pickle.loads(known[key])  # noqa: S301 - our own
 
     return kept
 
 
 def _load_tests() -> None:
-    """Makes every test use the library of the mutant, and runs them all once on the core as it is."""
+    """Makes every test use the library of the mutant."""
     sys.path.insert(0, str(ROOT))
     hypothesis.settings.register_profile(
         "mutants",
@@ -319,8 +332,10 @@ def _load_tests() -> None:
     hypothesis.settings.load_profile("mutants")
     driver = importlib.import_module("tests.estimator_c.est_driver")
     driver.compile_driver = lambda _: _library  # type: ignore[attr-defined]
-    trigger = importlib.import_module("tests.estimator_c.test_est_trigger")
-    trigger.suspension = _kept(trigger.suspension)  # type: ignore[attr-defined]
+    for name, functions in KEPT.items():
+        module = importlib.import_module(name)
+        for function in functions:
+            setattr(module, function, _kept(getattr(module, function)))
     estimator = importlib.import_module("harness.estimator").Estimator
     start = estimator.__init__
 
@@ -331,54 +346,86 @@ def _load_tests() -> None:
     estimator.__init__ = start_mutant
 
 
-class _Reporter:
-    """Remembers the first test that fails."""
+class _Session:
+    """A session of pytest: each test twice on the core as it is, to fill what is kept and to see how long it takes.
 
-    failed = ""
+    Then ``work``, which has them run again in forks.
+
+    :param noticed: how many mutants each test is known to have noticed.
+    """
+
+    def __init__(self, noticed: Mapping[str, int], work: Callable[[_Session], None]) -> None:
+        self._noticed, self._work = noticed, work
+        self._tests: list[pytest.Item] = []
+        self._seconds: dict[str, float] = {}
+        self._outside = sys.stdout
+        self._failed = ""
+        self._before_each: Callable[[], None] = lambda: None
+
+    def run(self) -> None:
+        """RuntimeError if a test fails on the core as it is."""
+        options = "-q --assert=plain -p no:xdist -p no:cacheprovider -o timeout=0 -s -p no:faulthandler".split()
+        with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
+            status = pytest.main([*options, "-k", LONG, f"--rootdir={ROOT}", *TESTS], plugins=[self])
+        if self._failed or status != pytest.ExitCode.OK:
+            raise RuntimeError(f"the tests fail on the core as it is: {self._failed or status!r}")
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """In place of pytest's own."""
+        self._tests = session.items
+        if not (self._first_failure() or self._first_failure()):
+            self._tests.sort(key=self._price)
+            with contextlib.redirect_stdout(self._outside):
+                self._work(self)
+        return True
+
+    def _price(self, test: pytest.Item) -> float:
+        """Seconds for each mutant noticed."""
+        return self._seconds[test.nodeid] / (1 + self._noticed.get(_name(test.nodeid), 0))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.failed and not self.failed:
-            self.failed = report.nodeid.rsplit("/", 1)[-1]
+        """Remembers what failed first."""
+        if report.failed and not self._failed:
+            self._failed = _name(report.nodeid)
+
+    def _first_failure(self) -> str:
+        for test, following in itertools.zip_longest(self._tests, self._tests[1:]):
+            self._before_each()
+            start = time.process_time()
+            test.ihook.pytest_runtest_protocol(item=test, nextitem=following)
+            self._seconds[test.nodeid] = time.process_time() - start
+            if self._failed:
+                break
+        return self._failed
+
+    def first_failure(self) -> str:
+        """On the present library, in a fork; a crash, or no end, counts as one."""
+        receiver, sender = os.pipe()
+        child = os.fork()
+        if child == 0:
+            self._before_each = _set_deadline
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nothing, 1)
+            os.dup2(nothing, 2)
+            os.write(sender, self._first_failure().encode())
+            os._exit(0)
+        os.close(sender)
+        with os.fdopen(receiver) as pipe:
+            said = pipe.read()
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if status == -signal.SIGXCPU:
+            return "no end"
+        return said if status == 0 else f"crash: {status}"
 
 
-def _first_failure(tests: Sequence[str]) -> str:
-    reporter = _Reporter()
-    options = [
-        "-x",
-        "-q",
-        "--assert=plain",
-        "-p",
-        "no:xdist",
-        "-p",
-        "no:cacheprovider",
-        "-o",
-        "timeout=0",
-        "-s",
-        "-k",
-        LONG,
-    ]
-    status = pytest.main([*options, f"--rootdir={ROOT}", *tests], plugins=[reporter])
-    return reporter.failed or ("" if status == 0 else f"status {int(status)}")
+def _set_deadline() -> None:
+    now = resource.getrusage(resource.RUSAGE_SELF)
+    ends = int(now.ru_utime + now.ru_stime) + DEADLINE_S
+    resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
 
 
-def _in_a_fork(tests: Sequence[str]) -> str:
-    """The first failure on the present library; a crash, or no end, counts as one."""
-    receiver, sender = os.pipe()
-    child = os.fork()
-    if child == 0:
-        resource.setrlimit(resource.RLIMIT_CPU, (DEADLINE_S, resource.RLIM_INFINITY))
-        nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, 1)
-        os.dup2(nothing, 2)
-        os.write(sender, _first_failure(tests).encode())
-        os._exit(0)
-    os.close(sender)
-    with os.fdopen(receiver) as pipe:
-        said = pipe.read()
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    if status == -signal.SIGXCPU:
-        return "no end"
-    return said if status == 0 else f"crash: {status}"
+def _name(nodeid: str) -> str:
+    return nodeid.rsplit("/", 1)[-1]
 
 
 # ---- the mutants
@@ -430,13 +477,19 @@ class _Build:
         return out
 
 
+_begun: list[tuple[_Session, tuple[_Build, _Build], str]] = []
+"""The session, the core as it is, and its hash."""
+
+
 def _hash(program: Path) -> str:
-    done = subprocess.run([program], capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    done = subprocess.run([program], capture_output=True, text=True, preexec_fn=_set_deadline, check=False)
     return done.stdout + str(done.returncode)
 
 
-def _try(mutant: Mutant, plain: tuple[_Build, _Build], expected: str) -> Outcome:
+def _try(mutant: Mutant) -> Outcome:
+    """In a worker of the pool, a fork of the process that has begun the session."""
     global _library  # noqa: PLW0603 - the tests, in a fork of this process, look there
+    session, plain, expected = _begun[-1]
     with tempfile.TemporaryDirectory() as scratch:
         try:
             tested = plain[0].copy(Path(scratch, "tested"))
@@ -445,38 +498,47 @@ def _try(mutant: Mutant, plain: tuple[_Build, _Build], expected: str) -> Outcome
             _library = tested.linked("-shared")
         except subprocess.CalledProcessError:
             return Outcome(mutant, "invalid")
-        failed = _in_a_fork(QUICK)
+        failed = session.first_failure()
         if failed:
             return Outcome(mutant, "killed", failed)
         hashed = plain[1].copy(Path(scratch, "hashed"))
         hashed.differs(mutant)
-        try:
-            same = _hash(hashed.linked()) == expected
-        except subprocess.TimeoutExpired:
-            same = False
-        failed = _in_a_fork(SEARCHING)
-        return Outcome(mutant, "killed" if failed else "survived", failed or ("same bits" if same else "other bits"))
+        same = _hash(hashed.linked()) == expected
+        return Outcome(mutant, "survived", "same bits" if same else "other bits")
 
 
-def tried(chosen: Sequence[Mutant], jobs: int = 2) -> Iterator[Outcome]:
-    """What becomes of each; RuntimeError if the tests fail on the core as it is."""
+def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tell: Callable[[Outcome], None]) -> None:
+    """Tells what becomes of each as soon as it is known; RuntimeError if the tests fail on the core as it is.
+
+    :param noticed: how many mutants each test is known to have noticed.
+    """
     global _library  # noqa: PLW0603
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory() as scratch:
         plain = (_Build(Path(scratch, "tested"), TESTED), _Build(Path(scratch, "hashed"), HASHED))
         _library = plain[0].linked("-shared")
         expected = _hash(plain[1].linked())
+
+        def work(session: _Session) -> None:
+            _begun.append((session, plain, expected))
+            with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
+                for future in as_completed([pool.submit(_try, mutant) for mutant in chosen]):
+                    outcome = future.result()
+                    where = (outcome.mutant.file, outcome.mutant.function)
+                    tell(dataclasses.replace(outcome, source=sources()[where]))
+
         _load_tests()
-        with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
-            failed = _first_failure((*QUICK, *SEARCHING))
-        if failed:
-            raise RuntimeError(f"the tests fail on the core as it is: {failed}")
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork")) as pool:
-            work = functools.partial(_try, plain=plain, expected=expected)
-            for future in as_completed([pool.submit(work, mutant) for mutant in chosen]):
-                outcome = future.result()
-                where = (outcome.mutant.file, outcome.mutant.function)
-                yield dataclasses.replace(outcome, source=sources()[where])
+        _Session(noticed, work).run()
+
+
+def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
+    """Of each file how many mutants there are, were tried, and what became of them; as the README has it."""
+    rows = ["| | mutants | tried | noticed | the same machine code | do not compile | not noticed |", f"|{'---|' * 7}"]
+    for name, count in [*Counter(mutant.file for mutant in every).most_common(), ("all", len(every))]:
+        fates = [outcome.fate for outcome in outcomes if name in ("all", outcome.mutant.file)]
+        counts = (fates.count(fate) for fate in ("killed", "equivalent", "invalid", "survived"))
+        rows.append(f"| {' | '.join(map(str, (name, count, len(fates), *counts)))} |")
+    return "\n".join(rows)
 
 
 def main() -> int:
@@ -494,13 +556,17 @@ def main() -> int:
     chosen = chosen[: arguments.sample]
     known = explained()
     outcomes = recalled(arguments.out, every, known) if arguments.resume else {}
-    for outcome in tried([mutant for mutant in chosen if mutant not in outcomes], arguments.jobs):
+    noticed = Counter(outcome.by for outcome in outcomes.values() if outcome.fate == "killed")
+
+    def tell(outcome: Outcome) -> None:
         outcomes[outcome.mutant] = outcome
         write(arguments.out, outcomes.values())
         if outcome.fate == "survived" and outcome.mutant.key not in known:
             print(shown(outcome.mutant.key), flush=True)
-    fates = Counter(outcome.fate for outcome in outcomes.values())
-    print(", ".join(f"{fates[fate]} {fate}" for fate in ("killed", "survived", "equivalent", "invalid")))
+
+    if left := [mutant for mutant in chosen if mutant not in outcomes]:
+        try_all(left, arguments.jobs, noticed, tell)
+    print(table(every, list(outcomes.values())))
     survivors = {outcome.mutant.key for outcome in outcomes.values() if outcome.fate == "survived"}
     stale = known.keys() - survivors if len(outcomes) == len(every) else set()
     for key in sorted(stale):

@@ -8,9 +8,9 @@ import math
 import numpy as np
 
 from emulator import Sampler
-from harness.calibration.recordings import DISPLACEMENT, MEASURED, Recording, Vector, averaged, periods
+from harness.calibration.recordings import DISPLACEMENT, Recording, Vector, averaged, periods
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
-from harness.run import CHANNELS
+from harness.run import CHANNELS, MEASURED
 from harness.scenario import Scenario
 
 

@@ -7,7 +7,7 @@ The weighted squares of the differences between the averages of the recordings a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -99,6 +99,7 @@ def calibrate(
     op_amp: str = "tl07x",
     stocks: Sequence[Stock] = STOCKS,
     pots: Sequence[Pots] = POTS,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Calibration:
     """The twin of the rig that made the recordings, of the kind that explains them best.
 
@@ -106,12 +107,13 @@ def calibrate(
     :param op_amp: what the rig's amplifiers are.
     :param stocks: what its other components may be; one or more.
     :param pots: what its pots may be set by; one or both.
+    :param progress: told how many kinds of machine have been tried, and of how many.
     :raises RigError: no emulator is like it: the fit does not settle, or the displacement comes before the force.
     :raises ConfigurationError: half a period is no whole number of samples.
     """
     noise_lsb, noise_error = noise_of(recordings, DISPLACEMENT)
     kinds = [[ComputerDescription(op_amp=op_amp, components=stock, pots=set_by) for stock in stocks] for set_by in pots]
-    fits = _fits([[Model(recordings, machine, noise_lsb) for machine in alike] for alike in kinds])
+    fits = _fits([[Model(recordings, machine, noise_lsb) for machine in alike] for alike in kinds], progress)
     best = _likeliest(fits)
     noise = Estimate("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
     estimates = (*best.estimates(), noise, *_force_channel(recordings))
@@ -126,7 +128,9 @@ def calibrate(
     )
 
 
-def _fits(models: Sequence[Sequence[Model]]) -> dict[tuple[Stock, Pots], _Fit]:
+def _fits(
+    models: Sequence[Sequence[Model]], progress: Callable[[int, int], None] | None
+) -> dict[tuple[Stock, Pots], _Fit]:
     """Of every kind that can be fitted at all; those that have the same unknowns are in one row.
 
     :raises RigError: none can; that of the first.
@@ -142,6 +146,8 @@ def _fits(models: Sequence[Sequence[Model]]) -> dict[tuple[Stock, Pots], _Fit]:
                 problems.append(error)
             else:
                 fits[model.nominal.components, model.nominal.pots], start = fit, fit.x
+            if progress is not None:
+                progress(len(fits) + len(problems), sum(map(len, models)))
     if not fits:
         raise problems[0]
     return fits

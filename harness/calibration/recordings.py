@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from harness.calibration.plan import RATE_HZ
 from harness.errors import ConfigurationError, RigError
 from harness.rigs.rig import Rig
-from harness.run import CHANNELS, Channel
+from harness.run import CHANNELS, MEASURED, Channel
 from harness.scenario import Scenario
 
 Vector = NDArray[np.float64]
@@ -20,10 +20,8 @@ Vector = NDArray[np.float64]
 SETTLING_N = 400
 """Left out at the start of each recording: what came before it is not known."""
 
-MEASURED = ("force", "displacement")
-"""The channels that a rig has to have, in the order of the columns of a recording."""
-
 FORCE, DISPLACEMENT = range(2)
+"""Columns of a recording: MEASURED."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +56,14 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> Recording:
     """Plays the scenario on the rig.
 
     :raises ConfigurationError: the rig cannot play it.
-    :raises RigError: the rig failed, or an amplifier was overloaded.
+    :raises RigError: the rig failed, is not well, or an amplifier was overloaded.
     """
     performance = rig.perform(scenario, seed)
     blocks = list(performance.blocks)
-    if lamps := performance.hindsight().lamps:
+    hindsight = performance.hindsight()
+    if hindsight.caveats:
+        raise RigError(f"scenario {scenario.name}: {hindsight.caveats[0]}: nothing can be fitted")
+    if lamps := hindsight.lamps:
         raise RigError(f"scenario {scenario.name}: overload lamps of {', '.join(lamps)} are lit: nothing can be fitted")
     if len({block.record for block in blocks}) != 1:
         raise RigError(f"scenario {scenario.name}: was not recorded without a gap: nothing can be fitted")

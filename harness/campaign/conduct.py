@@ -14,12 +14,15 @@ from typing import Any
 
 from harness.campaign.journal import Journal
 from harness.campaign.results import Results
-from harness.campaign.spec import Chunk, Plan
+from harness.campaign.spec import Chunk, Plan, device_as_planned
 from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
 from harness.campaign.workers import Workers
+from harness.devices import InprocDevice
+from harness.dut import connect
+from harness.errors import DeviceError, LinkError
 from harness.statistics import ConfidenceSequence, Decision
 
-_EXPOSURE = {"missed": "visible", "false_alarms": "samples"}
+_EXPOSURE = {"missed": "visible", "false_alarms": "armed"}
 """Of what each quantity that can stop a cell is a rate."""
 
 
@@ -77,15 +80,17 @@ Progress = Callable[[Tally], None]
 def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None = None) -> Results:
     """Play the plan to ``out``. Interrupted by whatever, it goes on where it was when it is asked for again.
 
-    :raises ConfigurationError: ``out`` holds what another plan gave; or a trial cannot be played.
+    :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
     :raises RecordingError: ``out`` cannot be written.
     :raises WorkerError: the workers cannot be had or kept.
-    :raises LinkError, DeviceError, RigError: a device or rig cannot be had.
     """
     if out.exists():
         return Results.load(out).of_plan(plan, out)
     tally = Tally(plan, len(plan.cells()))
-    with Journal(journal_of(out), plan.digest()) as journal:
+    with Journal(journal_of(out), plan) as journal:
+        if out.exists():  # another one has ended meanwhile
+            journal.remove()
+            return Results.load(out).of_plan(plan, out)
         for chunk, rows in journal.rows.items():
             tally.add(chunk, rows)
         work: Any = functools.partial(play_chunk, plan.as_json())
@@ -101,6 +106,21 @@ def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None =
         results.save(out)
         journal.remove()
     return results
+
+
+def unreachable(plan: Plan) -> dict[str, str]:
+    """Why devices cannot be had from here, by their names. Those within a process are not tried: a library may end it.
+
+    :raises ConfigurationError: a device refuses its configuration.
+    """
+    found = {}
+    for device in map(device_as_planned, plan.devices):
+        try:
+            if not isinstance(device, InprocDevice):
+                connect(device).close()
+        except (LinkError, DeviceError) as error:
+            found[device.name] = str(error)
+    return found
 
 
 def journal_of(out: Path) -> Path:

@@ -9,10 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from harness.campaign.results import CONFIDENCE, Results, Summary, label
+from harness.errors import ConfigurationError
 from harness.report.page import FOLDER, assembled
 from harness.storage import replacing
 
 _TEMPLATE = FOLDER / "campaign.html"
+
+_MARK = b'data-page="analogrig-campaign"'
+"""By which a page is known for one of a campaign."""
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 74, 34, 110, 26
 _DEEPEST = (0, 114, 178)
@@ -34,6 +38,23 @@ QUANTITIES = (
     Quantity("Mean latency [samples]", lambda summary: summary.latency_n, ".1f"),
     Quantity("Miss rate", lambda summary: summary.missed / summary.visible if summary.visible else None, ".1%"),
 )
+
+
+def page_of(out: Path) -> Path:
+    """The place of the page beside the results.
+
+    :raises ConfigurationError: something else stands there, or the results themselves would.
+    """
+    page = out.with_suffix(".html")
+    if page == out:
+        raise ConfigurationError(f"--out {out}: the page of the results is to be called so: choose another name")
+    try:
+        is_free = not page.exists() or _MARK in page.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{page}: {error.strerror or error}") from error
+    if not is_free:
+        raise ConfigurationError(f"{page}: is no page of a campaign: choose another --out, or remove it")
+    return page
 
 
 def write_page(results: Results, path: Path) -> None:
@@ -145,7 +166,7 @@ def _row(names: Sequence[str], summary: Summary) -> str:
         *(f"{summary.missed:,}", f"{summary.visible:,}"),
         f"{summary.miss_rate[1]:.2g}" if summary.visible else "–",
         f"{summary.false_alarms:,}",
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.samples else "–",
+        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "–",
         *("–" if each is None else f"{each:.1f}" for each in averages),
     )
     cells = "".join(f'<th scope="row">{html.escape(name)}</th>' for name in names)

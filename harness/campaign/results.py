@@ -16,7 +16,7 @@ from harness.errors import ConfigurationError, RecordingError
 from harness.statistics import ConfidenceSequence
 from harness.storage import replacing
 
-FORMAT, FORMAT_VERSION = "analogrig-campaign", 1
+FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 
 MAX_FILE_BYTES = 4_000_000_000
 
@@ -39,7 +39,7 @@ class Results:
 
         :raises RecordingError: the file cannot be written.
         """
-        head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": json.loads(self.plan.as_json())}
+        head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": self.plan.as_table()}
         with replacing(path) as file:
             file.write(f'{json.dumps(head, sort_keys=True)[:-1]}, "cells": [\n'.encode())
             for i, rows in enumerate(self.rows):
@@ -72,10 +72,7 @@ class Results:
 
         :raises ConfigurationError: they are another's.
         """
-        if self.plan.digest() != plan.digest():
-            raise ConfigurationError(
-                f"{path}: holds the results of another campaign: choose another --out, or remove it"
-            )
+        plan.check_same(json.loads(self.plan.as_json()), f"{path}: holds the results of another campaign")
         return self
 
     def cells(self) -> list[tuple[Cell, Summary]]:
@@ -100,8 +97,8 @@ class Results:
 def _check_row(row: Any) -> None:
     if row["outcome"] not in ("passed", "failed", "inconclusive"):
         raise ValueError("a row without an outcome")
-    counts = [row[name] for name in ("seed", "samples", "false_alarms")]
-    if not all(type(count) is int and count >= 0 for count in counts) or row["false_alarms"] > row["samples"]:
+    counts = [row[name] for name in ("false_alarms", "armed", "samples")]
+    if not all(type(count) is int and count >= 0 for count in (row["seed"], *counts)) or counts != sorted(counts):
         raise ValueError("a row whose counts cannot be")
     if not all(_is_change(*change) for change in row["changes"]):
         raise ValueError("a change that is none")
@@ -121,9 +118,11 @@ class Summary:
     failed: int
     inconclusive: int
     samples: int
+    armed: int
+    """Those in which the trigger was armed."""
     false_alarms: int
     false_alarm_rate: tuple[float, float]
-    """Bounds, per sample."""
+    """Bounds, per sample in which the trigger was armed."""
     visible: int
     missed: int
     late: int
@@ -135,6 +134,8 @@ class Summary:
     """Mean information bound of the changes that were detected and could be."""
     error: Mapping[str, float]
     """rms relative error of M, B and K at the end."""
+    doubt: str
+    """The seed of the first inconclusive trial, and why it is that; empty: there is none."""
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
@@ -150,9 +151,10 @@ class Summary:
             failed=sum(row["outcome"] == "failed" for row in rows),
             inconclusive=len(rows) - len(valid),
             samples=counts["samples"],
+            armed=counts["armed"],
             false_alarms=counts["false_alarms"],
             false_alarm_rate=ConfidenceSequence(
-                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["samples"], events=counts["false_alarms"]
+                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["armed"], events=counts["false_alarms"]
             ).bounds,
             visible=counts["visible"],
             missed=counts["missed"],
@@ -166,6 +168,9 @@ class Summary:
             error={
                 name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5 for i, name in enumerate("MBK") if errors
             },
+            doubt=next(
+                (f"seed {row['seed']}: {row.get('why', '')}" for row in rows if row["outcome"] == "inconclusive"), ""
+            ),
         )
 
 
@@ -184,7 +189,7 @@ def anytime_text(counts: Mapping[str, int]) -> str:
     parts = []
     for name, exposure, expected, unit in (
         ("missed", "visible", _EXPECTED_MISS_RATE, "changes"),
-        ("false_alarms", "samples", _EXPECTED_FALSE_ALARM_RATE, "samples"),
+        ("false_alarms", "armed", _EXPECTED_FALSE_ALARM_RATE, "samples"),
     ):
         if counts[exposure]:
             known = ConfidenceSequence(CONFIDENCE, expected, trials=counts[exposure], events=counts[name])
@@ -223,8 +228,11 @@ def text(results: Results) -> str:
         rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
-    note = f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"
-    return "\n".join([head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", f"  {note}"])
+    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
+    notes += [f"{total.inconclusive} trials inconclusive, such as {total.doubt}"] if total.inconclusive else []
+    return "\n".join(
+        [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
+    )
 
 
 def as_json(results: Results) -> dict[str, Any]:
@@ -247,6 +255,6 @@ def _numbers(summary: Summary) -> list[str]:
         ),
         f"{summary.miss_rate[1]:.2g}" if summary.visible else "-",
         str(summary.false_alarms),
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.samples else "-",
+        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "-",
         *("-" if each is None else f"{each:.1f}" for each in averages),
     ]

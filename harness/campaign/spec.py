@@ -7,21 +7,20 @@ same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from harness import config
-from harness.devices import DeviceDescription, InprocDevice, describe, from_table
+from harness.campaign import build
+from harness.campaign.difference import differences, named
+from harness.devices import DeviceDescription, describe, from_table
 from harness.errors import ConfigurationError
-from harness.links.wire import LIBRARY
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.rigs.recording import RecordingRig
@@ -90,6 +89,12 @@ class Draw:
         """Those that are given."""
         return {axis: ends for axis, ends in vars(self).items() if ends is not None}
 
+    def corners(self) -> tuple[dict[str, float], ...]:
+        """All at their low ends, and all at their high ones: each pot, and the noise, are within what they are there,
+        for a parameter and its factor turn the same pot the same way."""
+        axes = self.axes()
+        return tuple({axis: ends[i] for axis, ends in axes.items()} for i in range(2 if axes else 0))
+
 
 @dataclass(frozen=True)
 class Stop:
@@ -132,6 +137,8 @@ class CampaignSpec:
     name: str = ""
 
     def __post_init__(self) -> None:
+        if "/" in self.name or self.name in {".", ".."} or not self.name.isprintable():
+            raise ValueError(f"name must be one that a file can have, not {self.name!r}")
         if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
         for name in ("rigs", "devices"):
@@ -176,7 +183,6 @@ class Case:
     device: Mapping[str, Any]
     scenario: Scenario
     seed: int
-    drawn: Mapping[str, float] = field(default_factory=dict)
 
 
 class Chunk(tuple[int, int]):
@@ -201,6 +207,9 @@ class Plan:
     scenario: Mapping[str, Any]
     rigs: tuple[Mapping[str, Any], ...]
     devices: tuple[Mapping[str, Any], ...]
+    """With the ``build`` of each."""
+    analogrig: str
+    """The build of analogrig itself."""
 
     @classmethod
     def of(cls, spec: CampaignSpec) -> Plan:
@@ -212,7 +221,8 @@ class Plan:
             spec=spec,
             scenario=scenario.as_table(),
             rigs=tuple(rig_table(name) for name in spec.rigs),
-            devices=tuple(describe(name).as_table() for name in spec.devices),
+            devices=tuple(device_table(name) for name in spec.devices),
+            analogrig=build.of_analogrig(),
         )
         plan._check()
         return plan
@@ -221,17 +231,21 @@ class Plan:
     def from_json(cls, text: str) -> Plan:
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
-    def as_json(self) -> str:
-        """The same plan gives the same text."""
+    def as_table(self) -> dict[str, Any]:
+        """In plain values: all that decides the results, and nothing else."""
         table = dataclasses.asdict(self)
         table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
-        return json.dumps(table, sort_keys=True, separators=(",", ":"))
+        return table
 
-    def digest(self) -> str:
-        """SHA-256 of all that decides the results."""
-        own = [device.library_path for device in map(device_of, self.devices) if isinstance(device, InprocDevice)]
-        built = "".join(_content(path) for path in own if path != LIBRARY)  # it may be another one by the next time
-        return hashlib.sha256((self.as_json() + built).encode()).hexdigest()
+    def as_json(self) -> str:
+        """The same plan gives the same text."""
+        return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
+
+    def check_same(self, table: Any, where: str) -> None:
+        """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
+        found = list(differences(table, json.loads(self.as_json())))
+        if found:
+            raise ConfigurationError(f"{where} ({named(found, ('there', 'here'))}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
         """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
@@ -253,24 +267,22 @@ class Plan:
             self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
         )
 
-    def case(self, cell: Cell, seed: int) -> Case:
-        """:raises ConfigurationError: the values make no scenario."""
+    def drawn(self, seed: int) -> dict[str, float]:
+        """The values of a trial that are drawn, by their axes."""
         rng = np.random.default_rng([seed, _DRAWS])
-        drawn = {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
-        values = {**cell.values, **drawn}
+        return {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+
+    def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
+        """:raises ConfigurationError: the values make no scenario."""
+        values = {**cell.values, **(self.drawn(seed) if drawn is None else drawn)}
         try:
             scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
         except ValueError as error:
-            raise ConfigurationError(f"campaign {self.spec.name}: {_said(values)}: {error}") from error
+            raise ConfigurationError(f"{_said(values)}: {error}" if values else str(error)) from error
         rig = dict(self.rigs[cell.rig])
         if "noise_lsb" in values:
             rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
-        return Case(rig, self.devices[cell.device], scenario, seed, drawn)
-
-    def one_worker_only(self) -> str:
-        """As the function, of the first of the devices that is alone, or of a real rig."""
-        real = (str(table.get("name", "")) for table in self.rigs if table.get("kind") == "real")
-        return next(filter(None, (*map(one_worker_only, self.devices), *real)), "")
+        return Case(rig, self.devices[cell.device], scenario, seed)
 
     def _check(self) -> None:
         spec = self.spec
@@ -287,10 +299,29 @@ class Plan:
         if "noise_lsb" in axes and any("card" not in table for table in self.rigs):
             raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
         for cell in self.cells():
-            case = self.case(cell, spec.first_seed)
-            rig = open_table(case.rig)
+            for drawn, opposite in (*itertools.permutations(spec.draw.corners(), 2), (self.drawn(spec.first_seed), {})):
+                problem = self._problem(cell, drawn)
+                if problem:
+                    raise ConfigurationError(f"{where}: {self._blamed(cell, drawn, opposite)}{problem}")
+
+    def _problem(self, cell: Cell, drawn: Mapping[str, float]) -> str:
+        """Why such a trial cannot be set up on an emulated rig; empty if it can."""
+        try:
+            case = self.case(cell, self.spec.first_seed, drawn)
+            rig = open_table(case.rig) if "card" in case.rig else None
             if isinstance(rig, EmulatorRig):
                 rig.set_up(case.scenario, case.seed)
+        except ConfigurationError as error:
+            return str(error)
+        return ""
+
+    def _blamed(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
+        """Of the values at the ends of what is drawn, that which is wrong by itself; all, if none is; empty, if the
+        others are wrong as well."""
+        if not opposite or self._problem(cell, opposite):
+            return ""
+        alone = ({axis: value} for axis, value in corner.items())
+        return f"draw: {_said(next((each for each in alone if self._problem(cell, opposite | each)), corner))}: "
 
 
 def open_table(table: Mapping[str, Any]) -> Rig:
@@ -303,25 +334,45 @@ def open_table(table: Mapping[str, Any]) -> Rig:
     return open_rig(table["name"])
 
 
+def device_table(name: str) -> Mapping[str, Any]:
+    """A device by its name, as plain values that ``device_of`` takes, with its ``build``.
+
+    :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read.
+    """
+    device = describe(name)
+    return {**device.as_table(), "build": build.of_device(device)}
+
+
 def device_of(table: Mapping[str, Any]) -> DeviceDescription:
-    return from_table(table, f"device {table['name']}")
+    """The device of such a table, whatever its build is by now."""
+    return from_table({key: value for key, value in table.items() if key != "build"}, f"device {table['name']}")
 
 
-def _content(path: Path) -> str:
-    """:raises ConfigurationError: it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror or error}") from error
+def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
+    """As ``device_of``; of the build that the table names, if it does.
+
+    :raises ConfigurationError: it is another by now.
+    """
+    device = device_of(table)
+    if "build" in table:
+        build.check_device(device, table["build"])
+    return device
 
 
-def one_worker_only(table: Mapping[str, Any]) -> str:
-    """The name of a device of which there is only one, so that two workers cannot both have it; "" for any other."""
-    return device_of(table).only_one
+def one_worker_only(*tables: Mapping[str, Any]) -> str:
+    """Of rigs and devices the name of the first of which there is only one, so that two workers cannot both have it; ""
+    if there is none."""
+    return next(filter(None, map(_only_one, tables)), "")
+
+
+def _only_one(table: Mapping[str, Any]) -> str:
+    if table.get("kind") == "real":
+        return str(table["name"])
+    return "" if "card" in table else device_of(table).only_one
 
 
 def rig_table(name: str) -> Mapping[str, Any]:
-    """A rig by its name, as plain values that ``open_table`` takes.
+    """A rig by its name, as plain values that ``open_table`` takes; a real one is opened by its name again.
 
     :raises ConfigurationError: there is none, or it can play but one scenario.
     """
@@ -330,7 +381,8 @@ def rig_table(name: str) -> Mapping[str, Any]:
             raise ConfigurationError(
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
             )
-        return _given(rig.description()) if isinstance(rig, EmulatorRig) else {"name": name}
+        described = _given(rig.description())
+        return described if isinstance(rig, EmulatorRig) else {"name": name, "kind": "real", "described": described}
 
 
 def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:

@@ -2,45 +2,55 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import json
-import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.bench import INTERRUPTED_BY_USER, Bench
-from harness.campaign.spec import Case, Chunk, Plan, device_of, open_table
-from harness.dut import Dut, connect
-from harness.errors import AnalogrigError
-from harness.rigs.emulator import EmulatorRig
-from harness.rigs.rig import Rig
+import numpy as np
+
+from harness.campaign import build
+from harness.campaign.players import Players
+from harness.campaign.spec import Case, Cell, Chunk, Plan
+from harness.catalogue import SteppedFlag
+from harness.errors import ConfigurationError, DeviceError, LinkError, RigError
+from harness.exposure import exposure
 from harness.run import Run
-from harness.trials import Trials, are_possible
-from harness.verdict import TweakVerdict, Verdict, judge
+from harness.trials import Trials
+from harness.verdict import TweakVerdict, Verdict, judge, refusals
 
 Row = dict[str, Any]
 """Of one trial, in plain values; see ``row``."""
+
+_players = Players()
 
 
 def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
     """The rows of a chunk of the plan (``Plan.as_json``): the same in every process on every machine.
 
-    :raises ConfigurationError: a case cannot be played; names cell and seed.
-    :raises LinkError, DeviceError, RigError: a device or a rig cannot be had.
+    :raises ConfigurationError: the build here is another, or a device refuses its configuration; names cell and seed.
     """
     planned, cells = _plan(plan)
     numbered = Chunk(chunk)
     rows = []
     for seed in planned.seeds(numbered):
-        case = planned.case(cells[numbered.cell], seed)
         try:
-            run = _players.player(case).play(case)
-        except AnalogrigError as error:
-            raise type(error)(f"campaign {planned.spec.name}, cell {numbered.cell}, seed {seed}: {error}") from error
-        rows.append(row(run, judge(run), case.drawn))
+            rows.append(_played(planned, cells[numbered.cell], seed))
+        except ConfigurationError as error:
+            raise ConfigurationError(
+                f"campaign {planned.spec.name}, cell {numbered.cell}, seed {seed}: {error}"
+            ) from error
     return rows
+
+
+def _played(plan: Plan, cell: Cell, seed: int) -> Row:
+    """A trial that cannot be played is inconclusive: the next may be none the worse for it."""
+    drawn = plan.drawn(seed)
+    try:
+        run = _players.play(plan.case(cell, seed))
+    except (DeviceError, LinkError, RigError) as error:
+        return _row(seed, "inconclusive", drawn, why=" ".join(str(error).split()))
+    return row(run, judge(run), drawn)
 
 
 def _change(tweak: TweakVerdict) -> list[int | None]:
@@ -53,23 +63,34 @@ def _change(tweak: TweakVerdict) -> list[int | None]:
 def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
     """What is kept of a trial.
 
-    ``changes``: for each [latency or null, bound or null, missed, late], in samples. ``errors``: relative errors of M,
-    B, K at the end, or null. ``theta``: the first digits of the hash of all estimates, which tells builds apart.
+    ``armed``: the samples in which the trigger was armed. ``changes``: for each [latency or null, bound or null,
+    missed, late], in samples. ``errors``: relative errors of M, B, K at the end, or null. ``theta``: the first digits
+    of the hash of all estimates, which tells builds apart. ``why``: the first reason why it has not passed. A trial
+    that shows nothing, since the trigger was never armed, is inconclusive.
     """
-    out: Row = {
-        "seed": run.conditions.seed,
-        "outcome": verdict.outcome,
-        "samples": run.samples,
-        "false_alarms": len(verdict.false_alarms),
-        "changes": [_change(tweak) for tweak in verdict.tweaks],
-        "errors": list(verdict.estimates[-1].error.values()) if verdict.estimates else [],
-        "theta": verdict.theta_hash[:16],
-    }
-    if drawn:
-        out["drawn"] = dict(drawn)
-    if verdict.reasons:
-        out["why"] = verdict.reasons[0]
-    return out
+    shown, outcome, reasons = exposure(run), verdict.outcome, verdict.reasons
+    if outcome == "passed" and not shown.armed and verdict.ceiling is not None:
+        outcome, reasons = "inconclusive", (shown.no_evidence,)
+    return _row(
+        run.conditions.seed,
+        outcome,
+        drawn,
+        why=reasons[0] if reasons else "",
+        samples=run.samples,
+        armed=shown.armed,
+        false_alarms=len(verdict.false_alarms),
+        changes=[_change(tweak) for tweak in verdict.tweaks],
+        errors=list(verdict.estimates[-1].error.values()) if verdict.estimates else [],
+        theta=verdict.theta_hash[:16],
+    )
+
+
+_NOTHING: Row = {"samples": 0, "armed": 0, "false_alarms": 0, "changes": [], "errors": [], "theta": ""}
+
+
+def _row(seed: int, outcome: str, drawn: Mapping[str, float] | None, *, why: str, **found: Any) -> Row:
+    said = {"drawn": dict(drawn or {}), "why": why}
+    return {"seed": seed, "outcome": outcome, **_NOTHING, **found} | {key: each for key, each in said.items() if each}
 
 
 @dataclass(frozen=True)
@@ -77,94 +98,45 @@ class Count:
     """The alarms of a trial in which nothing changes."""
 
     alarms: int
-    updated: int
-    """Samples that the estimator took in."""
+    armed: int
+    """Samples in which the trigger was armed."""
     fault: str = ""
-    """Why the trial is not valid."""
+    """Why the trial is no evidence."""
 
 
 def count_alarms(case: Case) -> Count:
-    """As fast as it goes; errors as ``play_chunk``."""
-    return _players.player(case).count(case)
+    """As fast as it goes.
+
+    :raises ConfigurationError: it cannot be played.
+    :raises LinkError, DeviceError, RigError: the device or the rig cannot be had.
+    """
+    trials = _players.trials(case)
+    return _counted_on_bench(case) if trials is None else _counted(trials, case)
 
 
-class _InProcess:
-    """Plays by trials without a line."""
-
-    def __init__(self, rig: EmulatorRig, case: Case) -> None:
-        self._trials = Trials(rig, device_of(case.device))
-
-    def play(self, case: Case) -> Run:
-        return self._trials.run(case.scenario, case.seed)
-
-    def count(self, case: Case) -> Count:
-        alarms = self._trials.alarms(case.scenario, case.seed)
-        return Count(len(alarms), self._trials.counters["updated"])
-
-    def close(self) -> None:
-        """Nothing is held."""
+def _counted(trials: Trials, case: Case) -> Count:
+    alarms, flags, shown = trials.exposed(case.scenario, case.seed)
+    missing, refused = (int(np.count_nonzero(flags & flag)) for flag in (SteppedFlag.MISSING, SteppedFlag.REFUSED))
+    invalid = [*case.scenario.caveats, *refusals(refused), *case.scenario.expect.gaps(len(flags), missing)]
+    return _count(len(alarms), shown.armed, case.seed, [*invalid, shown.no_evidence])
 
 
-class _OnBench:
-    """Plays on a bench. After a run that was not valid the device is reached anew: what hung must not hang the next."""
-
-    def __init__(self, rig: Rig, case: Case) -> None:
-        self._rig = rig
-        self._device = device_of(case.device)
-        self._dut: Dut | None = None
-
-    def play(self, case: Case) -> Run:
-        if self._dut is None:
-            self._dut = connect(self._device)
-        try:
-            run = Bench(self._rig, self._dut).play(case.scenario, case.seed)
-        except BaseException:
-            self.close()
-            raise
-        if run.conditions.faults:
-            self.close()
-        if INTERRUPTED_BY_USER in run.conditions.faults:
-            raise KeyboardInterrupt
-        return run
-
-    def count(self, case: Case) -> Count:
-        run = self.play(case)
-        verdict = judge(run)
-        fault = "" if verdict.valid else f"seed {case.seed}: {verdict.reasons[0]}"
-        return Count(len(run.alarm_index), run.conditions.counters.get("updated", 0), fault)
-
-    def close(self) -> None:
-        dut, self._dut = self._dut, None
-        if dut is not None:
-            with contextlib.suppress(AnalogrigError):
-                dut.close()
+def _counted_on_bench(case: Case) -> Count:
+    run = _players.play(case)
+    verdict, shown = judge(run), exposure(run)
+    invalid = () if verdict.valid else verdict.reasons
+    return _count(len(run.alarm_index), shown.armed, case.seed, [*invalid, shown.no_evidence])
 
 
-class _Players(threading.local):
-    """The last rig and device of each thread: cells come in turn, so a few are kept."""
-
-    MOST = 64
-
-    def __init__(self) -> None:
-        self._kept: dict[str, tuple[_InProcess | _OnBench, contextlib.ExitStack]] = {}
-
-    def player(self, case: Case) -> _InProcess | _OnBench:
-        key = json.dumps([case.rig, case.device], sort_keys=True)
-        if key not in self._kept:
-            while len(self._kept) >= self.MOST:
-                self._kept.pop(next(iter(self._kept)))[1].close()
-            with contextlib.ExitStack() as held:
-                player = _player(held.enter_context(open_table(case.rig)), case)
-                held.callback(player.close)
-                self._kept[key] = player, held.pop_all()
-        return self._kept[key][0]
-
-    def close(self) -> None:
-        while self._kept:
-            self._kept.popitem()[1][1].close()
+def _count(alarms: int, armed: int, seed: int, faults: Sequence[str]) -> Count:
+    return Count(alarms, armed, next((f"seed {seed}: {fault}" for fault in faults if fault), ""))
 
 
-_players = _Players()
+@functools.lru_cache(maxsize=2)
+def _plan(text: str) -> tuple[Plan, list[Cell]]:
+    plan = Plan.from_json(text)
+    build.check_analogrig(plan.analogrig)
+    return plan, plan.cells()
 
 
 def close_devices() -> None:
@@ -172,24 +144,14 @@ def close_devices() -> None:
     _players.close()
 
 
-def _player(rig: Rig, case: Case) -> _InProcess | _OnBench:
-    if isinstance(rig, EmulatorRig) and are_possible(rig, device_of(case.device)):
-        return _InProcess(rig, case)
-    return _OnBench(rig, case)
-
-
-@functools.lru_cache(maxsize=2)
-def _plan(text: str) -> tuple[Plan, list[Any]]:
-    plan = Plan.from_json(text)
-    return plan, plan.cells()
-
-
 def samples_of(rows: list[Row]) -> Mapping[str, int]:
-    """Counts of valid trials: ``samples``, ``false_alarms``, ``visible`` changes, ``missed`` ones."""
+    """Counts of valid trials: ``samples``, those in which the trigger was ``armed``, ``false_alarms``, ``visible``
+    changes, ``missed`` ones."""
     valid = [each for each in rows if each["outcome"] != "inconclusive"]
     changes = [change for each in valid for change in each["changes"] if change[1] is not None]
     return {
         "samples": sum(each["samples"] for each in valid),
+        "armed": sum(each["armed"] for each in valid),
         "false_alarms": sum(each["false_alarms"] for each in valid),
         "visible": len(changes),
         "missed": sum(change[2] for change in changes),

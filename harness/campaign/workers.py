@@ -15,13 +15,16 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import connection
+from multiprocessing import connection, forkserver, resource_tracker
 from typing import Any, Protocol, TypeVar
 
 from harness.errors import ConfigurationError, WorkerError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+_LOADED = ("harness.campaign.trial", "harness.certificate")
+"""What a worker is made of. The process that they are forked from loads it once, while this one reads its orders."""
 
 MOST_DEATHS = 3
 """Workers that may be lost over one task."""
@@ -31,6 +34,21 @@ _IN_HAND = 2
 
 _ANSWER_S = 10
 """A scheduler that does not answer within so long is not there."""
+
+
+def prepare() -> None:
+    """Begin to load, in the process that the workers of this machine are forked from, what they need.
+
+    Worth a call before all else that takes long.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(_LOADED))
+    resource_tracker.ensure_running()  # it would unblock it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the interrupt key is for this process alone
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class Workers(Protocol):
@@ -60,6 +78,7 @@ class Processes:
         self._count = count
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
+        prepare()
         pools = [_pool() for _ in range(self._count)]
         busy: dict[Future[Result], tuple[int, Task, int]] = {}
         try:
@@ -145,7 +164,7 @@ def _submit(
 
 
 def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin)
+    return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("forkserver"), initializer=_begin)
 
 
 def _begin() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,19 +110,14 @@ def _run(
     most = min(MAX_PARAMETERS, said.identity.get("theta_max", MAX_PARAMETERS))
     estimator = EstimatorConfig.from_settings(said.settings, str(path), most)
     rows = _Rows(said, estimator.parameters)
-    n = said.extent
-    lost = int(((rows.flags & LOST) != 0).sum())
     counters = dict(said.counters)
-    if counters.get("alarms", len(said.alarms)) != len(said.alarms):
-        said.faults.append(f"the device raised {counters['alarms']} alarms, {path} holds {len(said.alarms)}")
-    lacking = [name for name in _COUNTERS if name not in counters]
-    if lacking:
-        said.faults.append(f"the device's counters {', '.join(lacking)} after the run are not in {path}")
+    lost = int(((rows.flags & LOST) != 0).sum())
     if lost > counters.get("samples_lost", lost):  # it has seen what the capture has not
         counters = {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
+    faults = (*scenario.caveats, *said.faults, *_gaps(path, said), *([end] if end else []))
     performance = rig.perform(scenario, 0)
-    alarms = [alarm for alarm in said.alarms if 0 <= alarm[0] < n]
-    diagnoses = [each for each in said.diagnoses if 0 <= each[0] < n]
+    alarms = [alarm for alarm in said.alarms if 0 <= alarm[0] < said.extent]
+    diagnoses = [each for each in said.diagnoses if 0 <= each[0] < said.extent]
     return Run(
         conditions=Conditions(
             seed=0,
@@ -145,7 +140,7 @@ def _run(
             link=str(path),
             counters=counters,
             link_counters=line,
-            faults=(*scenario.caveats, *said.faults, *([end] if end else [])),
+            faults=faults,
         ),
         codes=rows.codes,
         clipped=rows.clipped,
@@ -156,6 +151,16 @@ def _run(
         **_columns(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
         **_columns(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
     )
+
+
+def _gaps(path: Path, said: CapturedRun) -> Iterator[str]:
+    """What the device did by its counters and the capture does not hold."""
+    alarms = said.counters.get("alarms", len(said.alarms))
+    if alarms != len(said.alarms):
+        yield f"the device raised {alarms} alarms, {path} holds {len(said.alarms)}"
+    lacking = [name for name in _COUNTERS if name not in said.counters]
+    if lacking:
+        yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"
 
 
 _TYPES = {"index": np.int64, "onset": np.int64, "kind": np.uint8, "change": np.uint8}

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.options import seed
-from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+from harness.cli.options import add_rig, seed
+from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
 
 if TYPE_CHECKING:
     from harness.calibration.fit import Calibration, Estimate
+    from harness.calibration.recordings import Recording
+    from harness.rigs.rig import Rig
 
 MOST_LSB = 1.0
 """rms between rig and twin, on what the fit has not seen, beyond which it is none."""
@@ -23,7 +24,7 @@ _SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, 
 
 def add(commands: Any) -> None:
     command = commands.add_parser("calibrate", help="fit the emulator to a rig's recordings, and keep it as its twin")
-    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", "emulator"), metavar="NAME", help="the rig")
+    add_rig(command)
     command.add_argument(
         "--out",
         type=Path,
@@ -53,8 +54,6 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from harness.calibration.check import difference_lsb
     from harness.calibration.fit import POTS, STOCKS, calibrate
-    from harness.calibration.plan import check_scenario, scenarios
-    from harness.calibration.recordings import record
     from harness.errors import ConfigurationError, RigError
     from harness.rigs.description import open_rig
     from harness.storage import replacing
@@ -63,15 +62,15 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
     try:
         with open_rig(arguments.rig) as rig:
-            recordings = [record(rig, each, arguments.seed) for each in scenarios(arguments.program)]
-            check = record(rig, check_scenario(arguments.program), arguments.seed)
+            recordings = _recorded(rig, arguments)
         found = calibrate(
-            recordings,
+            recordings[:-1],
             op_amp=arguments.op_amp,
             stocks=(arguments.components,) if arguments.components else STOCKS,
             pots=(arguments.pots,) if arguments.pots else POTS,
+            progress=progress_line("fits"),
         )
-        check_lsb = difference_lsb(check, found.twin, found.estimate("displacement noise").value)
+        check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if check_lsb <= MOST_LSB:
@@ -79,6 +78,23 @@ def _run(arguments: argparse.Namespace) -> int:
             file.write(_toml(found, arguments.rig, arguments.program, check_lsb).encode("utf-8"))
     show(json.dumps(_as_json(found, check_lsb, arguments)) if arguments.json else _table(found, check_lsb, arguments))
     return PASSED if check_lsb <= MOST_LSB else FAILED
+
+
+def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[Recording]:
+    """Those to be fitted, and one more to compare rig and twin on.
+
+    :raises RigError: the rig failed, or is not well.
+    """
+    from harness.calibration.plan import check_scenario, scenarios
+    from harness.calibration.recordings import record
+
+    asked, out = [*scenarios(arguments.program), check_scenario(arguments.program)], []
+    show_progress = progress_line("recordings")
+    for each in asked:
+        out.append(record(rig, each, arguments.seed))
+        if show_progress is not None:
+            show_progress(len(out), len(asked))
+    return out
 
 
 def _table(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> str:

@@ -6,12 +6,11 @@ import argparse
 import contextlib
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show
+from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, watched
 
 if TYPE_CHECKING:
     from harness.campaign.conduct import Tally
@@ -44,24 +43,38 @@ def add_workers(command: argparse.ArgumentParser) -> None:
     )
 
 
+def begin(arguments: argparse.Namespace) -> None:
+    """Let the processes that will play be made while this one finds out what; most likely there will be several."""
+    from harness.campaign.workers import prepare
+
+    if not arguments.cluster and arguments.workers != 1 and len(os.sched_getaffinity(0)) > 1:
+        prepare()
+
+
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign.conduct import conduct, journal_of
-    from harness.campaign.report import write_page
+    begin(arguments)
+    from harness.campaign.conduct import conduct, journal_of, unreachable
+    from harness.campaign.report import page_of, write_page
     from harness.campaign.results import as_json, text
-    from harness.campaign.spec import CampaignSpec, Plan
-    from harness.errors import DeviceError, LinkError, RigError, WorkerError
+    from harness.campaign.spec import CampaignSpec, Plan, one_worker_only
+    from harness.errors import WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
+    page = page_of(out)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
-        with workers(arguments, plan.one_worker_only(), len(list(plan.chunks()))) as crew:
+        with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
+            lacking = {} if out.exists() or arguments.cluster else unreachable(plan)
+            if len(lacking) == len(plan.devices):
+                return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
+            for name, why in lacking.items():
+                complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
             results = conduct(plan, crew, out, progress(plan))
     except KeyboardInterrupt:
         return complain(f"interrupted: {kept}", INTERRUPTED)
-    except (DeviceError, LinkError, RigError, WorkerError) as error:
+    except WorkerError as error:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
-    page = out.with_suffix(".html")
     write_page(results, page)
     if arguments.json:
         show(json.dumps({**as_json(results), "results": str(out), "page": str(page)}))
@@ -92,23 +105,15 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
-    """One line on standard error, at most once a second; None when nobody watches."""
-    if not sys.stderr.isatty():
+    """None when nobody watches."""
+    line = watched()
+    if line is None:
         return None
-    import time
-
     from harness.campaign.results import anytime_text
 
     most = len(plan.cells()) * plan.spec.trials
-    next_s = 0.0
 
     def tell(tally: Tally) -> None:
-        nonlocal next_s
-        if time.monotonic() >= next_s or tally.trials == most:
-            next_s = time.monotonic() + 1.0
-            end = "\n" if tally.trials == most else ""
-            line = f"{tally.trials} of {most} trials; {anytime_text(tally.total())}"
-            sys.stderr.write(f"\r{line:<110}{end}")
-            sys.stderr.flush()
+        line.show(f"{tally.trials} of {most} trials; {anytime_text(tally.total())}", is_last=tally.trials == most)
 
     return tell

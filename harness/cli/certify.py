@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.campaign import add_workers, workers
-from harness.cli.options import seed
-from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+from harness.cli.campaign import add_workers, begin, workers
+from harness.cli.options import add_rig, seed
+from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, watched
 
 if TYPE_CHECKING:
     from harness.certificate import Certificate, Question
@@ -37,12 +36,11 @@ def add(commands: Any) -> None:
         type=int,
         nargs="?",
         const=_ESTIMATES,
-        default=0,
         metavar="N",
         help=f"for rates too rare to be waited for: N estimates from branches with louder noise ({_ESTIMATES})",
     )
     command.add_argument("--scenario", default="healthy", metavar="NAME", help="one without changes (%(default)s)")
-    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", "emulator"), metavar="NAME", help="the rig")
+    add_rig(command)
     command.add_argument("--dut", default=os.environ.get("ANALOGRIG_DUT", "host"), metavar="NAME", help="the device")
     command.add_argument("--seed", type=seed, default=0, metavar="N", help="of the first run (%(default)d)")
     add_workers(command)
@@ -51,15 +49,15 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from harness.campaign.spec import one_worker_only, rig_table
+    begin(arguments)
+    from harness.campaign.spec import device_table, one_worker_only, rig_table
     from harness.certificate import certify, question_of
-    from harness.devices import describe
     from harness.errors import DeviceError, LinkError, RigError, WorkerError
     from harness.scenario import Scenario
 
     question = question_of(
         rig_table(arguments.rig),
-        describe(arguments.dut).as_table(),
+        device_table(arguments.dut),
         Scenario.load(arguments.scenario),
         far=arguments.far,
         confidence=arguments.confidence,
@@ -69,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> int:
         first_seed=arguments.seed,
     )
     try:
-        with workers(arguments, one_worker_only(question.device), question.useful_workers) as crew:
+        with workers(arguments, one_worker_only(question.rig, question.device), question.useful_workers) as crew:
             answer = certify(question, crew, _progress())
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
@@ -79,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sentence(question: Question, answer: Certificate) -> str:
     way = "sequential test" if question.sequential else f"fixed length, at most {question.allowed} alarms allowed"
-    way = "a rare rate" if question.rare else way
+    way = way if question.rare is None else "a rare rate"
     return (
         f"{question.device['name']} on {question.rig['name']}: at most {question.far:g} false alarms per sample,"
         f" confidence {question.confidence:g} ({way}): {answer.outcome.upper()}\n  {answer.reason}"
@@ -95,11 +93,11 @@ def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
 
 
 def _progress() -> Callable[[int, int, int], None] | None:
-    if not sys.stderr.isatty():
+    line = watched()
+    if line is None:
         return None
 
     def tell(samples: int, most: int, alarms: int) -> None:
-        sys.stderr.write(f"\r{samples} of {most} samples, {alarms} alarms{'' if samples < most else chr(10)}")
-        sys.stderr.flush()
+        line.show(f"{samples} of {most} samples, {alarms} alarms", is_last=samples >= most)
 
     return tell

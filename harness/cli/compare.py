@@ -39,9 +39,9 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from harness.campaign.comparison import compare, load
+    from harness.campaign.comparison import compare, load, matched
 
-    found = compare(load(arguments.a), load(arguments.b), arguments.alpha)
+    found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
     show(json.dumps(asdict(found)) if arguments.json else _text(found))
     if not found.differences:
         return complain("INCONCLUSIVE: the two sides have nothing that can be compared", INCONCLUSIVE)

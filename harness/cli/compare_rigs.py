@@ -7,7 +7,7 @@ import json
 import os
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.options import add_dut, changes_of_dut, count, seed
+from harness.cli.options import RIG_NAMES, add_dut, changes_of_dut, count, seed
 from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser(
         "compare-rigs", help="how far rig B is from rig A, in LSB and in samples of latency, with confidence"
     )
-    command.add_argument("a", metavar="A", help="a rig: shipped name or .toml file")
+    command.add_argument("a", metavar="A", help=f"a rig: {RIG_NAMES}")
     command.add_argument("b", metavar="B", help="the other")
     command.add_argument("--scenario", default="thesis", metavar="NAME", help="shipped or a .toml file (%(default)s)")
     command.add_argument("--plays", type=count, default=10, metavar="N", help="on each of them (%(default)d)")
@@ -53,7 +53,7 @@ def _run(arguments: argparse.Namespace) -> int:
         open_dut(arguments.dut, **changes_of_dut(arguments)) as dut,
     ):
         bench_a, bench_b = (Bench(rig, dut, real_time=arguments.real_time) for rig in (a, b))
-        found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line())
+        found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))
     if not isinstance(found, RigComparison):
         return complain(f"INCONCLUSIVE: nothing can be compared: {found[0]}", INCONCLUSIVE)
     show(json.dumps(asdict(found) | {"sentence": found.sentence}) if arguments.json else _text(found))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 from typing import TYPE_CHECKING, Any
 
-from harness.cli.options import seed
+from harness.cli.options import add_rig, seed
 from harness.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
 
 if TYPE_CHECKING:
@@ -17,12 +16,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     command = commands.add_parser("doctor", help="what is wrong with a rig: leads, ranges, gains, skew, noise, clocks")
-    command.add_argument(
-        "--rig",
-        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
-        metavar="NAME",
-        help="shipped name or .toml file (default: $ANALOGRIG_RIG or emulator)",
-    )
+    add_rig(command)
     command.add_argument(
         "--program",
         choices=("front", "shock"),

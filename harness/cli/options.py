@@ -17,6 +17,15 @@ if TYPE_CHECKING:
 DEFAULT_SCENARIO = "thesis"
 
 
+RIG_NAMES = "shipped name, that of a table of your rigs file, FILE.toml or FILE.toml:NAME"
+RIG_HELP = f"{RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)"
+
+
+def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
+    """``default``: when the environment names none."""
+    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar="NAME", help=words)
+
+
 def add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scenario",
@@ -26,11 +35,8 @@ def add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--program", choices=PROGRAMS, help="what is wired on the computer, instead of the scenario's plant.set"
     )
-    command.add_argument(
-        "--rig",
-        default=os.environ.get("ANALOGRIG_RIG"),
-        metavar="NAME",
-        help="shipped name, .toml file, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)",
+    add_rig(
+        command, f"{RIG_NAMES}, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None
     )
     command.add_argument(
         "--seed",
@@ -66,8 +72,7 @@ def factor(text: str) -> float:
     raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
 
 
-def add_dut(command: argparse.ArgumentParser, default: str | None) -> None:
-    shown = "$ANALOGRIG_DUT or host" if default is not None else "that of the recording"
+def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
     command.add_argument(
         "--dut",
         default=default,
@@ -157,12 +162,7 @@ def add_capture(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scenario", metavar="NAME", help="what was played: shipped name or .toml file; a run.npz says it itself"
     )
-    command.add_argument(
-        "--rig",
-        default=os.environ.get("ANALOGRIG_RIG", "emulator"),
-        metavar="NAME",
-        help="on which a CAN log was captured: shipped name or .toml file (default: $ANALOGRIG_RIG or emulator)",
-    )
+    add_rig(command, f"on which a CAN log was captured: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
     command.add_argument(
         "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
     )

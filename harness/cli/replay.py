@@ -14,7 +14,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser("replay", help="play a recorded run through a device again, and judge it")
     command.add_argument("file", type=Path, metavar="FILE", help="a recording (run.npz), or a CAN log")
     add_capture(command)
-    add_dut(command, default=None)
+    add_dut(command, default=None, shown="that of the recording")
     add_output(command, default=Path("build/replay"))
     add_can_log(command)
     command.set_defaults(command=_run)

@@ -12,7 +12,7 @@ from harness.cli.options import PROGRAMS, seed
 from harness.cli.terminal import PASSED, complain, show
 
 if TYPE_CHECKING:
-    from harness.instrument.server import Server
+    from harness.served.server import Server
 
 DEFAULT_PORT = 5000
 """That of a Red Pitaya."""
@@ -61,9 +61,9 @@ def port(text: str) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from harness.instrument.served import ServedDescription
-    from harness.instrument.server import Server
     from harness.scenario import DEFAULT_SEED
+    from harness.served.rig import ServedDescription
+    from harness.served.server import Server
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -14,6 +16,9 @@ PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
 
 STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE}
 """Of a verdict's outcome."""
+
+
+_PROGRESS_S = 1.0
 
 
 def complain(message: str, status: int) -> int:
@@ -38,20 +43,37 @@ def open_standard_streams() -> None:
             setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - for as long as we live
 
 
-def progress_line() -> Progress | None:
-    """Percent on standard error, at most once a second and only from the second second on; None when nobody watches."""
-    if not sys.stderr.isatty():
-        return None
-    import time
+class ProgressLine:
+    """A line on standard error that is written over: at most once a second, and only from the second second on."""
 
-    next_s = time.monotonic() + 1.0
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._next_s = clock() + _PROGRESS_S
+        self._width = 0
+        """Of what stands there."""
+
+    def show(self, text: str, *, is_last: bool) -> None:
+        """The last one is shown if any was, and ends the line."""
+        if self._clock() < self._next_s and not (is_last and self._width):
+            return
+        self._next_s = self._clock() + _PROGRESS_S
+        end = "\n" if is_last else ""
+        print(f"\r{text:<{self._width}}", end=end, file=sys.stderr, flush=True)
+        self._width = 0 if is_last else len(text)
+
+
+def watched() -> ProgressLine | None:
+    """None when nobody watches."""
+    return ProgressLine() if sys.stderr.isatty() else None
+
+
+def progress_line(of: str = "samples") -> Progress | None:
+    """How many of how many, and percent; None when nobody watches."""
+    line = watched()
+    if line is None:
+        return None
 
     def show(done: int, asked: int) -> None:
-        nonlocal next_s
-        now_s = time.monotonic()
-        if now_s >= next_s:
-            next_s = now_s + 1.0
-            end = "\n" if done == asked else ""
-            print(f"\r{done} of {asked} samples ({done / asked:.0%})", end=end, file=sys.stderr, flush=True)
+        line.show(f"{done} of {asked} {of} ({done / asked:.0%})", is_last=done == asked)
 
     return show

@@ -23,7 +23,18 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.onset.two_filter import ANYWHERE, Array, Backwards, Columns, Edges, Forwards, Model, Record, joined, scan
+from harness.onset.two_filter import (
+    ANYWHERE,
+    Array,
+    Backwards,
+    Columns,
+    EdgePlace,
+    Forwards,
+    Model,
+    Signals,
+    joined,
+    scan,
+)
 from harness.plant import PARAMETERS, Plant
 
 CONFIDENCE = 0.95
@@ -103,7 +114,7 @@ class NoOnset:
 
 
 def onset(
-    record: Record,
+    signals: Signals,
     before: Plant,
     after: Plant | None,
     search: range,
@@ -115,12 +126,12 @@ def onset(
 
     :param before: as it was asked for; what it really is may be some per cent beside it.
     :param after: as it was asked for; None: nobody knows.
-    :param search: the samples (indices of ``record``) one of which is the instant.
-    :param within: the samples in which the plant changes no other time; None: the whole record.
+    :param search: the samples (indices of ``signals``) one of which is the instant.
+    :param within: the samples in which the plant changes no other time; None: the whole signals.
     :param confidence: with which the interval holds the instant.
     :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem, guess = Problem.of(record, before, after, search, within).fitted()
+    problem, guess = Problem.of(signals, before, after, search, within).fitted()
     guess, profile = problem.solved(guess)
     if profile.unexplained > _TOO_NARROW and guess.edges != ANYWHERE:
         other = problem.solved(dataclasses.replace(guess, half_width=ANYWHERE.half_width))
@@ -177,8 +188,8 @@ class Guess:
     """How many times as far as white noise the innovations go astray in the long run, as a variance."""
 
     @property
-    def edges(self) -> Edges:
-        return ANYWHERE if self.half_width == ANYWHERE.half_width else Edges(self.place, self.half_width)
+    def edges(self) -> EdgePlace:
+        return ANYWHERE if self.half_width == ANYWHERE.half_width else EdgePlace(self.place, self.half_width)
 
     def moved(self, move: Move) -> Self:
         """Nothing too far at once, and the edges' place within the sample period."""
@@ -222,7 +233,7 @@ class Profile:
 class Problem:
     """A window of a record, the instants in it at which a plant may have changed, and what is known beforehand."""
 
-    record: Record
+    signals: Signals
     search: range
     """As it was asked for."""
     candidates: slice
@@ -235,17 +246,17 @@ class Problem:
     """By how much the variance of the noise was raised."""
 
     @classmethod
-    def of(cls, record: Record, before: Plant, after: Plant | None, search: range, within: range | None) -> Self:
-        if search.step != 1 or not 0 <= search.start < search.stop <= len(record):
-            raise ValueError(f"{search} is empty or leaves the {len(record)} samples of the record")
-        alone = within or range(len(record))
+    def of(cls, signals: Signals, before: Plant, after: Plant | None, search: range, within: range | None) -> Self:
+        if search.step != 1 or not 0 <= search.start < search.stop <= len(signals):
+            raise ValueError(f"{search} is empty or leaves the {len(signals)} samples of the record")
+        alone = within or range(len(signals))
         if not alone.start <= search.start < search.stop <= alone.stop:
             raise ValueError(f"{search} leaves {alone}, in which the plant changes no other time")
         first = max(search.start - WINDOW_N, alone.start, 0)
         changed = before.changes_to(after or before)
         turned = [_UNKNOWN if after is None else _TURNED if name in changed else _LEFT_ALONE for name in PARAMETERS]
         return cls(
-            _no_better(record.part(first, min(search.stop + WINDOW_N, alone.stop))),
+            _no_better(signals.part(first, min(search.stop + WINDOW_N, alone.stop))),
             search,
             slice(search.start - first, search.stop - first),
             before,
@@ -261,9 +272,9 @@ class Problem:
             return self, guess
         more = math.sqrt(guess.left)
         noisier = dataclasses.replace(
-            self.record, noise_n=self.record.noise_n * more, noise_m=self.record.noise_m * more
+            self.signals, noise_n=self.signals.noise_n * more, noise_m=self.signals.noise_m * more
         )
-        problem = dataclasses.replace(self, record=noisier, left=guess.left)
+        problem = dataclasses.replace(self, signals=noisier, left=guess.left)
         return problem, problem.fit()
 
     def fit(self) -> Guess:
@@ -271,8 +282,8 @@ class Problem:
         zero = np.zeros(_OWN)
         guess = Guess(0.0, ANYWHERE.mean, ANYWHERE.half_width, zero, zero, self.candidates.start)
         earlier, later = (
-            self.record.part(0, self.candidates.start),
-            self.record.part(self.candidates.stop, len(self.record)),
+            self.signals.part(0, self.candidates.start),
+            self.signals.part(self.candidates.stop, len(self.signals)),
         )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
         guess, cost, innovation = _settled(earlier, self.before, guess, known)
@@ -289,21 +300,21 @@ class Problem:
     def filters(self, guess: Guess) -> tuple[Forwards, Backwards]:
         """Of the plant as it was, and of the plant as it then is."""
         old, new = self.models(guess)
-        later = np.arange(len(self.record)) >= guess.sample
+        later = np.arange(len(self.signals)) >= guess.sample
         course = _course(
             np.where(later[:, None, None], new.transition, old.transition),
-            np.where(later[:, None], new.inputs(self.record, guess.new[0]), old.inputs(self.record, guess.old[0])),
+            np.where(later[:, None], new.inputs(self.signals, guess.new[0]), old.inputs(self.signals, guess.old[0])),
         )
         return (
-            Forwards.of(old, self.record, Columns.of(old, self.record, course, (guess.offset, guess.old[0]))),
-            Backwards.of(new, self.record, Columns.of(new, self.record, course, (guess.offset, guess.new[0]))),
+            Forwards.of(old, self.signals, Columns.of(old, self.signals, course, (guess.offset, guess.old[0]))),
+            Backwards.of(new, self.signals, Columns.of(new, self.signals, course, (guess.offset, guess.new[0]))),
         )
 
     def models(self, guess: Guess) -> tuple[Model, Model]:
         """Of the plant as it was, and as it then is."""
         return (
-            Model.of(beside(self.before, guess.old), guess.edges, self.record),
-            Model.of(beside(self.after, guess.new), guess.edges, self.record),
+            Model.of(beside(self.before, guess.old), guess.edges, self.signals),
+            Model.of(beside(self.after, guess.new), guess.edges, self.signals),
         )
 
     def profile(self, guess: Guess) -> Profile:
@@ -320,7 +331,7 @@ class Problem:
         cost = fit + log + old.log[at] + new.log[at]
         best = int(cost.argmin())
         return Profile(
-            cost, float(fit[best]) / max(1, int(self.record.valid.sum())), Move(unknowns[best], at.start + best)
+            cost, float(fit[best]) / max(1, int(self.signals.valid.sum())), Move(unknowns[best], at.start + best)
         )
 
     def solved(self, guess: Guess) -> tuple[Guess, Profile]:
@@ -340,7 +351,7 @@ class Problem:
                 " variance of their noise"
             )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        _, none, _ = _settled(self.record, self.before, guess, known, rounds=1)
+        _, none, _ = _settled(self.signals, self.before, guess, known, rounds=1)
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if none - cost < chance * doubt(guess, unexplained):
             return NoOnset(f"nothing in the samples {self._searched} shows that the plant has changed", unchanged=True)
@@ -371,14 +382,14 @@ class Problem:
         return rows.T @ rows
 
 
-def _no_better(record: Record) -> Record:
+def _no_better(signals: Signals) -> Signals:
     """The same with at least the noise that stands for what one mass, damper and spring do not explain of a rig."""
-    if not record.valid.any():
-        return record
+    if not signals.valid.any():
+        return signals
     return dataclasses.replace(
-        record,
-        noise_n=max(record.noise_n, _LEAST_NOISE_FORCE * float(np.ptp(record.force_n[record.valid]))),
-        noise_m=max(record.noise_m, _LEAST_NOISE * float(np.ptp(record.displacement_m[record.valid]))),
+        signals,
+        noise_n=max(signals.noise_n, _LEAST_NOISE_FORCE * float(np.ptp(signals.force_n[signals.valid]))),
+        noise_m=max(signals.noise_m, _LEAST_NOISE * float(np.ptp(signals.displacement_m[signals.valid]))),
     )
 
 
@@ -396,7 +407,7 @@ def colour(innovations: Sequence[Array]) -> float:
 
 
 def _settled(
-    record: Record, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS
+    signals: Signals, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS
 ) -> tuple[Guess, float, Array]:
     """The guess with its offset, place and ``old`` moved to what these samples of one plant say, twice the negative
     logarithm of their likelihood, and the innovations.
@@ -405,11 +416,11 @@ def _settled(
     """
     cost, innovation = 0.0, np.zeros(0)
     first = guess
-    for _ in range(rounds if len(record) >= _LEAST_FIT_N else 0):
-        model = Model.of(beside(plant, guess.old), guess.edges, record)
-        transitions = np.broadcast_to(model.transition, (len(record), 2, 2))
-        course = _course(transitions, model.inputs(record, guess.old[0]))
-        filtered = Forwards.of(model, record, Columns.of(model, record, course, (guess.offset, guess.old[0])))
+    for _ in range(rounds if len(signals) >= _LEAST_FIT_N else 0):
+        model = Model.of(beside(plant, guess.old), guess.edges, signals)
+        transitions = np.broadcast_to(model.transition, (len(signals), 2, 2))
+        course = _course(transitions, model.inputs(signals, guess.old[0]))
+        filtered = Forwards.of(model, signals, Columns.of(model, signals, course, (guess.offset, guess.old[0])))
         rows = np.zeros((_COMMON + _OWN, 1 + _COMMON + _OWN))
         rows[:, 0] = [guess.offset - first.offset, guess.edges.mean - first.edges.mean, *(guess.old - first.old)]
         rows[:, 1:] = np.eye(_COMMON + _OWN)

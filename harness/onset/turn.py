@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.onset.jump import CONFIDENCE, Guess, NoOnset, Onset, Problem, beside, doubt, interval
-from harness.onset.two_filter import Array, Backwards, Edges, Forwards, Model, Record, joined
+from harness.onset.two_filter import Array, Backwards, EdgePlace, Forwards, Model, Signals, joined
 from harness.plant import PARAMETERS, Plant
 
 Indices = NDArray[np.int64]
@@ -36,20 +36,20 @@ _FINE_N = 8
 
 
 @dataclass(frozen=True)
-class Turn:
+class SlowTurn:
     """From the last sample that cannot tell of it to the first at which the plant has become another one."""
 
     begin: Onset
     end: Onset
 
-    def wider(self, search: range, part: float) -> Turn:
+    def wider(self, search: range, part: float) -> SlowTurn:
         """By a part of the time that it takes, within the range."""
         more = round(part * (self.end.sample - self.begin.sample))
         begin, end = (
             Onset(each.sample, max(each.low - more, search.start), min(each.high + more, search.stop - 1))
             for each in (self.begin, self.end)
         )
-        return Turn(begin, end)
+        return SlowTurn(begin, end)
 
 
 Shape = Callable[[Array], Array]
@@ -57,7 +57,7 @@ Shape = Callable[[Array], Array]
 
 
 def turn(
-    record: Record,
+    signals: Signals,
     before: Plant,
     after: Plant | None,
     search: range,
@@ -65,20 +65,20 @@ def turn(
     middle: Plant | None = None,
     within: range | None = None,
     confidence: float = CONFIDENCE,
-) -> Turn | NoOnset:
+) -> SlowTurn | NoOnset:
     """When a pot began to turn and when it stood, both in ``search``; other arguments as of ``harness.onset.onset``.
 
     :param middle: two pots jumped, one after the other, and between the two the plant was this one.
     :raises ValueError: the range is empty, or leaves the record or ``within``.
     """
-    problem, guess = Problem.of(record, before, after, search, within).fitted()
+    problem, guess = Problem.of(signals, before, after, search, within).fitted()
     ways = _Ways.of(problem, guess) if middle is None else _Ways.stopping(problem, guess, middle)
     shapes = (_evenly, _gently) if middle is None else (_evenly,)
     every = [_zoomed(ways, shape, problem.candidates, confidence) for shape in shapes]
     every.sort(key=lambda tried: float(tried.cost.min()))
     best = every[0]
     at = int(best.cost.argmin())
-    unexplained = float(best.fit[at]) / max(1, int(problem.record.valid.sum()))
+    unexplained = float(best.fit[at]) / max(1, int(problem.signals.valid.sum()))
     if objection := problem.objection(float(best.cost[at]), unexplained, guess):
         return objection
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
@@ -86,7 +86,7 @@ def turn(
     doubted = doubt(guess, max(unexplained, float(best.on_the_way[at])))
     likely = [tried for tried in every if tried.cost.min() - best.cost[at] <= _LIKELY * doubted]
     shift = search.start - problem.candidates.start
-    found = Turn(
+    found = SlowTurn(
         _over([_instant(tried.begin, tried.cost / doubted, confidence) for tried in likely], shift),
         _over([_instant(tried.end, tried.cost / doubted, confidence) for tried in likely], shift),
     )
@@ -170,7 +170,7 @@ def _over(found: Sequence[Onset], shift: int) -> Onset:
 class _Ways:
     """All that is needed to go from the one plant to the other, between any two instants."""
 
-    record: Record
+    signals: Signals
     old: Forwards
     new: Backwards
     offset: float
@@ -184,10 +184,10 @@ class _Ways:
         parts = np.linspace(0.0, 1.0, _PARTS).tolist()
         offsets = np.linspace(guess.old[0], guess.new[0], _PARTS).tolist()
         rows = [
-            _row(problem.record, old.on_the_way(new, part), guess.edges, offset)
+            _row(problem.signals, old.on_the_way(new, part), guess.edges, offset)
             for part, offset in zip(parts, offsets, strict=True)
         ]
-        return cls(problem.record, *problem.filters(guess), guess.offset, np.array(rows))
+        return cls(problem.signals, *problem.filters(guess), guess.offset, np.array(rows))
 
     @classmethod
     def stopping(cls, problem: Problem, guess: Guess, middle: Plant) -> Self:
@@ -195,8 +195,8 @@ class _Ways:
         turned = problem.before.changes_to(middle)
         own = [guess.new[1 + i] if name in turned else guess.old[1 + i] for i, name in enumerate(PARAMETERS)]
         offset = 0.5 * float(guess.old[0] + guess.new[0])
-        row = _row(problem.record, beside(middle, np.array([offset, *own])), guess.edges, offset)
-        return cls(problem.record, *problem.filters(guess), guess.offset, np.tile(row, (_PARTS, 1)))
+        row = _row(problem.signals, beside(middle, np.array([offset, *own])), guess.edges, offset)
+        return cls(problem.signals, *problem.filters(guess), guess.offset, np.tile(row, (_PARTS, 1)))
 
     def tried(self, begins: Indices, ends: Indices, shape: Shape) -> _Tried:
         """Every pair in which the end is after the begin; those that take longest first."""
@@ -213,20 +213,20 @@ class _Ways:
             on = slice(0, int((lengths > k).sum()))
             a, b, c, d, gx, gv, ex, ev, exx, exv, evv, offset = self._at(shape((k + 0.5) / lengths[on]))
             at = begin[on] + k
-            force, edge = self.record.force_n[at] + offset * self.record.noise_n, self.record.edges_n[at]
+            force, edge = self.signals.force_n[at] + offset * self.signals.noise_n, self.signals.edges_n[at]
             x[on], v[on] = (
                 a * x[on] + b * v[on] + gx * force + ex * edge,
                 c * x[on] + d * v[on] + gv * force + ev * edge,
             )
-            noise, jolt = self.record.noise_n**2, edge**2
+            noise, jolt = self.signals.noise_n**2, edge**2
             p[on], q[on], r[on] = (
                 a * a * p[on] + 2.0 * a * b * q[on] + b * b * r[on] + noise * gx * gx + jolt * exx,
                 a * c * p[on] + (a * d + b * c) * q[on] + b * d * r[on] + noise * gx * gv + jolt * exv,
                 c * c * p[on] + 2.0 * c * d * q[on] + d * d * r[on] + noise * gv * gv + jolt * evv,
             )
-            weight = self.record.valid[at + 1]
+            weight = self.signals.valid[at + 1]
             size = 1.0 + weight * p[on]
-            innovation = self.record.displacement_m[at + 1] / self.record.noise_m - self.offset - x[on]
+            innovation = self.signals.displacement_m[at + 1] / self.signals.noise_m - self.offset - x[on]
             own[on] += weight * innovation**2 / size
             log[on] += np.log(size)
             gain, other = weight * p[on] / size, weight * q[on] / size
@@ -247,9 +247,9 @@ class _Ways:
         return np.asarray((self.parts[lower] * (1.0 - beyond) + self.parts[lower + 1] * beyond).T)
 
 
-def _row(record: Record, plant: Plant, edges: Edges, offset: float) -> Array:
+def _row(signals: Signals, plant: Plant, edges: EdgePlace, offset: float) -> Array:
     """(12,) of ``_Ways.parts``."""
-    model = Model.of(plant, edges, record)
+    model = Model.of(plant, edges, signals)
     covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
     return np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]])
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from harness.information import QUANTISATION_VARIANCE_LSB2
 from harness.plant import PARAMETERS, Plant, SampledPlant
-from harness.run import CHANNELS, Channel, missing_to_device
+from harness.run import CHANNELS, MEASURED, Channel, missing_to_device
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ _PLACES = (np.arange(8) + 0.5) / 4.0 - 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Signals:
     """n consecutive samples, without a gap in time, of force and displacement."""
 
     force_n: Array
@@ -60,15 +60,15 @@ class Record:
         cls, codes: NDArray[np.uint16], clipped: NDArray[np.bool_], channels: Mapping[str, Channel], period_s: float
     ) -> Self:
         """Of codes and clipped (n, 4), columns as CHANNELS."""
-        columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in ("force", "displacement")}
+        columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in MEASURED}
         noise_n, noise_m = (
             (channels[name].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(channels[name].lsb)
-            for name in ("force", "displacement")
+            for name in MEASURED
         )
         valid = ~missing_to_device(clipped)
         return cls(columns["force"], columns["displacement"], valid, period_s, noise_n, noise_m)
 
-    def part(self, first: int, end: int) -> Record:
+    def part(self, first: int, end: int) -> Signals:
         """The samples first <= k < end."""
         return replace(
             self,
@@ -88,14 +88,14 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Edges:
+class EdgePlace:
     """Where in a sample period the edges of the force come: around a mean place (0..1), evenly within a half width."""
 
     mean: float
     half_width: float
 
 
-ANYWHERE = Edges(0.5, 0.5)
+ANYWHERE = EdgePlace(0.5, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,16 +123,16 @@ class Model:
     """(3, 2)"""
 
     @classmethod
-    def of(cls, plant: Plant, edges: Edges, record: Record) -> Self:
-        """For the period and the noise of ``record``."""
-        transition, response = _sampled(plant, 1.0, record)
+    def of(cls, plant: Plant, edges: EdgePlace, signals: Signals) -> Self:
+        """For the period and the noise of ``signals``."""
+        transition, response = _sampled(plant, 1.0, signals)
         places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0)
-        late = np.array([_sampled(plant, 1.0 - place, record)[1] for place in places.tolist()])
+        late = np.array([_sampled(plant, 1.0 - place, signals)[1] for place in places.tolist()])
         beside = np.clip([edges.mean - 100.0 * _STEP, edges.mean + 100.0 * _STEP], 0.0, 1.0)
-        ends = [_sampled(plant, 1.0 - place, record)[1] for place in beside.tolist()]
+        ends = [_sampled(plant, 1.0 - place, signals)[1] for place in beside.tolist()]
         moved = [plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS]
-        sampled = [_sampled(each, 1.0, record) for each in moved]
-        middle = _sampled(plant, 1.0 - edges.mean, record)[1]
+        sampled = [_sampled(each, 1.0, signals) for each in moved]
+        middle = _sampled(plant, 1.0 - edges.mean, signals)[1]
         return cls(
             transition=transition,
             response=response,
@@ -141,32 +141,32 @@ class Model:
             edge_by_place=(ends[1] - ends[0]) / (beside[1] - beside[0]),
             transition_by=np.array([each[0] - transition for each in sampled]) / _STEP,
             response_by=np.array([each[1] - response for each in sampled]) / _STEP,
-            edge_by=np.array([_sampled(each, 1.0 - edges.mean, record)[1] - middle for each in moved]) / _STEP,
+            edge_by=np.array([_sampled(each, 1.0 - edges.mean, signals)[1] - middle for each in moved]) / _STEP,
         )
 
-    def inputs(self, record: Record, offset: float) -> Array:
+    def inputs(self, signals: Signals, offset: float) -> Array:
         """(n, 2): what the force does to the state in the period after each sample.
 
         :param offset: of the force, in the rms of its noise.
         """
-        force = (record.force_n + offset * record.noise_n)[:, None]
-        return np.asarray(self.response * force + self.edge * record.edges_n[:, None])
+        force = (signals.force_n + offset * signals.noise_n)[:, None]
+        return np.asarray(self.response * force + self.edge * signals.edges_n[:, None])
 
-    def disturbances(self, record: Record) -> Array:
+    def disturbances(self, signals: Signals) -> Array:
         """(n, 2, 2): covariance of what is not known of that."""
-        noise = record.noise_n**2 * np.outer(self.response, self.response)
-        return np.asarray(noise + record.edges_n[:, None, None] ** 2 * self.edge_covariance)
+        noise = signals.noise_n**2 * np.outer(self.response, self.response)
+        return np.asarray(noise + signals.edges_n[:, None, None] ** 2 * self.edge_covariance)
 
 
-def _sampled(plant: Plant, part: float, record: Record) -> tuple[Array, Array]:
+def _sampled(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]:
     """Transition (2, 2) and response (2,) over a part of a sample period."""
     if part <= 0.0:
         return np.eye(2), np.zeros(2)
-    period_s = record.period_s
+    period_s = signals.period_s
     sampled = SampledPlant.of(plant, part * period_s)
     (xx, xv, vx, vv), (xf, vf) = sampled.transition, sampled.response
     transition = np.array([[xx, xv / period_s], [vx * period_s, vv]])
-    return transition, np.array([xf, vf * period_s]) / record.noise_m
+    return transition, np.array([xf, vf * period_s]) / signals.noise_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,20 +179,20 @@ class Columns:
     """(n, c): the displacement."""
 
     @classmethod
-    def of(cls, model: Model, record: Record, course: Array, offsets: tuple[float, float]) -> Self:
+    def of(cls, model: Model, signals: Signals, course: Array, offsets: tuple[float, float]) -> Self:
         """About a course of the state (n, 2) and offsets of displacement and force, in the rms of their noise."""
-        n = len(record)
-        force = (record.force_n + offsets[1] * record.noise_n)[:, None]
-        edges = record.edges_n[:, None]
+        n = len(signals)
+        force = (signals.force_n + offsets[1] * signals.noise_n)[:, None]
+        edges = signals.edges_n[:, None]
         inputs = np.zeros((n, 2, 1 + COMMON + OWN))
-        inputs[:, :, 0] = model.inputs(record, offsets[1])
+        inputs[:, :, 0] = model.inputs(signals, offsets[1])
         inputs[:, :, 2] = model.edge_by_place * edges
-        inputs[:, :, 3] = model.response * record.noise_n
+        inputs[:, :, 3] = model.response * signals.noise_n
         for i in range(len(PARAMETERS)):
             own = course @ model.transition_by[i].T + model.response_by[i] * force
             inputs[:, :, 4 + i] = own + model.edge_by[i] * edges
         measured = np.zeros((n, 1 + COMMON + OWN))
-        measured[:, 0] = record.displacement_m / record.noise_m - offsets[0]
+        measured[:, 0] = signals.displacement_m / signals.noise_m - offsets[0]
         measured[:, 1] = -1.0
         return cls(inputs, measured)
 
@@ -213,11 +213,11 @@ class Forwards:
     """(n, c): in their standard deviation; 0 for a sample that is none."""
 
     @classmethod
-    def of(cls, model: Model, record: Record, columns: Columns) -> Self:
+    def of(cls, model: Model, signals: Signals, columns: Columns) -> Self:
         """A Kalman filter that begins with any state."""
-        weight = record.valid.astype(np.float64)
-        gain, size, covariance = _gains(model, weight, model.disturbances(record))
-        kept = np.tile(np.eye(2), (len(record), 1, 1))
+        weight = signals.valid.astype(np.float64)
+        gain, size, covariance = _gains(model, weight, model.disturbances(signals))
+        kept = np.tile(np.eye(2), (len(signals), 1, 1))
         kept[:, :, 0] -= gain
         entering = _after_first(columns.inputs[:-1])
         taken = gain[:, :, None] * columns.measured[:, None, :]
@@ -243,10 +243,10 @@ class Backwards:
     """(n,)"""
 
     @classmethod
-    def of(cls, model: Model, record: Record, columns: Columns) -> Self:
+    def of(cls, model: Model, signals: Signals, columns: Columns) -> Self:
         """An information filter that begins, at the end, knowing nothing."""
-        weight = record.valid.astype(np.float64)
-        disturbances = model.disturbances(record)[:-1]
+        weight = signals.valid.astype(np.float64)
+        disturbances = model.disturbances(signals)[:-1]
         known = _informations(model, weight, disturbances)  # at the sample after each, that one included
         inner = np.eye(2) + known @ disturbances
         softened = disturbances @ np.linalg.inv(inner)

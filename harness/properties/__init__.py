@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from harness import statement
 from harness.errors import ConfigurationError
-from harness.played import Finding, Played
+from harness.played import Played
 from harness.rigs.rig import Rig
 from harness.scenario import Scenario
+from harness.statement import Finding, Play
 
 __all__ = ["TRIES", "Play", "is_playable", "with_some_seed"]
-
-Play = Callable[..., Played]
 
 TRIES = 5
 """What chance may spoil has failed when it did so with as many seeds, one after the other."""
@@ -33,14 +33,7 @@ def is_playable(rig: Rig, scenario: Scenario) -> bool:
 
 
 def with_some_seed(
-    play: Play, scenario: str | Scenario, seed: int, statement: Callable[[Played], Finding], tries: int = TRIES
+    play: Play, scenario: str | Scenario, seed: int, judge: Callable[[Played], Finding], tries: int = TRIES
 ) -> Finding:
-    """Whether a statement about a play holds with this seed, or the next, ...: the last finding.
-
-    With a chance p of one play to fail a sound device, that of this to fail it is p to the power of ``tries``.
-    """
-    for number in range(tries):
-        finding = statement(play(scenario, seed + number))
-        if finding:
-            break
-    return finding
+    """As ``harness.statement.with_some_seed``, with as many tries as the shipped properties have."""
+    return statement.with_some_seed(play, scenario, seed, judge, tries)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from harness.links.wire import Clock
 from harness.onset.jump import NoOnset, onset
-from harness.onset.turn import Turn, turn
-from harness.onset.two_filter import Record
+from harness.onset.turn import SlowTurn, turn
+from harness.onset.two_filter import Signals
 from harness.plant import AT_REST, Plant, SampledPlant
 from harness.rigs.pots import Pots
 from harness.run import Segment
@@ -85,15 +85,15 @@ class ByHand:
             span_s = asked_s - begun_s - BEFORE_S, self._clock() - begun_s + AFTER_S
             self._spans_n.append((span_s[0] * self._rate_hz, span_s[1] * self._rate_hz))
 
-    def dated(self, record: Record, first: int) -> list[Segment]:
+    def dated(self, signals: Signals, first: int) -> list[Segment]:
         """What became of the plant, by the samples of the record, the first of which has this index in the run."""
         out: list[Segment] = []
         earliest = 1
         for i, (tweak, (low_n, high_n)) in enumerate(zip(self._tweaks, self._spans_n, strict=True)):
-            following = self._spans_n[i + 1][0] if i + 1 < len(self._spans_n) else float(len(record))
-            search = range(max(earliest, int(low_n)), min(len(record) - 1, int(following), int(high_n) + 1))
-            within = range(min(earliest, search.start), max(int(min(following, len(record))), search.stop))
-            segment = _dated(record, tweak, search, within, slow=self._pots.slow)
+            following = self._spans_n[i + 1][0] if i + 1 < len(self._spans_n) else float(len(signals))
+            search = range(max(earliest, int(low_n)), min(len(signals) - 1, int(following), int(high_n) + 1))
+            within = range(min(earliest, search.start), max(int(min(following, len(signals))), search.stop))
+            segment = _dated(signals, tweak, search, within, slow=self._pots.slow)
             earliest = (segment.end_high or segment.start_high or search.stop) + 1
             moved = _moved(segment, first)
             if out and moved.start <= out[-1].start:  # both when the record was over
@@ -103,14 +103,14 @@ class ByHand:
         return out
 
 
-def _dated(record: Record, tweak: Tweak, search: range, within: range, *, slow: bool) -> Segment:
+def _dated(signals: Signals, tweak: Tweak, search: range, within: range, *, slow: bool) -> Segment:
     if len(search) < LEAST_SEARCH_N:
-        start = min(search.start, len(record) - 1)
+        start = min(search.start, len(signals) - 1)
         return Segment(start, tweak.after, unseen="the pot was turned when the record was over, or nearly so")
     if slow or len(tweak.before.changes_to(tweak.after)) > 1:
         middle = None if slow else tweak.middle
-        turned = turn(record, tweak.before, tweak.after, search, middle=middle, within=within)
-        if isinstance(turned, Turn):
+        turned = turn(signals, tweak.before, tweak.after, search, middle=middle, within=within)
+        if isinstance(turned, SlowTurn):
             begin, end = turned.begin, turned.end
             return Segment(
                 begin.sample,
@@ -122,24 +122,24 @@ def _dated(record: Record, tweak: Tweak, search: range, within: range, *, slow: 
                 end_high=end.high,
             )
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=turned.reason)
-    found = onset(record, tweak.before, tweak.after, search, within=within)
+    found = onset(signals, tweak.before, tweak.after, search, within=within)
     if isinstance(found, NoOnset):
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=found.reason)
     return Segment(found.sample, tweak.after, start_low=found.low, start_high=found.high)
 
 
-def doubts(record: Record, tweaks: Sequence[Tweak], first: int) -> list[str]:
+def doubts(signals: Signals, tweaks: Sequence[Tweak], first: int) -> list[str]:
     """What the samples of a record say against tweaks whose instants are taken for exact."""
     out = []
     starts = [tweak.sample for tweak in tweaks]
-    for tweak, before, after in zip(tweaks, [0, *starts], [*starts[1:], len(record)], strict=False):
+    for tweak, before, after in zip(tweaks, [0, *starts], [*starts[1:], len(signals)], strict=False):
         search = range(max(tweak.sample - _BESIDE_N, before + 2), min(tweak.sample + _BESIDE_N, after - 1))
         if len(search) < LEAST_SEARCH_N:
             continue
-        found = onset(record, tweak.before, tweak.after, search, within=range(before + 1, after))
+        found = onset(signals, tweak.before, tweak.after, search, within=range(before + 1, after))
         where = f"the pot that was to be turned at sample {first + tweak.sample} ({tweak.words})"
         if isinstance(found, NoOnset):
-            if found.unchanged and _is_plain(record, tweak, range(tweak.sample, after)):
+            if found.unchanged and _is_plain(signals, tweak, range(tweak.sample, after)):
                 out.append(f"{where}: {found.reason}")
         elif not found.low - 1 <= tweak.sample <= found.high + 1:
             span = f"{first + found.low} to {first + found.high}"
@@ -147,17 +147,17 @@ def doubts(record: Record, tweaks: Sequence[Tweak], first: int) -> list[str]:
     return out
 
 
-def _is_plain(record: Record, tweak: Tweak, stretch: range) -> bool:
+def _is_plain(signals: Signals, tweak: Tweak, stretch: range) -> bool:
     """Whether a change could not have stayed unseen."""
-    plants = [SampledPlant.of(plant, record.period_s) for plant in (tweak.before, tweak.after)]
+    plants = [SampledPlant.of(plant, signals.period_s) for plant in (tweak.before, tweak.after)]
     states = [AT_REST, AT_REST]
     information = 0.0
     for k in range(stretch.stop):
         inside = k >= stretch.start
         states = [
-            plants[1 if inside and i else 0].next(state, float(record.force_n[k])) for i, state in enumerate(states)
+            plants[1 if inside and i else 0].next(state, float(signals.force_n[k])) for i, state in enumerate(states)
         ]
-        information += 0.5 * ((states[1][0] - states[0][0]) / record.noise_m) ** 2 if inside else 0.0
+        information += 0.5 * ((states[1][0] - states[0][0]) / signals.noise_m) ** 2 if inside else 0.0
     return information > _PLAIN
 
 

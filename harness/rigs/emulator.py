@@ -248,7 +248,7 @@ class SetUp(NamedTuple):
     tweaks: tuple[RampedTweak, ...]
 
 
-class _Stage(NamedTuple):
+class _Prepared(NamedTuple):
     """What the plays of one scenario share, whatever the seed."""
 
     scenario: Scenario
@@ -277,7 +277,7 @@ class EmulatorRig:
         self._description = description
         self._card = description.card.card()
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
-        self._last_stage: _Stage | None = None
+        self._last_prepared: _Prepared | None = None
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
@@ -314,9 +314,9 @@ class EmulatorRig:
         What a scenario that fits in one block needs is prepared once for all seeds.
         """
         if scenario.samples <= block_samples:
-            stage = self._stage(scenario, seed)
-            if stage.play is not None:
-                return self._repeated(stage, stage.play, scenario, seed)
+            prepared = self._prepared(scenario, seed)
+            if prepared.play is not None:
+                return self._repeated(prepared, prepared.play, scenario, seed)
         computer, excitation, tweaks = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
@@ -334,16 +334,16 @@ class EmulatorRig:
             ),
         )
 
-    def _stage(self, scenario: Scenario, seed: int) -> _Stage:
+    def _prepared(self, scenario: Scenario, seed: int) -> _Prepared:
         """The last one, if it serves."""
-        if self._last_stage is None or not self._last_stage.serves(scenario):
+        if self._last_prepared is None or not self._last_prepared.serves(scenario):
             computer, excitation, tweaks = self.set_up(scenario, seed)
             with emulator_errors(f"scenario {scenario.name}: "):
                 excitation.edges(0, 1, computer.sample_rate_hz)
                 able = self._draws_offsets_alone and is_repeatable(computer, tweaks)
                 play = RepeatedPlay(computer, scenario.samples, tweaks) if able else None
-            self._last_stage = _Stage(scenario, computer, play, self._channels(computer), scenario.segments())
-        return self._last_stage
+            self._last_prepared = _Prepared(scenario, computer, play, self._channels(computer), scenario.segments())
+        return self._last_prepared
 
     @property
     def _draws_offsets_alone(self) -> bool:
@@ -352,8 +352,8 @@ class EmulatorRig:
         is_nominal &= drawn.specimen is None and drawn.values is None
         return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
 
-    def _repeated(self, stage: _Stage, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
-        count, offset_v = stage.computer.program.amplifiers, self._description.computer.offset_v
+    def _repeated(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
+        count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
         offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
         excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
         lit: dict[str, int] = {}
@@ -365,10 +365,10 @@ class EmulatorRig:
 
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
-            time_scale=stage.computer.scales.time,
-            channels=stage.channels,
+            time_scale=prepared.computer.scales.time,
+            channels=prepared.channels,
             blocks=_sampled(volts(), self.sampler(Stream.CARD.generator(seed))),
-            hindsight=lambda: Hindsight(stage.segments, lit),
+            hindsight=lambda: Hindsight(prepared.segments, lit),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:

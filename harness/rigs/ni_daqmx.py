@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -19,30 +20,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.excitation import TICKS_PER_SAMPLE, Excitation
-from harness.errors import ConfigurationError, RecordIncomplete, RigError
-from harness.rigs.instrument import Instrument, Recorded, Turn, parsed
+from harness.errors import ConfigurationError, RigClosed, RigRefused, RigTimeout
+from harness.rigs.instrument import Datasheet, Instrument, Taken
 
 RATE_HZ = 20e3
-RECORD_N = 100_000
 LEVELS_PER_SAMPLE = 32
+
+_TIMED_OUT = (-200284, -200292, -200474, -200560)
+_GONE = (-200220, -201003, -88705)
+"""Error codes of NI-DAQmx (nidaqmx.error_codes): samples not yet there, not yet taken, an operation timed out, a task
+did; no such device, it cannot be reached, it is not present."""
 
 
 class NiDaqmx(Instrument):
     """One record is one finite task; the card has no pots."""
 
-    rate_hz = RATE_HZ
-    record_n = RECORD_N
-    bits = 16
-    inputs = tuple(range(8))
-    output_v = (-10.0, 10.0)
-    ranges_v = {f"{volts}V": (-float(volts), float(volts)) for volts in (10, 5, 2, 1)}  # noqa: RUF012 - a constant
+    datasheet = Datasheet(
+        rate_hz=RATE_HZ,
+        record_n=100_000,
+        bits=16,
+        inputs=tuple(range(8)),
+        output_v=(-10.0, 10.0),
+        ranges_v={f"{volts}V": (-float(volts), float(volts)) for volts in (10, 5, 2, 1)},
+    )
 
     def __init__(self, library: Any, card: str, timeout_s: float, pause: Callable[[float], None] = time.sleep) -> None:
         """``library`` is the module nidaqmx.
 
         :raises RigError: the card is not there.
         """
-        self.name = f"instrument {card}"
+        super().__init__(f"instrument {card}")
         self._library = library
         self._card = card
         self._timeout_s = timeout_s
@@ -52,26 +59,23 @@ class NiDaqmx(Instrument):
         self.make_safe()
 
     @classmethod
-    def open(cls, url: str, timeout_s: float) -> NiDaqmx:
-        """:raises ConfigurationError: the package nidaqmx is not installed.
-        :raises RigError: the card is not there, or NI's driver is not.
+    def is_address(cls, address: str) -> bool:
+        return re.fullmatch(r"[A-Za-z0-9][\w-]*", address) is not None
+
+    @classmethod
+    def open(cls, address: str, timeout_s: float) -> NiDaqmx:
+        """:raises ConfigurationError: the package nidaqmx is not installed, or NI's driver is not.
+        :raises RigError: the card is not there.
         """
         try:
             library = importlib.import_module("nidaqmx")
-            importlib.import_module("nidaqmx.constants")
-            importlib.import_module("nidaqmx.errors")
+            for part in ("constants", "errors", "stream_readers"):
+                importlib.import_module(f"nidaqmx.{part}")
         except ImportError as error:
-            raise ConfigurationError(f"instrument {url}: needs nidaqmx: pip install 'analogrig[nidaqmx]'") from error
-        return cls(library, parsed(url).netloc, timeout_s)  # its hostname would be in small letters
-
-    @classmethod
-    def check(cls, excitation: Excitation) -> None:
-        least_v, most_v = cls.output_v
-        if not least_v <= excitation.low_v <= excitation.high_v <= most_v:
             raise ConfigurationError(
-                f"the generator would have to give {excitation.low_v:g} V to {excitation.high_v:g} V, and has"
-                f" {least_v:g} V to {most_v:g} V"
-            )
+                f"instrument {address}: needs nidaqmx: pip install 'analogrig[nidaqmx]'"
+            ) from error
+        return cls(library, address, timeout_s)
 
     def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
         self._ranges = tuple(ranges)
@@ -79,25 +83,29 @@ class NiDaqmx(Instrument):
     def set_excitation(self, excitation: Excitation) -> None:
         self._excitation = excitation
 
-    def record(
-        self, samples: int, turns: Sequence[Turn] = (), while_recording: Callable[[], None] | None = None
-    ) -> Recorded:
-        if turns:
-            raise RigError(f"{self.name}: has no pots that it could turn")
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:
         with self._errors("the record"), self._library.Task() as out, self._library.Task() as taken:
-            self._wire(out, taken, samples)
+            inputs = self._wire(out, taken, samples)
             out.write(levels_v(self._excitation, samples).tolist(), auto_start=False)
             out.start()  # it waits for the inputs to start
             taken.start()
             if while_recording is not None:
                 while_recording()
-            read = taken.read(number_of_samples_per_channel=samples, timeout=samples / RATE_HZ + self._timeout_s)
-        volts = np.array(read, dtype=np.float64).reshape(len(self._ranges), -1).T
-        if volts.shape[0] != samples:
-            raise RecordIncomplete(f"{self.name}: gave {volts.shape[0]} of {samples} samples")
-        ends = np.array([self.ranges_v[word] for _, word in self._ranges])
-        lsb_v = (ends[:, 1] - ends[:, 0]) / (1 << self.bits)
-        return Recorded(volts, (volts <= ends[:, 0] + 0.5 * lsb_v) | (volts >= ends[:, 1] - 1.5 * lsb_v))
+            codes = self._codes(taken, inputs, samples)
+            volts = [
+                np.polynomial.polynomial.polyval(of_input, each.ai_dev_scaling_coeff)
+                for each, of_input in zip(inputs, codes, strict=True)
+            ]
+            return Taken(np.stack(volts, axis=1), codes.T, _bits(inputs))
+
+    def _codes(self, taken: Any, inputs: Sequence[Any], samples: int) -> NDArray[np.signedinteger]:
+        """(inputs, m) as the converters gave them, m as many as asked for unless some are lacking."""
+        reader = self._library.stream_readers.AnalogUnscaledReader(taken.in_stream)
+        is_short = _bits(inputs) <= np.iinfo(np.int16).bits
+        codes = np.zeros((len(inputs), samples), np.int16 if is_short else np.int32)
+        read = reader.read_int16 if is_short else reader.read_int32
+        got = read(codes, number_of_samples_per_channel=samples, timeout=samples / RATE_HZ + self._timeout_s)
+        return codes[:, :got]
 
     def rest(self, settle_s: float) -> None:
         """In the card's case the computer's time is that of the clock on the wall."""
@@ -106,31 +114,49 @@ class NiDaqmx(Instrument):
 
     def make_safe(self) -> None:
         with self._errors("0 V at ao0"), self._library.Task() as out:
-            out.ao_channels.add_ao_voltage_chan(f"{self._card}/ao0", min_val=self.output_v[0], max_val=self.output_v[1])
+            self._wire_output(out)
             out.write(0.0, auto_start=True, timeout=self._timeout_s)
 
     def close(self) -> None:
         """Tasks are closed when they are done."""
 
-    def _wire(self, out: Any, taken: Any, samples: int) -> None:
+    def _wire_output(self, out: Any) -> None:
+        low_v, high_v = self.datasheet.output_v
+        out.ao_channels.add_ao_voltage_chan(f"{self._card}/ao0", min_val=low_v, max_val=high_v)
+
+    def _wire(self, out: Any, taken: Any, samples: int) -> list[Any]:
+        """Returns the inputs, as NI's package has them."""
         finite = self._library.constants.AcquisitionType.FINITE
-        out.ao_channels.add_ao_voltage_chan(f"{self._card}/ao0", min_val=self.output_v[0], max_val=self.output_v[1])
+        self._wire_output(out)
+        inputs = []
         for number, word in self._ranges:
-            low_v, high_v = self.ranges_v[word]
-            taken.ai_channels.add_ai_voltage_chan(f"{self._card}/ai{number}", min_val=low_v, max_val=high_v)
+            low_v, high_v = self.datasheet.ranges_v[word]
+            inputs.append(
+                taken.ai_channels.add_ai_voltage_chan(f"{self._card}/ai{number}", min_val=low_v, max_val=high_v)
+            )
         for task, per_sample in ((taken, 1), (out, LEVELS_PER_SAMPLE)):
             rate_hz, count = per_sample * RATE_HZ, per_sample * samples
             task.timing.cfg_samp_clk_timing(rate_hz, sample_mode=finite, samps_per_chan=count)
         out.triggers.start_trigger.cfg_dig_edge_start_trig(f"/{self._card}/ai/StartTrigger")
+        return inputs
 
     @contextlib.contextmanager
     def _errors(self, what: str) -> Iterator[None]:
-        """NI's errors have many lines; the first says what is the matter."""
+        """NI's errors have many lines, of which the first says what is the matter, and a number unless its driver is
+        not installed."""
         try:
             yield
         except self._library.errors.Error as error:
-            first = str(error).strip().partition("\n")[0]
-            raise RigError(f"{self.name}: {what}: {first}") from error
+            said = f"{self.name}: {what}: {str(error).strip().partition(chr(10))[0]}"
+            code = getattr(error, "error_code", None)
+            if code is None:
+                raise ConfigurationError(said) from error
+            kind = RigTimeout if code in _TIMED_OUT else RigClosed if code in _GONE else RigRefused
+            raise kind(said) from error
+
+
+def _bits(inputs: Sequence[Any]) -> int:
+    return max(int(each.ai_resolution) for each in inputs)
 
 
 def levels_v(excitation: Excitation, samples: int) -> NDArray[np.float64]:

@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
 
+import serial
+
 from harness.errors import ConfigurationError, LinkError, RigError
 from harness.links.wire import DEFAULT_BAUD, PortWire
 
@@ -41,8 +43,6 @@ _PLACEHOLDERS = ("pot", "dial", "step")
 class Pots(Protocol):
     """Pots that can be set."""
 
-    exact: bool
-    """The instants of their turns are known to the sample."""
     slow: bool
     """A hand turns them, and is on its way for many samples; otherwise each jumps, one after the other."""
 
@@ -121,6 +121,12 @@ class SerialPots(_Boxed):
         super().__post_init__()
         if not self.url:
             raise ValueError("url must say where the box is: a serial port, or any URL of pyserial")
+        try:
+            serial.serial_for_url(self.url, do_not_open=True)
+        except ValueError as error:
+            raise ValueError(f"url {self.url}: {error}") from error
+        except OSError:  # what is not there may be there when it is opened
+            pass
         if not 1 <= self.baud <= 100_000_000:
             raise ValueError(f"baud must be 1 to 100000000, not {self.baud}")
         _check_placeholders("line", self.line)
@@ -172,7 +178,6 @@ def _check_placeholders(key: str, template: str, *, needed: bool = True) -> None
 class _OneByOne:
     """Pots that are set one after another, in settling and in turning alike."""
 
-    exact = False
     slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
@@ -289,7 +294,6 @@ class _Box(_OneByOne):
 
 
 class _Operator:
-    exact = False
     slow = True
 
     def __init__(self, terminal: Path) -> None:
@@ -332,7 +336,6 @@ class _Operator:
 
 
 class _Nobody:
-    exact = False
     slow = False
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:

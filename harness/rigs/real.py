@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator import Excitation, SuspensionComputer
-from harness.errors import ConfigurationError, RigError, SelfTestError
+from harness.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from harness.information import QUANTISATION_VARIANCE_LSB2
-from harness.onset.two_filter import Record
+from harness.onset.two_filter import Signals
 from harness.plant import Plant
 from harness.rigs.by_hand import ByHand, Tweak, doubts
 from harness.rigs.emulator import Stream, emulator_errors, settings_of
-from harness.rigs.instrument import Instrument, Recorded, Turn, driver
+from harness.rigs.instrument import Instrument, PotBox, Record, Turn, located
 from harness.rigs.lock import Lock
 from harness.rigs.pots import NoPots, Pots
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
-from harness.rigs.wiring import MEASURED, InstrumentPots, RealDescription, check_wiring
-from harness.run import CHANNELS, Channel, Segment
+from harness.rigs.wiring import InstrumentPots, RealDescription, check_wiring
+from harness.run import CHANNELS, MEASURED, Channel, Segment
 from harness.scenario import Scenario
 
 LEAD_N = 500
@@ -52,21 +52,36 @@ _log = logging.getLogger(__name__)
 class _OnInstrument:
     """Its pots; those that turn within a record are in the record's schedule."""
 
-    exact = True
     slow = False
 
-    def __init__(self, instrument: Instrument, pots: Iterable[str]) -> None:
+    def __init__(self, box: PotBox) -> None:
+        self._box = box
+
+    @classmethod
+    def of(cls, instrument: Instrument, pots: Iterable[str]) -> Self:
         """:raises RigError: it has not those pots."""
-        if lacking := sorted(set(pots) - set(instrument.pots)):
+        box = instrument.pots
+        lacking = sorted(set(pots) - set(box.names if box else ()))
+        if box is None or lacking:
             raise RigError(f"{instrument.name}: has no pots {', '.join(lacking)} that it could turn")
-        self._instrument = instrument
+        return cls(box)
 
     def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
         for pot, dial in dials.items():
-            self._instrument.turn(pot, dial)
+            self._box.turn(pot, dial)
 
     def turn(self, dials: Mapping[str, float], words: str) -> None:
         self.settle(dials, words)
+
+    def schedule(self, tweaks: Iterable[Tweak], rate_hz: float) -> None:
+        """For the next record."""
+        self._box.schedule(
+            [
+                Turn((tweak.sample + _AFTER_N) / rate_hz, pot, dial)
+                for tweak in tweaks
+                for pot, dial in tweak.dials.items()
+            ]
+        )
 
     def close(self) -> None:
         pass
@@ -76,14 +91,15 @@ class RealRig:
     """A description and the instrument that it names; nothing is sent before the first block is asked for."""
 
     def __init__(self, description: RealDescription, connect: Callable[[str, float], Instrument] | None = None) -> None:
-        """``connect`` opens the instrument of a URL with a time-out; by default the driver of its scheme.
+        """``connect`` opens the instrument at an address with a time-out; by default the driver does.
 
         :raises ConfigurationError: the description contradicts itself, or the instrument.
         """
         turned = set() if isinstance(description.pots, NoPots) else {"tweak"}
         self.capabilities = frozenset({"excite", *turned})
-        self._kind = driver(description.instrument)
-        check_wiring(description, self._kind)
+        self._kind, self._address = located(description.instrument)
+        self._datasheet = self._kind.datasheet
+        check_wiring(description, self._datasheet)
         self._description = description
         self._connect = connect or self._kind.open
         self._instrument: Instrument | None = None
@@ -110,7 +126,7 @@ class RealRig:
         """As ``perform``, with or without the rig's test of itself."""
         plan = self._plan(scenario, seed)
         return Performance(
-            sample_period_s=1.0 / self._kind.rate_hz,
+            sample_period_s=1.0 / self._datasheet.rate_hz,
             time_scale=self._time_scale(plan.computer),
             channels=self._channels(plan.computer),
             blocks=self._blocks(scenario, plan, tested=tested),
@@ -191,8 +207,8 @@ class RealRig:
         out = {}
         for name in MEASURED:
             wired = self._description.inputs[name]
-            ends_v = sorted((end - wired.offset_v) / wired.gain for end in self._kind.ranges_v[wired.range])
-            low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << self._kind.bits)
+            ends_v = sorted((end - wired.offset_v) / wired.gain for end in self._datasheet.ranges_v[wired.range])
+            low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << self._datasheet.bits)
             out[name] = Channel(
                 low_v=low_v,
                 lsb_v=lsb_v,
@@ -212,7 +228,7 @@ class RealRig:
         wired = [self._description.inputs[name] for name in MEASURED]
         instrument.set_inputs([(each.input, each.range) for each in wired])
         instrument.set_excitation(self._at_generator(plan.excitation))
-        cuts = records(scenario.samples, self._kind.record_n, [tweak.sample for tweak in plan.tweaks])
+        cuts = records(scenario.samples, self._datasheet.record_n, [tweak.sample for tweak in plan.tweaks])
         standing, plant = plan.start, scenario.plant.plant()
         for record, (start, end) in enumerate(cuts):
             mine = [dataclasses.replace(t, sample=t.sample - start) for t in plan.tweaks if start <= t.sample < end]
@@ -235,21 +251,25 @@ class RealRig:
 
     def _record(
         self, instrument: Instrument, pots: Pots, samples: int, tweaks: Sequence[Tweak]
-    ) -> tuple[Recorded, ByHand]:
-        rate_hz = self._kind.rate_hz
-        if pots.exact:
-            turns = [
-                Turn((tweak.sample + _AFTER_N) / rate_hz, pot, dial)
-                for tweak in tweaks
-                for pot, dial in tweak.dials.items()
-            ]
-            return instrument.record(samples, turns), ByHand(pots, (), rate_hz)
-        by_hand = ByHand(pots, tweaks, rate_hz)
-        return instrument.record(samples, while_recording=by_hand.turn_all), by_hand
+    ) -> tuple[Record, ByHand]:
+        """:raises RecordStale: the instrument has given a record that it had given before."""
+        rate_hz = self._datasheet.rate_hz
+        if isinstance(pots, _OnInstrument):
+            pots.schedule(tweaks, rate_hz)
+            taken, by_hand = instrument.record(samples), ByHand(pots, (), rate_hz)
+        else:
+            by_hand = ByHand(pots, tweaks, rate_hz)
+            taken = instrument.record(samples, by_hand.turn_all)
+        if taken.repeats and any(wired.noise_lsb for wired in self._description.inputs.values()):
+            raise RecordStale(
+                f"{instrument.name}: the record is an old one: to the bit it has been given before, and inputs with"
+                " noise give none twice (if these had none at all: noise_lsb = 0)"
+            )
+        return taken, by_hand
 
-    def _as_measured(self, plan: _Plan, codes: NDArray[np.uint16], clipped: NDArray[np.bool_]) -> Record:
-        period_s = self._time_scale(plan.computer) / self._kind.rate_hz
-        return Record.of(codes, clipped, self._channels(plan.computer), period_s)
+    def _as_measured(self, plan: _Plan, codes: NDArray[np.uint16], clipped: NDArray[np.bool_]) -> Signals:
+        period_s = self._time_scale(plan.computer) / self._datasheet.rate_hz
+        return Signals.of(codes, clipped, self._channels(plan.computer), period_s)
 
     def _time_scale(self, computer: SuspensionComputer) -> float:
         return self._description.scaling.time or computer.scales.time
@@ -287,7 +307,7 @@ class RealRig:
         instrument.rest(self._description.settle_s)
 
     def _converted(
-        self, taken: Recorded, channels: Mapping[str, Channel]
+        self, taken: Record, channels: Mapping[str, Channel]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
         """Volts at the computer, codes and clipping, (n, 4) each."""
         n = len(taken.volts)
@@ -310,11 +330,11 @@ class RealRig:
         if self._lock is None:
             self._lock = Lock(description.instrument)
         if self._instrument is None:
-            self._instrument = self._connect(description.instrument, description.timeout_s)
+            self._instrument = self._connect(self._address, description.timeout_s)
         if self._pots is None:
             wanted = SuspensionComputer(description.plant).dials
             self._pots = (
-                _OnInstrument(self._instrument, wanted)
+                _OnInstrument.of(self._instrument, wanted)
                 if isinstance(description.pots, InstrumentPots)
                 else description.pots.open()
             )

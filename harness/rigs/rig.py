@@ -70,7 +70,7 @@ class Rig(Protocol):
     """Something that can play a scenario."""
 
     capabilities: frozenset[str]
-    """What it can do beyond sampling: ``tweak``, ``excite``."""
+    """What it can do beyond sampling, of ``harness.rigs.CAPABILITIES``."""
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         """Begin to play; the blocks are produced as they are asked for.

@@ -9,10 +9,9 @@ from typing import Literal
 
 from emulator import SuspensionComputer
 from harness.errors import ConfigurationError
-from harness.rigs.instrument import Instrument
+from harness.rigs.instrument import Datasheet
 from harness.rigs.pots import PotsDescription
-
-MEASURED = ("force", "displacement")
+from harness.run import MEASURED
 
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
@@ -131,7 +130,7 @@ class RealDescription:
                 raise ValueError(f"{name} must be {least:g} to {most:g}, not {getattr(self, name):g}")
 
 
-def check_wiring(description: RealDescription, instrument: type[Instrument] | Instrument) -> None:
+def check_wiring(description: RealDescription, instrument: Datasheet) -> None:
     """That the description fits what the instrument has.
 
     :raises ConfigurationError: it does not; names the key.

@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from harness.errors import SelfTestError
 from harness.rigs.rig import Rig
+from harness.run import MEASURED
 from harness.self_test import checks, noise
 from harness.self_test.findings import Check, Findings
-from harness.self_test.record import HIGH_V, LOW_V, Record
+from harness.self_test.record import HIGH_V, LOW_V, SelfTestRecord
 from harness.self_test.response import Answer, Response, SecondOrder
-from harness.self_test.timing import Edges, Levels, averaged_n, lateness
+from harness.self_test.timing import Levels, SeenEdges, averaged_n, lateness
 
 LEAST_SWING_V = 0.25
 """A channel that moves by less shows no signal."""
-
-_CHANNELS = ("force", "displacement")
 
 
 def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
@@ -40,18 +39,18 @@ def self_test(rig: Rig, seed: int, program: str = "front") -> Findings:
     :raises SelfTestError: it could not be made: no signal, a drop-out, another program.
     :raises RigError: the rig failed.
     """
-    return Findings(str(rig.description().get("name", "")), program, examined(Record.taken(rig, seed, program)))
+    return Findings(str(rig.description().get("name", "")), program, examined(SelfTestRecord.taken(rig, seed, program)))
 
 
-def examined(record: Record) -> tuple[Check, ...]:
+def examined(record: SelfTestRecord) -> tuple[Check, ...]:
     """What the record shows, as far as what is wrong leaves the rest a meaning.
 
     :raises SelfTestError: there is no signal in it, or a drop-out.
     """
-    clipping = tuple(_clipping(record, channel) for channel in _CHANNELS)
+    clipping = tuple(_clipping(record, channel) for channel in MEASURED)
     if off_scale := tuple(each for each in clipping if each.value > 0.5 and not _moves(record, each.channel)):
         return off_scale
-    for channel in _CHANNELS:
+    for channel in MEASURED:
         if not _moves(record, channel):
             raise SelfTestError(
                 f"no signal on {channel}, which moves by {record.swing_v(channel):.2g} V: is the generator on, the"
@@ -64,15 +63,15 @@ def examined(record: Record) -> tuple[Check, ...]:
     leads = (identity, *seen.polarity())
     if any(each.state == "wrong" for each in leads):
         return leads
-    range_use = (checks.range_use(name, record.swing_codes(name), record.channels[name].codes) for name in _CHANNELS)
+    range_use = (checks.range_use(name, record.swing_codes(name), record.channels[name].codes) for name in MEASURED)
     return (*leads, *clipping, *range_use, *seen.quantities())
 
 
-def _moves(record: Record, channel: str) -> bool:
+def _moves(record: SelfTestRecord, channel: str) -> bool:
     return record.swing_v(channel) > LEAST_SWING_V
 
 
-def _clipping(record: Record, channel: str) -> Check:
+def _clipping(record: SelfTestRecord, channel: str) -> Check:
     clipped = record.clipped[channel]
     share, samples = float(clipped.mean()), len(clipped)
     at_top = clipped & (record.codes[channel] > record.channels[channel].codes / 2)
@@ -90,12 +89,12 @@ class _Known:
 class _Seen:
     """A record whose force is a square wave, and what is read from it."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: SelfTestRecord) -> None:
         """:raises SelfTestError: the square wave is broken."""
         self._record = record
         self._codes = record.codes["force"]
         self._levels = Levels.of(self._codes)
-        self._edges = Edges.of(self._levels.state, record.half_period_n)
+        self._edges = SeenEdges.of(self._levels.state, record.half_period_n)
         channel = record.channels["force"]
         self._low_v, self._high_v = (
             channel.low_v + channel.lsb_v * float(self._codes[self._levels.state == level].mean()) for level in (0, 1)
@@ -234,7 +233,7 @@ class _Seen:
     def _gains(self) -> tuple[float, float]:
         """Deviation of the displacement's static gain, by the force as measured and as commanded."""
         record, response = self._record, self._response
-        force, displacement = (record.channels[name].unit_per_v for name in _CHANNELS)
+        force, displacement = (record.channels[name].unit_per_v for name in MEASURED)
         measured = response.gain * record.plant.stiffness_n_per_m * displacement / force - 1.0
         if self._clipped:
             return measured, measured

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.information import QUANTISATION_VARIANCE_LSB2
-from harness.self_test.timing import Edges, Levels, Line
+from harness.self_test.timing import Levels, Line, SeenEdges
 
 _UNSETTLED_N = 3
 """So many samples on either side of an edge do not count for the noise of a level."""
@@ -23,7 +23,7 @@ _NEAR_N = 0.2
 """Neighbours of equivalent time are no further apart than so many samples."""
 
 
-def of_levels(codes: NDArray[np.uint16], levels: Levels, edges: Edges) -> tuple[float, float]:
+def of_levels(codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges) -> tuple[float, float]:
     """The noise (rms) of a square wave about its levels in LSB, quantisation included, and its standard error.
 
     A level that does not move may show less of its quantisation than 1/12 LSB^2: so much is taken to be there.

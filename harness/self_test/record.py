@@ -12,7 +12,7 @@ from emulator.excitation import Excitation
 from harness.errors import SelfTestError
 from harness.plant import Plant
 from harness.rigs.rig import Rig
-from harness.run import CHANNELS, Channel
+from harness.run import CHANNELS, MEASURED, Channel
 from harness.scenario import PLANTS, PlantChoice, Scenario
 
 SAMPLES = 16_384
@@ -25,6 +25,9 @@ FREQUENCY_HZ = 823 * 125e6 / 2**30
 """95.81 Hz: half periods of 104 samples, after which nothing moves any more. It is a multiple of what the 30 bits of a
 Red Pitaya's generator resolve, and the edges of 0.8 s fall on all parts of a sample, no two parts more than 0.017 apart
 (at 20 kHz)."""
+
+LEAST_PERIODS = 13
+"""In the record: with fewer edges their instants cannot be told, nor the noise."""
 
 PROGRAMS = ("front", "shock")
 
@@ -41,7 +44,7 @@ def scenario(program: str) -> Scenario:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class SelfTestRecord:
     """What was played and what was seen of it."""
 
     program: str
@@ -54,13 +57,18 @@ class Record:
     """By channel: (n,)"""
 
     @classmethod
-    def taken(cls, rig: Rig, seed: int, program: str) -> Record:
+    def taken(cls, rig: Rig, seed: int, program: str) -> SelfTestRecord:
         """Plays the self-test.
 
         :raises ConfigurationError: the rig cannot play it.
+        :raises SelfTestError: it samples too fast for it, or did not take it as one record.
         :raises RigError: the rig failed.
         """
         performance = rig.perform(scenario(program), seed)
+        if performance.sample_period_s * SAMPLES * FREQUENCY_HZ < LEAST_PERIODS:
+            most_hz = SAMPLES * FREQUENCY_HZ / LEAST_PERIODS
+            rate_hz = 1.0 / performance.sample_period_s
+            raise SelfTestError(f"the self-test goes up to {most_hz:.0f} samples/s, and the rig takes {rate_hz:.0f}")
         blocks = list(performance.blocks)
         codes = np.concatenate([block.codes for block in blocks])
         clipped = np.concatenate([block.clipped for block in blocks])
@@ -68,7 +76,7 @@ class Record:
             raise SelfTestError(f"the rig gave {len(codes)} of {SAMPLES} samples")
         if len({block.record for block in blocks}) > 1:
             raise SelfTestError(f"the rig does not take {SAMPLES} samples without a gap")
-        column = {name: CHANNELS.index(name) for name in ("force", "displacement")}
+        column = {name: CHANNELS.index(name) for name in MEASURED}
         return cls(
             program,
             performance.sample_period_s,

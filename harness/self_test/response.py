@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.errors import SelfTestError
-from harness.self_test.timing import Edges, Line
+from harness.self_test.timing import Line, SeenEdges
 
 _EDGES_FELT = 2
 """So many edges back is the response settled: the rest is below 1e-5 for a half period of 100 samples."""
@@ -82,7 +82,6 @@ class Response:
     """Of the rising or the falling instant, whichever is larger."""
     residual: NDArray[np.float64]
     """(m,): of the samples used, in the unit of the displacement."""
-    residual_rms: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Answer:
     """(n,): any unit."""
     used: NDArray[np.bool_]
     """(n,): clipped samples are not."""
-    edges: Edges
+    edges: SeenEdges
     levels: tuple[float, float]
     """Of the force, any unit: low, high."""
     averaged_n: float
@@ -169,5 +168,4 @@ class Answer:
             period_error_n=float(errors[4]),
             instant_error_n=float(errors[5:].max()),
             residual=y - design @ linear,
-            residual_rms=rms,
         )

@@ -52,7 +52,7 @@ class Levels:
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class SeenEdges:
     """The edges of a square wave as its samples show them, rising and falling in turn: (edges,)."""
 
     before: NDArray[np.int64]
@@ -62,7 +62,7 @@ class Edges:
     rising: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, state: NDArray[np.int8], half_period_n: float) -> Edges:
+    def of(cls, state: NDArray[np.int8], half_period_n: float) -> SeenEdges:
         """
         :param half_period_n: about so many samples lie between two edges.
         :raises SelfTestError: it is no unbroken square wave.
@@ -108,19 +108,21 @@ class Line:
     rising_n: float
     falling_n: float
 
-    def instants(self, edges: Edges) -> NDArray[np.float64]:
+    def instants(self, edges: SeenEdges) -> NDArray[np.float64]:
         """Of these edges: (edges,)."""
         return np.asarray(edges.turn * self.period_n + np.where(edges.rising, self.rising_n, self.falling_n))
 
 
-def averaged_n(edges: Edges) -> float:
+def averaged_n(edges: SeenEdges) -> float:
     """Over so much of a sample period the instrument averages, 0 for one that does not: it sees that part of all edges
     on the way."""
     seen = len(edges.on_the_way()[0])
     return seen / len(edges.rising) / (1.0 - 2.0 * SETTLED_PART) if seen >= _AVERAGES_FROM else 0.0
 
 
-def lateness(codes: NDArray[np.uint16], levels: Levels, edges: Edges, line: Line, room_n: float) -> tuple[float, float]:
+def lateness(
+    codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges, line: Line, room_n: float
+) -> tuple[float, float]:
     """By how many samples the edges of these codes are later than the line says, and its standard error.
 
     :param room_n: by so much the line may be off at the ends of the record.

@@ -310,9 +310,6 @@ def _tracking_figures(simulation: Simulation) -> tuple[Figure, ...]:
         panels = _theta_panels(each.theta, known, UNITS_PER_M)
         return Figure(number, title, panels, text, marks(each, PROFILE, CHANGE_LABELS))
 
-    error = simulation.tracks["prediction-error"]
-    mean = simulation.tracks["mean-between-faults"]
-    since_start = mean_since_start(simulation)
     return (
         estimates(
             "4.5",
@@ -330,6 +327,22 @@ def _tracking_figures(simulation: Simulation) -> tuple[Figure, ...]:
             " last inputs are the same until the next edge, so that only b0 + b1 can be learned, and the next edge"
             " is a surprise again.",
         ),
+        *_trigger_figures(simulation),
+        estimates(
+            "4.10",
+            "Parameter estimates using the mean between faults triggering function.",
+            "mean-between-faults",
+            "At an alarm P returns to 10 I and θ stays.",
+        ),
+    )
+
+
+def _trigger_figures(simulation: Simulation) -> tuple[Figure, ...]:
+    error = simulation.tracks["prediction-error"]
+    mean = simulation.tracks["mean-between-faults"]
+    since_start = mean_since_start(simulation)
+    mean_label = "Mean prediction error since sample 50"
+    return (
         Figure(
             "4.7",
             "The prediction error sequence for the time-varying shock absorber.",
@@ -341,11 +354,7 @@ def _tracking_figures(simulation: Simulation) -> tuple[Figure, ...]:
         Figure(
             "4.8",
             "The mean prediction error as an alternative triggering function ?",
-            (
-                _with_ceiling(
-                    "Mean prediction error since sample 50", "|mean| [0.1 µm]", since_start.statistic, MEAN_CEILING
-                ),
-            ),
+            (_with_ceiling(mean_label, "|mean| [0.1 µm]", since_start.statistic, MEAN_CEILING),),
             "The running mean of the prediction errors of plain RLS since the start, the first 50 samples left out.",
             marks(since_start, PROFILE, CHANGE_LABELS),
         ),
@@ -356,12 +365,6 @@ def _tracking_figures(simulation: Simulation) -> tuple[Figure, ...]:
             "The magnitude of the mean prediction error since the last alarm, held at zero for 4 samples after one"
             " and for the first 50 samples; the ceiling is the printed 300 units.",
             marks(mean, PROFILE, CHANGE_LABELS),
-        ),
-        estimates(
-            "4.10",
-            "Parameter estimates using the mean between faults triggering function.",
-            "mean-between-faults",
-            "At an alarm P returns to 10 I and θ stays.",
         ),
     )
 

@@ -31,7 +31,7 @@ from harness.thesis.circuit import (
     run_codes,
     track_codes,
 )
-from harness.thesis.document import Chapter, Claim, Curve, Erratum, Figure, Number, Panel, Signal
+from harness.thesis.document import Chapter, Claim, Curve, Erratum, Figure, Mark, Number, Panel, Signal
 from harness.thesis.model import FRONT, SHOCK, Arx, time_varying
 from harness.thesis.schemes import PLAIN, schemes
 from harness.thesis.tracking import Track, marks, performance, track
@@ -188,75 +188,62 @@ def _errata(model: Model) -> tuple[Erratum, ...]:
 
 
 def _circuit_figures(circuit: Circuit, model: Model) -> tuple[Figure, ...]:
-    run = circuit.comparison
-    force, analogue = run.channel("force"), run.channel("displacement") * 1e3
-    simulated = simulated_mm(run)
     data = circuit.identification
+    return (_comparison_figure(circuit.comparison), _scaling_figure(data), _prediction_figure(data, model))
+
+
+def _comparison_figure(run: Run) -> Figure:
+    force, analogue, simulated = run.channel("force"), run.channel("displacement") * 1e3, simulated_mm(run)
+    both = (Curve("simulation", simulated, "truth"), Curve("analogue", analogue, "first", "dash"))
+    difference = Curve("analogue − simulation", analogue - simulated, "second")
+    return Figure(
+        "5.4",
+        "A comparison of the simulated system output and the electrical analogue output.",
+        (
+            Panel("Displacement", "x [mm]", both),
+            Panel("Difference", "difference [mm]", (difference,)),
+            Panel("Force", "F [N]", (Curve("force", force, "third", "step"),)),
+        ),
+        "The shock absorber of section 4.2, 200 Hz, 0 to 10 V; analogue: the emulated circuit through its card.",
+    )
+
+
+def _scaling_figure(data: Run) -> Figure:
+    volts = {
+        name: data.conditions.channels[name].volts(data.codes[:, i]) for i, name in enumerate(("force", "displacement"))
+    }
+    circuit = (Curve("input", volts["force"], "third", "step"), Curve("output", volts["displacement"], "first"))
+    displacement = Curve("displacement", data.channel("displacement") * 1e3, "second")
+    return Figure(
+        "5.5",
+        "(a) Circuit data, (b) scaled circuit/suspension data.",
+        (
+            Panel("(a) Circuit data", "volts", circuit),
+            Panel("(b) Force", "F [N]", (Curve("force", data.channel("force"), "third", "step"),)),
+            Panel("(b) Displacement", "x [mm]", (displacement,)),
+        ),
+        "100 Hz, 0 to 10 V, 2000 samples. Which plant was on the computer the text does not say; this is the one"
+        f" inferred from Equ. 5.4, on the rig <code>{SKEWED}</code>.",
+    )
+
+
+def _prediction_figure(data: Run, model: Model) -> Figure:
     u, y, _, m_per_code = run_codes(data)
     zero = data.conditions.channels["displacement"].zero
     predicted = (model.simulated(u, y, FIRST_N) - zero) * m_per_code * 1e3
     actual = (y[FIRST_N:] - zero) * m_per_code * 1e3
     second = np.arange(FIRST_N, len(u), dtype=np.float64)
-    volts = {
-        name: data.conditions.channels[name].volts(data.codes[:, i]) for i, name in enumerate(("force", "displacement"))
-    }
-    return (
-        Figure(
-            "5.4",
-            "A comparison of the simulated system output and the electrical analogue output.",
-            (
-                Panel(
-                    "Displacement",
-                    "x [mm]",
-                    (Curve("simulation", simulated, "truth"), Curve("analogue", analogue, "first", "dash")),
-                ),
-                Panel(
-                    "Difference", "difference [mm]", (Curve("analogue − simulation", analogue - simulated, "second"),)
-                ),
-                Panel("Force", "F [N]", (Curve("force", force, "third", "step"),)),
-            ),
-            "The shock absorber of section 4.2, 200 Hz, 0 to 10 V; analogue: the emulated circuit through its card.",
+    both = (Curve("circuit", actual, "truth"), Curve("simulation of G(z)", predicted, "first", "dash"))
+    difference = Curve("circuit − simulation", actual - predicted, "second")
+    return Figure(
+        "5.6",
+        "Prediction properties of the estimated analogous transfer function.",
+        (
+            Panel("Second 1000 samples", "x [mm]", both, second),
+            Panel("Difference", "difference [mm]", (difference,), second),
         ),
-        Figure(
-            "5.5",
-            "(a) Circuit data, (b) scaled circuit/suspension data.",
-            (
-                Panel(
-                    "(a) Circuit data",
-                    "volts",
-                    (
-                        Curve("input", volts["force"], "third", "step"),
-                        Curve("output", volts["displacement"], "first"),
-                    ),
-                ),
-                Panel("(b) Force", "F [N]", (Curve("force", data.channel("force"), "third", "step"),)),
-                Panel(
-                    "(b) Displacement", "x [mm]", (Curve("displacement", data.channel("displacement") * 1e3, "second"),)
-                ),
-            ),
-            "100 Hz, 0 to 10 V, 2000 samples. Which plant was on the computer the text does not say; this is the one"
-            f" inferred from Equ. 5.4, on the rig <code>{SKEWED}</code>.",
-        ),
-        Figure(
-            "5.6",
-            "Prediction properties of the estimated analogous transfer function.",
-            (
-                Panel(
-                    "Second 1000 samples",
-                    "x [mm]",
-                    (Curve("circuit", actual, "truth"), Curve("simulation of G(z)", predicted, "first", "dash")),
-                    second,
-                ),
-                Panel(
-                    "Difference",
-                    "difference [mm]",
-                    (Curve("circuit − simulation", actual - predicted, "second"),),
-                    second,
-                ),
-            ),
-            "G(z) estimated from the first 1000 samples, simulated over the second 1000 from the force alone; only"
-            " its first two values are the circuit's.",
-        ),
+        "G(z) estimated from the first 1000 samples, simulated over the second 1000 from the force alone; only"
+        " its first two values are the circuit's.",
     )
 
 
@@ -282,90 +269,120 @@ def deviations(arx: Arx) -> dict[str, float]:
 
 
 def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figure, ...]:
-    run, tracks = recording.run, recording.tracks
-    mean, ours = tracks["mean-between-faults"], tracks["cusum"]
-    segments = recording.segments
-    displacement = run.channel("displacement") * 1e3
-    lsb_mm = run.conditions.channels["displacement"].lsb * 1e3
-    changes = marks(dataclasses.replace(mean, alarms=mean.alarms[:0]), segments, CHANGE_LABELS)
-    batch = batch_estimates(run)
-    m_per_code = lsb_mm / 1e3
+    batch = batch_estimates(recording.run)
+    m_per_code = recording.run.conditions.channels["displacement"].lsb
     ceiling = MEAN_CEILING / UNITS_PER_M / m_per_code
-    predicted = displacement - mean.innovation * lsb_mm
-    calm = quantised.tracks["mean-between-faults"]
     return (
-        Figure(
-            "5.7",
-            "Input/Output data from the time-varying electrical analogy.",
-            (
-                Panel("Input", "F [N]", (Curve("force", run.channel("force"), "third", "step"),)),
-                Panel("Output", "x [mm]", (Curve("displacement", displacement, "first"),)),
-            ),
-            "100 Hz, 0 to 10 V. Which pots were turned when, the text does not say: assumed are the four changes of"
-            " section 4.4.1 at samples 200, 400, 600 and 800, each in the middle of a half period with the force on,"
-            " and an input whose level stays (see claim 4.9-level).",
-            changes,
-        ),
-        Figure(
-            "5.8",
-            "Parameter estimates for the time-varying analogous system.",
-            _estimate_panels(mean, batch, run),
-            f"Mean between faults with the printed ceiling of 500 units, {ceiling:.2f} LSB, off for the first 50"
-            " samples. Orange: the batch estimates of the stretches between the changes, as in the thesis. b1 is"
-            f" drawn 1e-6 lower, to make them distinguishable. At 1 LSB of noise the scheme raises {len(mean.alarms)}"
-            " alarms and never settles; Fig. 5.8 B shows our default on the same samples.",
-            marks(mean, segments, CHANGE_LABELS),
-        ),
-        Figure(
-            "5.8 A",
-            "The same without noise.",
-            (
-                *_estimate_panels(calm, batch_estimates(quantised.run), quantised.run),
-                _statistic("Triggering sequence [LSB]", calm.statistic, ceiling),
-            ),
-            "Ideal amplifiers and no noise but that of the 12 bits, the same scheme and ceiling.",
-            marks(calm, segments, CHANGE_LABELS),
-        ),
-        Figure(
-            "5.8 B",
-            "The data of Fig. 5.8, our default trigger.",
-            (
-                *_estimate_panels(ours, batch, run),
-                _statistic("Trigger: cumulative sum", ours.statistic, float(np.log(1e5))),
-            ),
-            "The device as it is shipped: three b's and an offset, of which those of u(k−1) and u(k−2) are drawn;"
-            " whitened equations; the ceiling is ln 100,000. After an alarm the b's, and with them M, B and K, are not"
-            " told apart before the next edge of the force, 50 samples after each change.",
-            marks(ours, segments, CHANGE_LABELS),
-        ),
+        _data_figure(recording),
+        _estimates_figure(recording, batch, ceiling),
+        _quantised_figure(quantised, ceiling),
+        _default_figure(recording, batch),
         _ceilings_figure(recording),
         _conditioned_figure(recording, batch),
-        Figure(
-            "5.9",
-            "Parameter estimates obtained using (a) forgetting factor, (b) Kalman filter.",
-            (
-                _b_panel("(a) λ = 0.97", tracks["forgetting"], batch, run),
-                _b_panel("(b) R = identity matrix", tracks["random-walk"], batch, run),
-            ),
-            "Only the b parameters, as in the thesis; b1 is drawn 1e-6 lower. What R = I means depends on the units of"
-            " u and y; here they are codes, as the device has them.",
-            changes,
+        _others_figure(recording, batch),
+        _trigger_figure(recording, ceiling),
+    )
+
+
+def _changes_alone(recording: Recording) -> tuple[Mark, ...]:
+    """Where the plant changed, without anybody's alarms."""
+    track = recording.tracks["mean-between-faults"]
+    return marks(dataclasses.replace(track, alarms=track.alarms[:0]), recording.segments, CHANGE_LABELS)
+
+
+def _data_figure(recording: Recording) -> Figure:
+    run = recording.run
+    return Figure(
+        "5.7",
+        "Input/Output data from the time-varying electrical analogy.",
+        (
+            Panel("Input", "F [N]", (Curve("force", run.channel("force"), "third", "step"),)),
+            Panel("Output", "x [mm]", (Curve("displacement", run.channel("displacement") * 1e3, "first"),)),
         ),
-        Figure(
-            "5.10",
-            "(a) The triggering sequence (b) Actual and predicted analogous system output.",
-            (
-                _statistic("(a) Triggering sequence [LSB]", mean.statistic, ceiling),
-                Panel(
-                    "(b) Actual and predicted output",
-                    "x [mm]",
-                    (Curve("actual", displacement, "truth"), Curve("predicted", predicted, "first", "dash")),
-                    shown=(-20.0, 190.0),
-                ),
-            ),
-            "Of the run of Fig. 5.8; predicted one sample ahead.",
-            marks(mean, segments, CHANGE_LABELS),
+        "100 Hz, 0 to 10 V. Which pots were turned when, the text does not say: assumed are the four changes of"
+        " section 4.4.1 at samples 200, 400, 600 and 800, each in the middle of a half period with the force on,"
+        " and an input whose level stays (see claim 4.9-level).",
+        _changes_alone(recording),
+    )
+
+
+def _estimates_figure(recording: Recording, batch: Signal, ceiling: float) -> Figure:
+    mean = recording.tracks["mean-between-faults"]
+    return Figure(
+        "5.8",
+        "Parameter estimates for the time-varying analogous system.",
+        _estimate_panels(mean, batch, recording.run),
+        f"Mean between faults with the printed ceiling of 500 units, {ceiling:.2f} LSB, off for the first 50"
+        " samples. Orange: the batch estimates of the stretches between the changes, as in the thesis. b1 is"
+        f" drawn 1e-6 lower, to make them distinguishable. At 1 LSB of noise the scheme raises {len(mean.alarms)}"
+        " alarms and never settles; Fig. 5.8 B shows our default on the same samples.",
+        marks(mean, recording.segments, CHANGE_LABELS),
+    )
+
+
+def _quantised_figure(quantised: Recording, ceiling: float) -> Figure:
+    calm = quantised.tracks["mean-between-faults"]
+    return Figure(
+        "5.8 A",
+        "The same without noise.",
+        (
+            *_estimate_panels(calm, batch_estimates(quantised.run), quantised.run),
+            _statistic("Triggering sequence [LSB]", calm.statistic, ceiling),
         ),
+        "Ideal amplifiers and no noise but that of the 12 bits, the same scheme and ceiling.",
+        marks(calm, quantised.segments, CHANGE_LABELS),
+    )
+
+
+def _default_figure(recording: Recording, batch: Signal) -> Figure:
+    ours = recording.tracks["cusum"]
+    return Figure(
+        "5.8 B",
+        "The data of Fig. 5.8, our default trigger.",
+        (
+            *_estimate_panels(ours, batch, recording.run),
+            _statistic("Trigger: cumulative sum", ours.statistic, float(np.log(1e5))),
+        ),
+        "The device as it is shipped: three b's and an offset, of which those of u(k−1) and u(k−2) are drawn;"
+        " whitened equations; the ceiling is ln 100,000. After an alarm the b's, and with them M, B and K, are not"
+        " told apart before the next edge of the force, 50 samples after each change.",
+        marks(ours, recording.segments, CHANGE_LABELS),
+    )
+
+
+def _others_figure(recording: Recording, batch: Signal) -> Figure:
+    tracks, run = recording.tracks, recording.run
+    return Figure(
+        "5.9",
+        "Parameter estimates obtained using (a) forgetting factor, (b) Kalman filter.",
+        (
+            _b_panel("(a) λ = 0.97", tracks["forgetting"], batch, run),
+            _b_panel("(b) R = identity matrix", tracks["random-walk"], batch, run),
+        ),
+        "Only the b parameters, as in the thesis; b1 is drawn 1e-6 lower. What R = I means depends on the units of"
+        " u and y; here they are codes, as the device has them.",
+        _changes_alone(recording),
+    )
+
+
+def _trigger_figure(recording: Recording, ceiling: float) -> Figure:
+    run, mean = recording.run, recording.tracks["mean-between-faults"]
+    displacement = run.channel("displacement") * 1e3
+    predicted = displacement - mean.innovation * (run.conditions.channels["displacement"].lsb * 1e3)
+    return Figure(
+        "5.10",
+        "(a) The triggering sequence (b) Actual and predicted analogous system output.",
+        (
+            _statistic("(a) Triggering sequence [LSB]", mean.statistic, ceiling),
+            Panel(
+                "(b) Actual and predicted output",
+                "x [mm]",
+                (Curve("actual", displacement, "truth"), Curve("predicted", predicted, "first", "dash")),
+                shown=(-20.0, 190.0),
+            ),
+        ),
+        "Of the run of Fig. 5.8; predicted one sample ahead.",
+        marks(mean, recording.segments, CHANGE_LABELS),
     )
 
 

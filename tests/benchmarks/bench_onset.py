@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from harness.onset.jump import NoOnset, Onset
-from harness.onset.turn import Turn
+from harness.onset.turn import SlowTurn
 from harness.statistics import lower_rate
 from tests.harness.onsets import Clock, Trial, still
 
@@ -22,43 +23,58 @@ from .figure import Figure
 JUMPS_N, RAMPS_N, STILL_N = 500, 100, 100
 CLOCKS: tuple[Clock, ...] = ("card", "free")
 
+Found = TypeVar("Found", Onset, SlowTurn)
+
 
 def jumps(trials: int = JUMPS_N) -> Iterator[Figure]:
     """Changes of 5 to 50 % of one or two parameters; at 99 % confidence the coverage is above its first bound."""
     for clock in CLOCKS:
-        played = [Trial.jump(seed, clock) for seed in range(trials)]
-        begun_s = time.process_time()
-        found = [trial.found() for trial in played]
-        each_ms = 1e3 * (time.process_time() - begun_s) / trials
-        pairs = [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, Onset)]
-        held = [each.low <= trial.sample <= each.high for trial, each in pairs]
-        yield _coverage(f"jump, clock {clock}: instants within the interval", held, trials)
-        widths = np.array([each.high - each.low + 1 for _, each in pairs])
-        bounds = np.array([trial.width_bound() for trial, _ in pairs])
-        remark = (
-            f"samples; median {np.median(widths):.0f}; nobody could tell {bounds.mean():.1f}, median"
-            f" {np.median(bounds):.0f}"
+        name = f"jump, clock {clock}"
+        pairs, each_ms = _searched(Trial.jump, Trial.found, Onset, clock, trials)
+        yield _coverage(
+            f"{name}: instants within the interval", [_holds(found, of.sample) for of, found in pairs], trials
         )
-        yield Figure(f"jump, clock {clock}: mean width", float(widths.mean()), remark)
-        yield Figure(f"jump, clock {clock}: CPU time for a range of 600 samples", each_ms, "ms")
+        bounds = np.array([of.width_bound() for of, _ in pairs])
+        remark = f"nobody could tell {bounds.mean():.1f}, median {np.median(bounds):.0f}"
+        yield _width(f"{name}: mean width", [found for _, found in pairs], remark)
+        yield Figure(f"{name}: CPU time for a range of 600 samples", each_ms, "ms")
 
 
 def ramps(trials: int = RAMPS_N) -> Iterator[Figure]:
     """Even turns of 10 to 50 % of one parameter in 20 to 600 samples."""
     for clock in CLOCKS:
-        played = [Trial.ramp(seed, clock) for seed in range(trials)]
-        begun_s = time.process_time()
-        found = [trial.turned() for trial in played]
-        each_ms = 1e3 * (time.process_time() - begun_s) / trials
-        pairs = [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, Turn)]
-        begins = [each.begin.low <= trial.sample <= each.begin.high for trial, each in pairs]
-        ends = [each.end.low <= trial.sample + trial.ramp_n <= each.end.high for trial, each in pairs]
-        yield _coverage(f"ramp, clock {clock}: begins within the interval", begins, trials)
-        yield _coverage(f"ramp, clock {clock}: ends within the interval", ends, trials)
-        widths = np.array([each.begin.high - each.begin.low + 1 for _, each in pairs])
-        remark = f"samples; median {np.median(widths):.0f}; of ramps of 20 to 600 samples"
-        yield Figure(f"ramp, clock {clock}: mean width of the begin", float(widths.mean()), remark)
-        yield Figure(f"ramp, clock {clock}: CPU time", each_ms, "ms")
+        name = f"ramp, clock {clock}"
+        pairs, each_ms = _searched(Trial.ramp, Trial.turned, SlowTurn, clock, trials)
+        begins = [_holds(found.begin, of.sample) for of, found in pairs]
+        ends = [_holds(found.end, of.sample + of.ramp_n) for of, found in pairs]
+        yield _coverage(f"{name}: begins within the interval", begins, trials)
+        yield _coverage(f"{name}: ends within the interval", ends, trials)
+        yield _width(f"{name}: mean width of the begin", [found.begin for _, found in pairs], "of ramps of 20 to 600")
+        yield Figure(f"{name}: CPU time", each_ms, "ms")
+
+
+def _searched(
+    play: Callable[[int, Clock], Trial],
+    search: Callable[[Trial], Found | NoOnset],
+    kind: type[Found],
+    clock: Clock,
+    trials: int,
+) -> tuple[list[tuple[Trial, Found]], float]:
+    """The trials of which something was found, with it; and the CPU time of one search, ms."""
+    played = [play(seed, clock) for seed in range(trials)]
+    begun_s = time.process_time()
+    found = [search(trial) for trial in played]
+    each_ms = 1e3 * (time.process_time() - begun_s) / trials
+    return [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, kind)], each_ms
+
+
+def _holds(interval: Onset, sample: int) -> bool:
+    return interval.low <= sample <= interval.high
+
+
+def _width(name: str, intervals: Sequence[Onset], remark: str) -> Figure:
+    widths = np.array([each.high - each.low + 1 for each in intervals])
+    return Figure(name, float(widths.mean()), f"samples; median {np.median(widths):.0f}; {remark}")
 
 
 def quiet(trials: int = STILL_N) -> Iterator[Figure]:

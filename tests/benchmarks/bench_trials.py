@@ -47,9 +47,10 @@ def figures() -> Iterator[Figure]:
     yield Figure("trials: two processes", together, "samples/s of CPU time", "one process", ratio=together / alone)
     one_s, two_s = (_certificate(*LONG_CERTIFICATE, "--workers", count)[0] for count in "12")
     yield Figure("certificate of 63 million samples, two workers", two_s, "s on the wall", "one", ratio=one_s / two_s)
-    wall_s, cpu_s = (min(each) for each in zip(*(_certificate(*CERTIFICATE) for _ in range(REPEATS)), strict=True))
+    wall_s = min(_certificate(*CERTIFICATE)[0] for _ in range(REPEATS))
+    cpu_s = min(_certificate(*CERTIFICATE, "--workers", "1")[1] for _ in range(REPEATS))
     yield Figure("certificate of 1.65 million samples", wall_s, "s on the wall")
-    yield Figure("certificate of 1.65 million samples, CPU", cpu_s, "s of CPU time")
+    yield Figure("certificate of 1.65 million samples, one worker", cpu_s, "s of CPU time")
 
 
 def _cases() -> Iterator[tuple[str, Scenario, int]]:

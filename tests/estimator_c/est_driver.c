@@ -23,6 +23,13 @@ static float count_innovations(void* context, float innovation, float variance, 
     return *counter;
 }
 
+/* Another: the squared innovation in predicted variances. */
+static float normalise(void* context, float innovation, float variance, bool anew) {
+    (void)context;
+    (void)anew;
+    return (innovation * innovation) / variance;
+}
+
 int driver_init(const driver_config_t* in) {
     config = (est_config_t){
         .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .nc = (uint8_t)in->nc,
@@ -35,7 +42,8 @@ int driver_init(const driver_config_t* in) {
         .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
                      .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,
                      .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset,
-                     .custom = (in->custom != 0) ? count_innovations : 0, .context = &counted },
+                     .custom = (in->custom == 2) ? normalise : ((in->custom == 1) ? count_innovations : 0),
+                     .context = &counted },
     };
     return est_init(&self, &config) ? 1 : 0;
 }

@@ -194,6 +194,43 @@ def test_configuration_out_of_range_is_refused(estimator: Estimator, changes: di
     assert not estimator.init(**changes)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"na": 1, "c": (-0.9, 0.0)},
+        {"nb": 1},
+        {"nk": 1},
+        {"nb": 2, "nc": 1},
+        {"nb": 1, "nc": 2},
+        {"forgetting": 0.5},
+        {"forgetting": 1.0},
+        {"p0": 1e-9},
+        {"p0": 1e9},
+        {"p0_offset": 1e-9},
+        {"p0_offset": 1e9},
+        {"noise_variance": 1e-9},
+        {"noise_variance": 1e9},
+        {"random_walk": 1e9},
+        {"edge_codes": 1e6},
+        {"edge_codes": 1e-9},
+        {"code_low": -1e-9, "code_high": 0.0},
+        {"ceiling": 1e-9},
+        {"ceiling": 1e9},
+        {"edge_instants": 0},
+        {"edge_instants": 2},
+        {"kind": 0},
+        {"kind": 4, "custom": 1},
+        {"reset": 0},
+        {"reset": 1},
+    ],
+    ids=str,
+)
+def test_configuration_at_the_end_of_its_range_is_taken(
+    estimator: Estimator, changes: dict[str, float | tuple[float, float]]
+) -> None:
+    assert estimator.init(**changes)
+
+
 def test_largest_order_fits(estimator: Estimator) -> None:
     assert estimator.init(na=2, nb=3, nk=1, offset=1)
     assert estimator.init(na=2, nb=2, nk=1, nc=2, offset=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.estimator_c.est_driver import CUSTOM, GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
+from tests.estimator_c.est_driver import CUSTOM, GATHERING, LOCKED, MISSING, NONE, REFUSED, UPDATED, Estimator
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 800
@@ -68,6 +68,12 @@ def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refr
         assert estimator.init(refresh_n=refresh_n)
         refreshes.append(estimator.run(u[:samples], y[:samples]).counters["refreshes"])
     assert refreshes == [0, 1]
+
+
+def test_c_that_is_to_stay_as_it_is_does_so_for_more_equations_than_can_be_counted(estimator: Estimator) -> None:
+    u, y = (np.tile(x, 90) for x in front())
+    assert estimator.init(kind=NONE, refresh_n=0)
+    assert estimator.run(u, y).counters["refreshes"] == 0
 
 
 def test_c_stays_as_it_is_where_the_last_edge_is_long_past(estimator: Estimator) -> None:
@@ -151,6 +157,13 @@ def test_own_trigger_is_asked_at_every_innovation_and_told_when_it_begins_anew(e
     alarms = estimator.run(u, y).alarms
     # Two samples gathered, 50 of warm-up; after an alarm two gathered and ten held.
     assert alarms.tolist() == [151, 263, 375, 487, 599, 711]
+
+
+def test_own_trigger_is_told_the_variance_that_the_innovation_should_have(estimator: Estimator) -> None:
+    """In codes^2, so that the squared innovation is as large on average. 2 LSB of noise, and rounding."""
+    u, y = suspension([(0, FRONT)], np.arange(10.0, 4000.0, 50.0), 4000, 2.0, 5)
+    assert estimator.init(kind=CUSTOM, custom=2, ceiling=1e6, noise_variance=4.0 + 1.0 / 12.0, edge_instants=LOCKED)
+    assert estimator.run(u, y).statistic[200:].mean() == pytest.approx(1.0, rel=0.1)
 
 
 def test_variance_of_the_noise_is_followed(estimator: Estimator) -> None:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from emulator import Excitation
 from harness import config, information
 from harness.onset.jump import NoOnset, Onset, onset
-from harness.onset.turn import Turn, turn
-from harness.onset.two_filter import Record
+from harness.onset.turn import SlowTurn, turn
+from harness.onset.two_filter import Signals
 from harness.plant import PARAMETERS, Plant, SampledPlant
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
 from harness.scenario import PLANTS, Scenario, Tweak
@@ -42,12 +42,12 @@ def machines() -> EmulatorRig:
     return EmulatorRig(dataclasses.replace(described, computer=computer))
 
 
-def played(scenario: Scenario, seed: int) -> Record:
+def played(scenario: Scenario, seed: int) -> Signals:
     """What the card takes of it."""
     performance = machines().perform(scenario, seed)
     blocks = list(performance.blocks)
     codes, clipped = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("codes", "clipped"))
-    return Record.of(codes, clipped, performance.channels, performance.sample_period_s * performance.time_scale)
+    return Signals.of(codes, clipped, performance.channels, performance.sample_period_s * performance.time_scale)
 
 
 def scenario_of(
@@ -80,7 +80,7 @@ def changed(rng: np.random.Generator, least: float, most: float, together: int) 
 class Trial:
     """A change of the front suspension at an instant that only the trial knows."""
 
-    record: Record
+    signals: Signals
     after: Plant
     sample: int
     ramp_n: int
@@ -110,10 +110,10 @@ class Trial:
         return cls(played(scenario, seed), after, sample, ramp_n, search, known=True)
 
     def found(self) -> Onset | NoOnset:
-        return onset(self.record, FRONT, self.after if self.known else None, self.search)
+        return onset(self.signals, FRONT, self.after if self.known else None, self.search)
 
-    def turned(self) -> Turn | NoOnset:
-        return turn(self.record, FRONT, self.after if self.known else None, self.search)
+    def turned(self) -> SlowTurn | NoOnset:
+        return turn(self.signals, FRONT, self.after if self.known else None, self.search)
 
     def width_bound(self) -> int:
         """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the
@@ -122,15 +122,15 @@ class Trial:
         samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
         courses_m = self._courses(first, samples)
         true_m = courses_m[samples == self.sample]
-        gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.record.noise_m**2)
+        gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.signals.noise_m**2)
         return int((gathered < information.LN_CERTAIN).sum())
 
     def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
         """(m, 800) metres from a sample on, the plant changing at each of these samples (m,)."""
-        before, after = (SampledPlant.of(plant, self.record.period_s) for plant in (FRONT, self.after))
+        before, after = (SampledPlant.of(plant, self.signals.period_s) for plant in (FRONT, self.after))
         x, v = np.zeros(len(samples)), np.zeros(len(samples))
         out = []
-        for k, force in enumerate(self.record.force_n[first : first + 800].tolist(), start=first):
+        for k, force in enumerate(self.signals.force_n[first : first + 800].tolist(), start=first):
             out.append(x)
             (xa, va), (xb, vb) = (_next(plant, x, v, force) for plant in (before, after))
             changed = k >= samples
@@ -150,5 +150,5 @@ def _next(
 def still(seed: int, clock: Clock) -> Trial:
     """A pot that was to be turned and was not: nothing has changed."""
     rng = np.random.default_rng([11, seed])
-    record = played(scenario_of(2200, clock, 200.0), seed)
-    return Trial(record, changed(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0))
+    signals = played(scenario_of(2200, clock, 200.0), seed)
+    return Trial(signals, changed(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0))

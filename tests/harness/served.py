@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.instrument.serving import serving
+from tests.served.serving import serving
 
 ROOT = Path(__file__).parents[2]
 

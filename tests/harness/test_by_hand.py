@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from harness.links.wire import VirtualClock
-from harness.onset.two_filter import Record
+from harness.onset.two_filter import Signals
 from harness.plant import Plant
 from harness.rigs.by_hand import ByHand, Tweak
 from harness.scenario import Tweak as PlayedTweak
@@ -44,7 +44,7 @@ def turned(tweaks: Sequence[Tweak], takes_s: float, *, slow: bool = False) -> By
     return by_hand
 
 
-def taken(samples: int, *changes: PlayedTweak) -> Record:
+def taken(samples: int, *changes: PlayedTweak) -> Signals:
     """By the card of a machine of real components."""
     return played(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
 
@@ -55,8 +55,8 @@ def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) 
 
 def test_jump_is_dated_wherever_the_pot_was_between_question_and_answer() -> None:
     soft = FRONT.scaled("K", 0.7)
-    record = taken(4000, PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
-    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(record, first=5000)
+    signals = taken(4000, PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(signals, first=5000)
     assert segment.plant == soft and not segment.unseen
     assert segment.start_low is not None and segment.start_high is not None
     assert segment.start_low <= 6630 <= segment.start_high
@@ -66,12 +66,12 @@ def test_jump_is_dated_wherever_the_pot_was_between_question_and_answer() -> Non
 def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_the_second() -> None:
     after = FRONT.scaled("B", 0.7).scaled("K", 0.75)
     dials = {"K": 0.6, "B": 0.5}  # in this order
-    record = taken(
+    signals = taken(
         4000,
         PlayedTweak(1630, stiffness_n_per_m=after.stiffness_n_per_m),
         PlayedTweak(1700, damping_n_s_per_m=after.damping_n_s_per_m),
     )
-    (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).dated(record, first=0)
+    (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).dated(signals, first=0)
     assert not segment.unseen, segment.unseen
     earliest, latest = segment.earliest(), segment.latest()
     assert earliest.start <= 1630 <= latest.start
@@ -93,13 +93,13 @@ def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
     """Asked for 2000 samples apart; a search of the one never looks at samples in which the other may have been."""
     soft = FRONT.scaled("K", 0.7)
     light = soft.scaled("M", 0.6)
-    record = taken(
+    signals = taken(
         6000,
         PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m),
         PlayedTweak(3250, mass_kg=light.mass_kg),
     )
     tweaks = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
-    first, second = turned(tweaks, takes_s=0.01).dated(record, first=0)
+    first, second = turned(tweaks, takes_s=0.01).dated(signals, first=0)
     for segment, sample in ((first, 1630), (second, 3250)):
         assert not segment.unseen, segment.unseen
         assert segment.earliest().start <= sample <= segment.latest().start

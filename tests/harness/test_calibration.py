@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -20,7 +21,6 @@ from harness.calibration.plan import check_scenario, scenarios
 from harness.calibration.recordings import (
     DISPLACEMENT,
     FORCE,
-    MEASURED,
     Recording,
     averaged,
     noise_of,
@@ -32,7 +32,7 @@ from harness.errors import ConfigurationError, RigError
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import ComputerDescription, EmulatorRig
 from harness.rigs.rig import Block, Hindsight, Performance
-from harness.run import Channel
+from harness.run import MEASURED, Channel
 from harness.scenario import PlantChoice
 from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
 
@@ -188,17 +188,17 @@ def test_a_card_whose_samples_do_not_fit_the_periods_is_refused(recordings: list
 
 
 class Troubled:
-    """A rig with a lit lamp, or whose samples are of two records."""
+    """A rig with a lit lamp, that is not well, or whose samples are of two records."""
 
     capabilities = frozenset({"excite"})
 
-    def __init__(self, *, lamps: dict[str, int], records: tuple[int, ...]) -> None:
-        self._lamps, self._records = lamps, records
+    def __init__(self, lamps: dict[str, int], caveats: tuple[str, ...] = (), records: tuple[int, ...] = (0,)) -> None:
+        self._hindsight, self._records = Hindsight((), lamps, caveats), records
 
     def perform(self, scenario: Any, seed: int) -> Performance:
         del scenario, seed
         channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in MEASURED}
-        return Performance(50e-6, 200.0, channels, self._blocks(), lambda: Hindsight((), self._lamps))
+        return Performance(50e-6, 200.0, channels, self._blocks(), lambda: self._hindsight)
 
     def _blocks(self) -> Iterator[Block]:
         for first, number in enumerate(self._records):
@@ -217,8 +217,12 @@ class Troubled:
 @pytest.mark.parametrize(
     ("rig", "message"),
     [
-        (Troubled(lamps={"U1": 7}, records=(0,)), "scenario calibration-1: overload lamps of U1 are lit"),
-        (Troubled(lamps={}, records=(0, 1)), "scenario calibration-1: was not recorded without a gap"),
+        (Troubled({"U1": 7}), "scenario calibration-1: overload lamps of U1 are lit"),
+        (
+            Troubled({}, ("the rig's self-test: skew",)),
+            "scenario calibration-1: the rig's self-test: skew: nothing",
+        ),
+        (Troubled({}, records=(0, 1)), "scenario calibration-1: was not recorded without a gap"),
     ],
 )
 def test_overloaded_and_broken_recordings_are_not_fitted(rig: Troubled, message: str) -> None:
@@ -242,10 +246,17 @@ def ran(rig: str, out: Path, *more: str) -> int:
     return main(["calibrate", "--rig", rig, "--out", str(out), *given, *more])
 
 
-def test_the_command_keeps_a_twin_that_opens_as_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_keeps_a_twin_that_opens_as_a_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr("harness.cli.terminal._PROGRESS_S", 0.0)
     out = tmp_path / "twin.toml"
     assert ran(described(tmp_path), out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    said = capsys.readouterr()
+    assert "\r4 of 13 recordings (31%)" in said.err
+    assert said.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
+    told = json.loads(said.out)
     assert told["check_lsb"] < 0.5
     gain = next(each for each in told["estimates"] if each["name"] == "force gain")
     assert abs(gain["value"] - 1e-3) < 4.5 * gain["standard_error"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import signal
@@ -15,20 +16,23 @@ from pathlib import Path
 import pytest
 
 from harness.bench import Bench
+from harness.campaign import players
 from harness.campaign.conduct import Tally, conduct, journal_of
 from harness.campaign.journal import Journal
 from harness.campaign.results import Results, Summary, text
-from harness.campaign.spec import CampaignSpec, Chunk, Plan, one_worker_only
+from harness.campaign.spec import CampaignSpec, Chunk, Plan, one_worker_only, rig_table
 from harness.campaign.trial import close_devices, play_chunk, row
 from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
-from harness.devices import describe
-from harness.dut import open_dut
-from harness.errors import AnalogrigError, ConfigurationError, RecordingError, WorkerError
+from harness.devices import DeviceDescription, describe
+from harness.dut import Dut, connect, open_dut
+from harness.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
 from harness.links.wire import LIBRARY
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorRig
+from harness.run import Run
 from harness.scenario import Scenario, Tweak
+from harness.statistics import ConfidenceSequence
 from harness.verdict import judge
 
 SPEC = """
@@ -63,8 +67,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
     spec = SPEC.replace("[draw]", "noise_lsb = [0.5]\n[draw]")
     plan = planned(tmp_path, spec)
-    case = plan.case(plan.cells()[1], 4)
-    damping = case.drawn["damping_n_s_per_m"]
+    damping = plan.drawn(4)["damping_n_s_per_m"]
     assert 2500.0 < damping < 3021.0
     base = dataclasses.replace(Scenario.load("healthy"), samples=1300)
     plant = dataclasses.replace(base.plant, damping_n_s_per_m=damping)
@@ -75,13 +78,13 @@ def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
         run = Bench(rig, dut).play(scenario, 4)
     played = play_chunk(plan.as_json(), (2, 1))
     assert [each["seed"] for each in played] == [4, 5]
-    assert played[0] == row(run, judge(run), case.drawn)
+    assert played[0] == row(run, judge(run), plan.drawn(4))
 
 
 def test_plan_reads_the_same_after_a_journey_as_text(tmp_path: Path) -> None:
     plan = planned(tmp_path)
     assert Plan.from_json(plan.as_json()) == plan
-    assert Plan.from_json(plan.as_json()).digest() == plan.digest()
+    assert Plan.from_json(plan.as_json()).as_json() == plan.as_json()
 
 
 def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
@@ -101,6 +104,8 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
         ("[grid]\nmass_kg = [90.0]\n[draw]\nmass_kg = [80.0, 90.0]", "mass_kg: in the grid and drawn as well"),
         ("trials = 0", "trials must be 1 to"),
         ("devices = []", "devices must name at least one"),
+        ("name = '../../elsewhere'", "name must be one that a file can have, not '../../elsewhere'"),
+        ('name = "two\\nlines"', r"name must be one that a file can have, not 'two\\nlines'"),
         ("[grid]\nmass_kg = [10.0]", "pot M: .*M_kg = 10"),
         ("scenario = 'thesis'\n[grid]\nmass_factor = [0.5]", "has tweaks of its own"),
         ("[grid]\nmass_factor = [0.5]\n", None),
@@ -111,6 +116,13 @@ def test_device_on_a_line_gives_the_same_rows(tmp_path: Path) -> None:
             "mass_factor = 0.5: the tweak at sample 1000 is beyond the last",
         ),
         ("rigs = ['recording:x.npz']", "x.npz"),
+        ("[draw]\nnoise_lsb = [-0.05, 1.0]", "campaign spec: draw: noise_lsb = -0.05: .*noise_lsb must be 0 to"),
+        ("[draw]\nnoise_lsb = [0.5, 1.0]\nmass_kg = [10.0, 300.0]", "draw: mass_kg = 10: .*pot M: .*M_kg = 10"),
+        ("samples = 1300\n[draw]\nmass_factor = [-0.1, 0.9]", "draw: mass_factor = -0.1: .*must be"),
+        (
+            "samples = 1300\n[draw]\nmass_kg = [50.0, 300.0]\nmass_factor = [0.4, 0.9]",
+            "mass_kg = 50, mass_factor = 0.4: .*pot M",
+        ),
     ],
 )
 def test_wrong_campaign_is_one_line_that_names_the_key(tmp_path: Path, spec: str, complaint: str | None) -> None:
@@ -144,7 +156,7 @@ def test_order_in_which_chunks_come_changes_nothing(tmp_path: Path, reference: P
 def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, reference: Path) -> None:
     """As if the power had gone after any byte: every length of the last line, and all numbers of lines."""
     plan, out = planned(tmp_path), tmp_path / "out.json"
-    with Journal(journal_of(out), plan.digest()) as journal:
+    with Journal(journal_of(out), plan) as journal:
         for chunk in plan.chunks():
             journal.add(chunk, play_chunk(plan.as_json(), chunk))
     whole = journal_of(out).read_bytes()
@@ -158,21 +170,21 @@ def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, refere
 
 
 def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
-    path, digest = tmp_path / "out.json.journal", planned(tmp_path).digest()
-    with Journal(path, digest) as journal:
+    path, plan = tmp_path / "out.json.journal", planned(tmp_path)
+    with Journal(path, plan) as journal:
         journal.add(Chunk((0, 0)), [])
         journal.add(Chunk((0, 1)), [])
     path.write_bytes(path.read_bytes()[:-3])
-    with Journal(path, digest) as journal:
+    with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0)]
         journal.add(Chunk((1, 0)), [])
-    with Journal(path, digest) as journal:
+    with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0), (1, 0)]
 
 
 def test_damaged_line_of_a_journal_is_played_again(tmp_path: Path, reference: Path) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.json"
-    with Journal(journal_of(out), plan.digest()) as journal:
+    with Journal(journal_of(out), plan) as journal:
         for chunk in plan.chunks():
             journal.add(chunk, play_chunk(plan.as_json(), chunk))
     damaged = bytearray(journal_of(out).read_bytes())
@@ -358,13 +370,38 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
     assert tuple(map(tuple, tally.counted)) == results.rows
 
 
+def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
+    """At most 0.01 a sample at 90 % takes some 600 without an alarm; of 160 samples at most 10 are armed."""
+    stop = '[stop]\nquantity = "false_alarms"\nrate = 0.01\nconfidence = 0.9\n'
+    plan = planned(tmp_path, f"trials = 20\nchunk = 1\nsamples = 160\n{stop}")
+    summary = conduct(plan, ThisProcess(), tmp_path / "out.json").total()
+    assert (summary.trials, summary.samples) == (20, 3200)
+    assert summary.armed <= 200
+
+
+@pytest.mark.parametrize(
+    ("spec", "why"),
+    [("samples = 140", "the warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "the device was not excited")],
+)
+def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Path, spec: str, why: str) -> None:
+    still = tmp_path / "still.toml"
+    still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
+    plan = planned(tmp_path, f"trials = 1\n{spec.format(still=still)}\n")
+    (played,) = play_chunk(plan.as_json(), (0, 0))
+    assert (played["outcome"], played["armed"]) == ("inconclusive", 0)
+    assert why in played["why"]
+
+
 # ------------------------------------------------------------------------------------------------------------ results
 
 
-def test_results_survive_the_file_and_are_not_played_again(tmp_path: Path, reference: Path) -> None:
-    class Nobody(ThisProcess):
-        play = None  # type: ignore[assignment]  # never asked
+class Nobody(ThisProcess):
+    """Is never asked."""
 
+    play = None  # type: ignore[assignment]
+
+
+def test_results_survive_the_file_and_are_not_played_again(tmp_path: Path, reference: Path) -> None:
     again = conduct(planned(tmp_path), Nobody(), reference)  # type: ignore[arg-type]
     again.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == reference.read_bytes()
@@ -379,7 +416,7 @@ def test_results_of_another_campaign_are_not_overwritten(tmp_path: Path, referen
 
 def test_journal_of_another_campaign_is_refused(tmp_path: Path) -> None:
     out = tmp_path / "out.json"
-    with Journal(journal_of(out), planned(tmp_path).digest()):
+    with Journal(journal_of(out), planned(tmp_path)):
         pass
     with pytest.raises(ConfigurationError, match="what was kept there is of another campaign"):
         conduct(planned(tmp_path, SPEC.replace("chunk = 2", "chunk = 3")), ThisProcess(), out)
@@ -388,7 +425,7 @@ def test_journal_of_another_campaign_is_refused(tmp_path: Path) -> None:
 def test_two_campaigns_do_not_share_a_journal(tmp_path: Path) -> None:
     plan, out = planned(tmp_path), tmp_path / "out.json"
     with (
-        Journal(journal_of(out), plan.digest()),
+        Journal(journal_of(out), plan),
         pytest.raises(ConfigurationError, match="another campaign is writing to it"),
     ):
         conduct(plan, ThisProcess(), out)
@@ -400,7 +437,7 @@ def test_two_campaigns_do_not_share_a_journal(tmp_path: Path) -> None:
         lambda whole: whole[: len(whole) // 2],
         lambda whole: whole.replace(b'"outcome":"passed"', b'"outcome":"superb"', 1),
         lambda whole: whole.replace(b'"false_alarms":0', b'"false_alarms":-1', 1),
-        lambda whole: whole.replace(b'"version": 1', b'"version": 2', 1),
+        lambda whole: whole.replace(b'"version": 2', b'"version": 1', 1),
         lambda _: b"[]",
         lambda _: b"[" * 100_000,
     ],
@@ -420,6 +457,7 @@ def trial(
         "seed": seed,
         "outcome": outcome,
         "samples": 1000,
+        "armed": 850,
         "false_alarms": false_alarms,
         "changes": list(changes),
         "errors": [0.03, -0.04, 0.0],
@@ -437,6 +475,8 @@ def test_summary_counts_what_is_valid_and_nothing_else() -> None:
     found = Summary.of(rows)
     assert (found.trials, found.passed, found.failed, found.inconclusive) == (4, 2, 1, 1)
     assert (found.samples, found.false_alarms, found.visible, found.missed, found.late) == (3000, 2, 3, 1, 1)
+    assert found.armed == 3 * 850
+    assert found.false_alarm_rate == ConfidenceSequence(0.95, 1e-6, trials=3 * 850, events=2).bounds
     assert (found.latency_n, found.latency_p95_n, found.bound_n) == (6.0, 8.0, 4.0)
     assert found.error["M"] == pytest.approx(0.03)
     assert found.miss_rate[0] < 1 / 3 < found.miss_rate[1]
@@ -459,16 +499,191 @@ def test_command_says_what_came_out_and_writes_the_page(
     assert [cell["stiffness_factor"] for cell in said["cells"]] == ["0.8", "0.9"]
     assert out.read_bytes() == reference.read_bytes()
     assert Path(said["page"]).read_text().startswith("<!doctype html>")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 0
 
 
-def test_device_that_cannot_be_had_is_inconclusive_and_what_is_done_is_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent']\n")
+def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n")
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json")]) == 3
     complaint = capsys.readouterr().err
-    assert "cell 0, seed 0: cannot open /dev/absent" in complaint
+    assert "INCONCLUSIVE: no device can be had: cannot open /dev/absent" in complaint
     assert complaint.count("\n") == 1
+    assert not journal_of(tmp_path / "out.json").exists()
+
+
+def test_device_that_does_not_answer_leaves_the_others_their_results(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    master, slave = os.openpty()
+    (tmp_path / "mute.toml").write_text(f"kind = 'serial'\nurl = '{os.ttyname(slave)}'\ntimeout_s = 0.05\n")
+    planned(tmp_path, f"trials = 3\nsamples = 400\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n")
+    out = tmp_path / "out.json"
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 3
+    os.close(master)
+    os.close(slave)
+    said = capsys.readouterr()
+    assert "mute cannot be had, and its trials are INCONCLUSIVE: device mute: no Hello" in said.err
+    assert "3 trials inconclusive, such as seed 0: device mute: no Hello" in said.out
+    mute, others = Results.load(out).rows
+    assert [(each["outcome"], each["samples"]) for each in mute] == [("inconclusive", 0)] * 3
+    assert [(each["outcome"], each["samples"]) for each in others] == [("passed", 400)] * 3
+
+
+@pytest.mark.parametrize("failing", [{1, 2}, set(range(4))])
+def test_trial_whose_device_fails_is_inconclusive_and_the_next_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: set[int]
+) -> None:
+    real = Bench.play
+
+    def play(bench: Bench, scenario: Scenario, seed: int) -> Run:
+        if seed in failing:
+            raise LinkClosed("the device\nis gone")
+        return real(bench, scenario, seed)
+
+    monkeypatch.setattr(Bench, "play", play)
+    planned(tmp_path, "trials = 4\nsamples = 300\ndevices = ['host?exchange=block']\n")
+    out = tmp_path / "out.json"
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 3
+    (rows,) = Results.load(out).rows
+    assert {each["seed"] for each in rows if each["outcome"] == "inconclusive"} == failing
+    assert {each.get("why") for each in rows if each["seed"] in failing} == {"the device is gone"}
+
+
+def test_device_of_several_cells_is_opened_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A serial port cannot be opened twice."""
+    close_devices()
+    opened = []
+
+    def connected(description: DeviceDescription) -> Dut:
+        opened.append(description.name)
+        return connect(description)
+
+    monkeypatch.setattr(players, "connect", connected)
+    spec = "trials = 1\nsamples = 300\ndevices = ['host?exchange=block']\n[grid]\nnoise_lsb = [0.5, 1.0]\n"
+    plan = planned(tmp_path, spec)
+    for cell in range(2):
+        play_chunk(plan.as_json(), (0, cell))
+    close_devices()
+    assert len(opened) == 1
+
+
+def test_rig_that_is_not_emulated_takes_one_worker() -> None:
+    assert one_worker_only(rig_table("red-pitaya"), describe("host").as_table()) == "red-pitaya"
+    assert one_worker_only(rig_table("emulator"), describe("host").as_table()) == ""
+
+
+# ---------------------------------------------------------------------------------------------------- builds and files
+
+
+def changed_library(tmp_path: Path) -> Path:
+    library = tmp_path / "own.so"
+    library.write_bytes(LIBRARY.read_bytes() + b" ")
+    return library
+
+
+def test_campaign_does_not_go_on_with_another_build_of_its_device(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    library, out = changed_library(tmp_path), tmp_path / "out.json"
+    spec = f"trials = 2\nsamples = 300\ndevices = ['inproc:{library}']\n"
+    plan = planned(tmp_path, spec)
+    with Journal(journal_of(out), plan) as journal:
+        journal.add(Chunk((0, 0)), play_chunk(plan.as_json(), (0, 0)))
+    kept = journal_of(out).read_bytes()
+    library.write_bytes(LIBRARY.read_bytes())
+    close_devices()
+    with pytest.raises(ConfigurationError, match=r"own\.so is another build than the one that the campaign was begun"):
+        play_chunk(plan.as_json(), (0, 0))
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 2
+    complaint = capsys.readouterr().err
+    before, after = plan.devices[0]["build"], planned(tmp_path, spec).devices[0]["build"]
+    assert f"devices[0].build is '{before}' there and '{after}' here" in complaint
+    assert complaint.count("\n") == 1
+    assert journal_of(out).read_bytes() == kept
+
+
+@pytest.mark.parametrize("device", ["qemu-m4:{file}", "inproc:{file}"])
+def test_contents_of_what_a_device_runs_are_part_of_the_campaign(tmp_path: Path, device: str) -> None:
+    file = tmp_path / "own"
+    builds = []
+    for content in (b"one", b"two"):
+        file.write_bytes(content)
+        builds.append(Plan.of(CampaignSpec(devices=(device.format(file=file),), trials=1)).devices[0]["build"])
+    assert builds == [hashlib.sha256(content).hexdigest()[:16] for content in (b"one", b"two")]
+
+
+def test_another_version_of_analogrig_plays_nothing_of_a_campaign(tmp_path: Path) -> None:
+    plan, out = planned(tmp_path), tmp_path / "out.json"
+    older = dataclasses.replace(plan, analogrig="0.0.7 0123456789abcdef")
+    with pytest.raises(ConfigurationError, match=r"has analogrig 0\.1\.0, the campaign was begun by 0\.0\.7$"):
+        play_chunk(older.as_json(), (0, 0))
+    with Journal(journal_of(out), older):
+        pass
+    with pytest.raises(ConfigurationError, match=r"analogrig is '0\.0\.7 0123456789abcdef' there and '0\.1\.0 "):
+        conduct(plan, ThisProcess(), out)
+
+
+@pytest.mark.parametrize("content", [b"my own notes\n", b"x", b"\x00" * 5000, b'{"format": "other"}\n'])
+def test_file_of_somebody_else_in_the_place_of_the_journal_is_left_alone(tmp_path: Path, content: bytes) -> None:
+    out = tmp_path / "out.json"
+    journal_of(out).write_bytes(content)
+    with pytest.raises(ConfigurationError, match=r"out\.json\.journal: is a file that no campaign has written"):
+        conduct(planned(tmp_path), ThisProcess(), out)
+    assert journal_of(out).read_bytes() == content
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "standing", "said"),
+    [
+        ("out.json", "out.html", "out.html: is no page of a campaign"),
+        ("out.html", "other", "the page of the results is to be called so"),
+        ("out.json", "out.json", "out.json: not the results of a campaign"),
+    ],
+)
+def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
+    tmp_path: Path, out: str, standing: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planned(tmp_path)
+    (tmp_path / standing).write_text("my own")
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / out), "--workers", "1"]) == 2
+    assert said in capsys.readouterr().err
+    assert (tmp_path / standing).read_text() == "my own"
+    assert not journal_of(tmp_path / out).exists()
+
+
+def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Path) -> None:
+    """A limit on the size of files stands for a disk that is full."""
+    planned(tmp_path)
+    out = tmp_path / "out.json"
+    command = (
+        f"ulimit -f 4; exec {sys.executable} -m harness.cli campaign {tmp_path / 'spec.toml'} --out {out} --workers 1"
+    )
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == f"analogrig: {journal_of(out)}: File too large\n"
+    assert journal_of(out).read_bytes().count(b"\n") > 1
+    conduct(planned(tmp_path), ThisProcess(), out)
+    assert out.read_bytes() == reference.read_bytes()
+
+
+def test_campaign_that_another_process_has_ended_meanwhile_is_not_played_again(
+    tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.json"
+    monkeypatch.setattr(Journal, "_lock", lambda _: out.write_bytes(reference.read_bytes()))
+    results = conduct(planned(tmp_path), Nobody(), out)  # type: ignore[arg-type]
+    assert results == Results.load(reference)
+    assert not journal_of(out).exists()
+
+
+def test_journal_that_was_removed_while_it_was_opened_is_not_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "out.json.journal"
+    monkeypatch.setattr("fcntl.flock", lambda *_: path.unlink())
+    with pytest.raises(ConfigurationError, match="another campaign is writing to it"):
+        Journal(path, planned(tmp_path))
 
 
 def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
@@ -498,10 +713,10 @@ def test_another_build_of_a_library_is_another_campaign(tmp_path: Path) -> None:
     library = tmp_path / "own.so"
     library.write_bytes(LIBRARY.read_bytes())
     spec = CampaignSpec(devices=(f"inproc:{library}",), trials=1, name="own")
-    before = Plan.of(spec).digest()
-    assert Plan.of(spec).digest() == before
+    before = Plan.of(spec).as_json()
+    assert Plan.of(spec).as_json() == before
     library.write_bytes(LIBRARY.read_bytes() + b" ")
-    assert Plan.of(spec).digest() != before
+    assert Plan.of(spec).as_json() != before
 
 
 @pytest.mark.parametrize("text", ["samples = 0", "samples = 2000000000"])

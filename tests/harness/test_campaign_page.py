@@ -27,7 +27,7 @@ def row(seed: int, cell: int) -> Row:
     missed = cell == 5 and seed == 1
     change = [None if missed else cell + 1, 2, missed, False]
     outcome = "failed" if missed else "passed"
-    counts = {"seed": seed, "outcome": outcome, "samples": 1100, "false_alarms": 0}
+    counts = {"seed": seed, "outcome": outcome, "samples": 1100, "armed": 950, "false_alarms": 0}
     return {**counts, "changes": [change], "errors": [0.0, 0.0, 0.0], "theta": "0"}
 
 

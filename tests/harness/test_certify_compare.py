@@ -15,7 +15,7 @@ import pytest
 from scipy import stats
 
 from harness.bench import Bench
-from harness.campaign.comparison import Difference, _worded, compare, load, permutation_p, sign_flip_p
+from harness.campaign.comparison import Difference, _worded, compare, load, matched, permutation_p, sign_flip_p
 from harness.campaign.spec import rig_table
 from harness.campaign.trial import Count, Row
 from harness.campaign.workers import Processes, ThisProcess
@@ -68,7 +68,7 @@ class Coin:
 
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
         for task in tasks:
-            yield task, Count(int(self._rng.binomial(100, self._rate)), 100 + 150)
+            yield task, Count(int(self._rng.binomial(100, self._rate)), 100)
 
 
 def outcomes(rate: float, n: int, **settings: Any) -> list[Certificate]:
@@ -104,12 +104,12 @@ class LastFirst:
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
         while True:
             for task in reversed(list(itertools.islice(tasks, 5))):
-                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)
+                yield task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100)
 
 
 class InTurn:
     def play(self, _: Any, tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
-        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100 + 150)) for task in tasks)
+        return ((task, Count(int(np.random.default_rng(task).binomial(100, 0.03)), 100)) for task in tasks)
 
 
 def test_answer_does_not_depend_on_the_workers() -> None:
@@ -138,6 +138,41 @@ def test_scenario_with_changes_cannot_be_certified() -> None:
         question_of(
             rig_table("emulator"), describe("inproc").as_table(), Scenario.load("thesis"), far=1e-5, confidence=0.9
         )
+
+
+@pytest.mark.parametrize("way", [[], ["--sequential"], ["--dut", "host"]])
+def test_device_that_is_not_excited_is_not_certified_by_its_silence(
+    way: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Edges of 0.1 mV, where a code is 4.9 mV, over less than the 1000 samples after which the device calls it idle."""
+    still = tmp_path / "still.toml"
+    still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
+    options = ["--far", "0.03", "--confidence", "0.9", "--allowed", "0", "--scenario", str(still), "--workers", "1"]
+    assert main(["certify", "--dut", "inproc", *options, *way]) == 3
+    assert "INCONCLUSIVE\n  seed 0: the trigger was armed in 0 of" in capsys.readouterr().out
+
+
+def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_elsewhere() -> None:
+    """Displacements beyond the card's range of 4 V: most samples are missing, and the scenario allows a quarter."""
+    rig = dict(rig_table("emulator"))
+    rig["card"] = {**rig["card"], "range_v": {**rig["card"]["range_v"], "displacement": [-1.0, 1.0]}}
+    found = []
+    for device in ("inproc", "host"):
+        table = describe(device).as_table()
+        question = question_of(rig, table, Scenario.load("healthy"), far=5e-3, confidence=0.9, allowed=0)
+        found.append(certify(question, ThisProcess()))
+    assert found[0] == found[1]
+    assert found[0].outcome == "inconclusive"
+    assert "samples were clipped and missing for the device, more than the 25%" in found[0].reason
+
+
+@pytest.mark.parametrize(("dut", "far"), [("inproc", "1e-300"), ("inproc", "1e-13"), ("host", "4e-11")])
+def test_length_that_nobody_would_live_to_see_is_refused(
+    dut: str, far: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At 99.9 %, with at most 5 alarms, 16.455 / far samples."""
+    assert main(["certify", "--dut", dut, "--far", far]) == 2
+    assert f"far = {float(far):g} takes {16.455 / float(far):.2g} samples, and in a year" in capsys.readouterr().err
 
 
 def test_command_tells_outcome_by_its_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,7 +214,8 @@ def observed(
     seed: int, latency_n: int | None, *, false_alarms: int = 0, cell: str = "a", theta: str = "0"
 ) -> tuple[tuple[object, ...], Row]:
     change = [latency_n, 3, latency_n is None, False]
-    row = {"seed": seed, "outcome": "passed", "samples": 1000, "false_alarms": false_alarms, "changes": [change]}
+    counts = {"samples": 1000, "armed": 850, "false_alarms": false_alarms}
+    row = {"seed": seed, "outcome": "passed", **counts, "changes": [change]}
     return (cell, seed), {**row, "errors": [0.01, 0.02, 0.03], "theta": theta}
 
 
@@ -255,8 +291,8 @@ def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_pa
         for factor in (0.7, 0.9):
             drawn = dataclasses.replace(scenario, tweaks=(Tweak(400, stiffness_n_per_m=24500.0 * factor),))
             Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
-    assert len(dict(load(tmp_path / "both"))) == 2
-    found = compare(load(tmp_path / "both" / "0.7"), load(tmp_path / "both" / "0.9"))
+    assert len(dict(load(tmp_path / "both").trials)) == 2
+    found = compare(load(tmp_path / "both" / "0.7").trials, load(tmp_path / "both" / "0.9").trials)
     assert found.identical == (0, 0)
 
 
@@ -284,7 +320,7 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for seed in range(2):
             Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
-    assert [(key[1], key[2]) for key, _ in load(tmp_path / "a")] == [("emulator", 0), ("emulator", 1)]
+    assert [(key[1], key[2]) for key, _ in load(tmp_path / "a").trials] == [("emulator", 0), ("emulator", 1)]
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["identical"] == [1, 1]
@@ -292,6 +328,97 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
     with pytest.raises(RecordingError, match="empty: holds no valid trial"):
         load(tmp_path / "empty")
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "absent.json")]) == 2
+
+
+CAMPAIGN = """
+name = "mine"
+trials = 3
+samples = 700
+change_at = 500
+devices = [DEVICES]
+[grid]
+stiffness_factor = [0.8, 0.9]
+"""
+
+
+def campaign(tmp_path: Path, name: str, *changes: tuple[str, str]) -> str:
+    """Plays CAMPAIGN with these changes of its words; the file of its results."""
+    spec = CAMPAIGN
+    for old, new in changes:
+        assert spec.count(old) == 1
+        spec = spec.replace(old, new)
+    (tmp_path / f"{name}.toml").write_text(spec)
+    out = str(tmp_path / f"{name}.json")
+    assert main(["campaign", str(tmp_path / f"{name}.toml"), "--out", out, "--workers", "1"]) in (0, 1)
+    return out
+
+
+@pytest.fixture
+def own_devices(tmp_path: Path) -> list[str]:
+    """Two within this process that differ in their settings."""
+    for name, arl0 in (("keen", 1e3), ("calm", 1e6)):
+        (tmp_path / f"{name}.toml").write_text(f'kind = "inproc"\n[estimator]\narl0 = {arl0}\n')
+    return [str(tmp_path / f"{name}.toml") for name in ("keen", "calm")]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("[0.8, 0.9]", "[0.7, 0.9]"), "grid.stiffness_factor[0] is 0.8 in A and 0.7 in B"),
+        (("trials = 3", "trials = 4"), "trials is 3 in A and 4 in B"),
+        (("trials = 3", "trials = 3\nfirst_seed = 9"), "first_seed is 0 in A and 9 in B"),
+        (("samples = 700", "samples = 701"), "scenario.samples is 700 in A and 701 in B"),
+        (
+            ("trials = 3", "trials = 3\nrigs = ['emulator-skewed']"),
+            "rigs[0].card.model is 'ideal' in A and 'skewed' in B",
+        ),
+        (("stiffness_factor", "noise_lsb = [1.5]\nstiffness_factor"), "grid.noise_lsb is [] in A and [1.5] in B"),
+    ],
+)
+def test_campaigns_that_played_something_else_are_not_compared(
+    change: tuple[str, str], named: str, tmp_path: Path, own_devices: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    devices = ("DEVICES", repr(own_devices[0]))
+    a, b = campaign(tmp_path, "a", devices), campaign(tmp_path, "b", devices, change)
+    assert main(["compare", a, b]) == 2
+    said = capsys.readouterr().err
+    assert "A and B are different campaigns: " in said
+    assert named in said
+    assert said.count("\n") == 1
+
+
+def test_campaigns_that_differ_in_device_name_and_chunk_are_compared(
+    tmp_path: Path, own_devices: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    a = campaign(tmp_path, "a", ("DEVICES", repr(own_devices[0])))
+    b = campaign(
+        tmp_path, "b", ("DEVICES", repr(own_devices[1])), ("mine", "other"), ("trials = 3", "trials = 3\nchunk = 1")
+    )
+    capsys.readouterr()
+    assert main(["compare", a, b, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["trials"] == [6, 6]
+    assert said["identical"][1] == 6
+
+
+def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own_devices: list[str]) -> None:
+    keen, calm = own_devices
+    a = campaign(tmp_path, "a", ("DEVICES", f"{keen!r}, {calm!r}"))
+    b = campaign(tmp_path, "b", ("DEVICES", f"{calm!r}, {keen!r}"))
+    found = compare(*matched(load(Path(a)), load(Path(b))))
+    assert found.identical == (12, 12)
+    assert not any(each.shown for each in found.differences)
+
+
+def test_recordings_that_have_no_play_in_common_are_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        for name, samples in (("a", 700), ("b", 710)):
+            Bench(rig, dut).play(dataclasses.replace(scenario, samples=samples), 0).save(tmp_path / name / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    assert "A and B played nothing in common: scenario.samples is 700 in A and 710 in B" in capsys.readouterr().err
 
 
 def test_trials_that_were_inconclusive_on_one_side_alone_are_no_pass(

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any, Self
 
 import numpy as np
 import pytest
 
-from emulator import Excitation, SuspensionComputer
-from emulator.opamp import preset
-from harness.errors import ConfigurationError, RecordIncomplete, RigError
+from emulator import Excitation
+from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
 from harness.rigs.description import open_rig
 from harness.rigs.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
 from harness.scenario import Scenario
+from tests.harness.ni_stand_in import Card, DaqError, Error, library
 
 RIG = """\
 [rig.bench]
@@ -31,93 +28,13 @@ self_test = false
 SCENARIO = Scenario(400, Excitation(low_v=0.1, high_v=9.0, phase=0.3), name="short")
 
 
-class Error(Exception):
-    """The root of nidaqmx's errors, of which one is raised where NI's driver is not installed."""
-
-
-class DaqError(Error):
-    """Many lines."""
-
-
-class Card:
-    """What the tasks of the stand-in act on: ao0 goes to an ideal computer, ai0 and ai1 see force and displacement."""
-
-    def __init__(self) -> None:
-        self.done: list[tuple[Any, ...]] = []
-        self.output_v = 0.0
-        self.levels: list[float] = []
-        self.lost_n = 0
-        self.failing = ""
-
-    def measured(self, levels: list[float], samples: int) -> list[list[float]]:
-        played = _Played(np.array(levels))
-        computer = SuspensionComputer("front", opamp=preset("ideal"), sample_rate_hz=20e3)
-        volts = np.concatenate(list(computer.play(played, samples)))
-        kept: list[list[float]] = volts[: samples - self.lost_n, :2].T.tolist()
-        return kept
-
-
-class _Played(Excitation):
-    """An excitation that is whatever was written to the card."""
-
-    def __init__(self, levels: np.ndarray) -> None:
-        super().__init__()
-        object.__setattr__(self, "levels", levels)
-
-    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Any:  # noqa: ARG002 - as its base
-        from emulator.excitation import TICKS_PER_SAMPLE, Edges
-
-        each = TICKS_PER_SAMPLE // LEVELS_PER_SAMPLE
-        first, last = -(-start_tick // each), -(-stop_tick // each)
-        at = np.arange(first, min(last, len(self.levels)))  # type: ignore[attr-defined]
-        return Edges(at * each, self.levels[at])  # type: ignore[attr-defined]
-
-
-def library(card: Card) -> ModuleType:
-    class Task:
-        def __init__(self) -> None:
-            self.ao_channels = SimpleNamespace(add_ao_voltage_chan=self.add("ao"))
-            self.ai_channels = SimpleNamespace(add_ai_voltage_chan=self.add("ai"))
-            self.timing = SimpleNamespace(cfg_samp_clk_timing=self.add("clock"))
-            trigger = SimpleNamespace(cfg_dig_edge_start_trig=self.add("trigger"))
-            self.triggers = SimpleNamespace(start_trigger=trigger)
-
-        def add(self, what: str) -> Any:
-            return lambda *args, **kwargs: card.done.append((what, *args, *kwargs.values()))
-
-        def __enter__(self) -> Self:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def start(self) -> None:
-            if card.failing:
-                raise DaqError(f"{card.failing}\nDevice: Dev1\nStatus Code: -200088")
-
-        def write(self, data: Any, **_: Any) -> None:
-            if isinstance(data, float):
-                card.output_v = data
-            else:
-                card.levels, card.output_v = data, data[-1]
-
-        def read(self, number_of_samples_per_channel: int, timeout: float) -> Any:
-            assert timeout > number_of_samples_per_channel / 20e3
-            return card.measured(card.levels, number_of_samples_per_channel)
-
-    module = ModuleType("nidaqmx")
-    constants = SimpleNamespace(AcquisitionType=SimpleNamespace(FINITE="finite"))
-    vars(module).update(Task=Task, errors=SimpleNamespace(Error=Error), constants=constants)
-    return module
-
-
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Card:
     standing_in = Card()
     module = library(standing_in)
     monkeypatch.setitem(sys.modules, "nidaqmx", module)
-    monkeypatch.setitem(sys.modules, "nidaqmx.errors", module.errors)
-    monkeypatch.setitem(sys.modules, "nidaqmx.constants", module.constants)
+    for part in ("errors", "constants", "stream_readers"):
+        monkeypatch.setitem(sys.modules, f"nidaqmx.{part}", getattr(module, part))
     return standing_in
 
 
@@ -141,6 +58,7 @@ def test_signals_are_those_of_the_emulated_rig(card: Card, rigs_file: str) -> No
 def test_output_and_inputs_run_on_one_clock_and_begin_together(card: Card) -> None:
     instrument = NiDaqmx(library(card), "Dev1", 1.0)
     instrument.set_inputs([(2, "10V"), (3, "5V")])
+    instrument.set_excitation(SCENARIO.excitation)
     card.done.clear()
     instrument.record(100)
     assert ("ao", "Dev1/ao0", -10.0, 10.0) in card.done
@@ -159,18 +77,51 @@ def test_levels_hold_from_each_edge_on() -> None:
     assert np.flatnonzero(np.diff(between)).tolist() == [LEVELS_PER_SAMPLE * 3 // 2 - 1]
 
 
-def test_error_of_the_card_is_one_line_and_the_output_is_left_at_0_v(card: Card, rigs_file: str) -> None:
-    card.failing = "Device identifier is invalid."
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (-200284, RigTimeout),  # samples not yet available
+        (-200560, RigTimeout),  # wait until done
+        (-200220, RigClosed),  # invalid device
+        (-201003, RigClosed),  # cannot be accessed
+        (-200077, RigRefused),  # a value is not supported
+    ],
+)
+def test_error_of_the_card_is_one_line_of_its_kind_and_the_output_is_left_at_0_v(
+    code: int, kind: type[RigError], card: Card, rigs_file: str
+) -> None:
+    card.failing = DaqError(f"It does not go.\nDevice: Dev1\nStatus Code: {code}", code)
     with open_rig(rigs_file) as rig, pytest.raises(RigError) as caught:
         list(rig.perform(SCENARIO, 1).blocks)
-    assert str(caught.value) == "instrument Dev1: the record: Device identifier is invalid."
+    assert type(caught.value) is kind
+    assert str(caught.value) == "instrument Dev1: the record: It does not go."
     assert card.output_v == 0.0
+
+
+def test_without_the_driver_of_ni_the_rig_cannot_be_had(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_task() -> None:
+        raise Error("Could not find an installation of NI-DAQmx.")
+
+    module = library(card)
+    monkeypatch.setattr(module, "Task", no_task)
+    with pytest.raises(ConfigurationError, match="instrument Dev1: 0 V at ao0: Could not find an installation"):
+        NiDaqmx(module, "Dev1", 1.0)
 
 
 def test_record_that_is_too_short_is_an_error(card: Card, rigs_file: str) -> None:
     card.lost_n = 5
     with open_rig(rigs_file) as rig, pytest.raises(RecordIncomplete, match="395 of 400 samples"):
         list(rig.perform(SCENARIO, 1).blocks)
+
+
+def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A card that gives its 12 bits at the upper end of 16 would else be read 16 times too large, and clip unseen."""
+    instrument = NiDaqmx(library(card), "Dev1", 1.0)
+    instrument.set_inputs([(0, "10V"), (1, "10V")])
+    instrument.set_excitation(SCENARIO.excitation)
+    monkeypatch.setattr("harness.rigs.ni_daqmx._bits", lambda _: 12)
+    with pytest.raises(RigError, match=r"instrument Dev1: gave the code \d+, which its 12 bits do not have"):
+        instrument.record(100)
 
 
 def test_rig_tests_itself_well(card: Card, rigs_file: str) -> None:
@@ -189,10 +140,3 @@ def test_without_the_package_the_line_that_installs_it_is_named(
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
     with open_rig(rigs_file) as rig, pytest.raises(ConfigurationError, match=r"pip install 'analogrig\[nidaqmx\]'"):
         next(rig.perform(SCENARIO, 1).blocks)
-
-
-def test_driver_is_found_by_its_scheme() -> None:
-    from harness.rigs.instrument import INSTRUMENTS, driver
-
-    for scheme, (module, name) in INSTRUMENTS.items():
-        assert driver(f"{scheme}://somewhere") is getattr(importlib.import_module(module), name)

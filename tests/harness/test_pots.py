@@ -54,6 +54,10 @@ def opened(**table: Any) -> Pots:
         ({"kind": "command", "arguments": ["{pot} {dial}"], "timeout_s": 0}, "timeout_s must be more than 0"),
         ({"kind": "command", "arguments": ["{pot} {dial}"], "steps": 1}, "steps must be 2 to"),
         ({"kind": "serial", "line": "{pot} {dial}"}, "the key 'url' is lacking"),
+        (
+            {"kind": "serial", "line": "{pot} {dial}", "url": "nosuch://x"},
+            "url nosuch://x: invalid URL, protocol 'nosuch' not known",
+        ),
         ({"kind": "serial", "url": "/dev/null", "line": "{pot}"}, "line must have {pot}, and {dial} or {step}, in it"),
         (
             {"kind": "serial", "url": "/dev/null", "line": "{pot} {dial}", "reply": "{ok}"},
@@ -97,7 +101,6 @@ def test_command_is_given_each_pot_and_its_dial(tmp_path: Path) -> None:
     pots = opened(
         kind="command", arguments=[*script(tmp_path, ""), "--pot={pot}", "{dial}", "{step}"], names={"K": "2"}
     )
-    assert not pots.exact
     pots.settle(DIALS, WORDS)
     pots.turn({"K": 1.0}, WORDS)
     assert calls(tmp_path) == [

@@ -15,7 +15,7 @@ from emulator import COMPONENTS, Excitation, SuspensionComputer
 from harness import config
 from harness.bench import Bench
 from harness.dut import open_dut
-from harness.rigs.instrument import Recorded, Turn
+from harness.rigs.instrument import Instrument, Taken
 from harness.rigs.ni_daqmx import NiDaqmx
 from harness.rigs.real import RealRig
 from harness.rigs.wiring import RealDescription
@@ -37,7 +37,7 @@ class CardAndComputer(NiDaqmx):
     """A card of 16 bits at a computer of real components, whose pots go where the command says."""
 
     def __init__(self, said: Path) -> None:
-        self.name = "card"
+        Instrument.__init__(self, "card")
         self._said = said
         self._computer = SuspensionComputer(
             "front", rng=np.random.default_rng(1), components=dataclasses.replace(COMPONENTS["polyester"], seed=1)
@@ -50,10 +50,8 @@ class CardAndComputer(NiDaqmx):
     def set_excitation(self, excitation: Excitation) -> None:
         self._excitation = excitation
 
-    def record(
-        self, samples: int, turns: Sequence[Turn] = (), while_recording: Callable[[], None] | None = None
-    ) -> Recorded:
-        assert not turns and while_recording is not None
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:
+        assert while_recording is not None
         standing = len(self._heard())
         while_recording()
         self._computer.machine.turn(dict(self._heard()[:standing]))
@@ -64,9 +62,9 @@ class CardAndComputer(NiDaqmx):
             if (turned := due.get(len(taken) * BLOCK_N - 1)) is not None:
                 self._computer.machine.turn(dict([turned]))
         volts = np.concatenate(taken)[:, :2]
-        lsb_v = 20.0 / (1 << self.bits)
-        codes = np.rint((volts + 10.0) / lsb_v + self._noise.normal(size=volts.shape))
-        return Recorded(codes * lsb_v - 10.0, np.zeros(volts.shape, bool))
+        lsb_v = 20.0 / (1 << self.datasheet.bits)
+        codes = np.rint(volts / lsb_v + self._noise.normal(size=volts.shape)).astype(np.int64)
+        return Taken(np.asarray(codes * lsb_v, np.float64), codes, self.datasheet.bits)
 
     def _heard(self) -> list[tuple[str, float]]:
         """What the command was told, in order."""

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
+from emulator.excitation import Excitation
 from harness import cli
+from harness.bench import Bench
+from harness.devices import host_child
+from harness.dut import open_dut
+from harness.rigs.description import open_rig
+from harness.scenario import Scenario
+from tests.harness.firmware import needs_firmware
+from tests.harness.processes import ends
 
 SHORT = """\
 samples = 400
@@ -50,6 +61,13 @@ def run(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     return user.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:xdist", *arguments)
 
 
+def refused(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
+    """A run that ends before anything heavy is asked for, and so may be one in this process."""
+    result = user.runpytest_inprocess("-p", "no:cacheprovider", *arguments)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    return result
+
+
 def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]:
     """Those of the first test case."""
     case = ET.parse(user.path / file).getroot().find(".//testcase")  # noqa: S314 - written a moment ago
@@ -71,47 +89,118 @@ def test_play_of_a_scenario_is_a_test_and_junit_knows_its_figures(user: pytest.P
     assert told["overruns"] == "0"
 
 
-def test_option_is_taken_from_command_line_then_environment_then_ini(
+LEVELS = {
+    "default": ("emulator", "host", "None", "build/runs", "ci"),
+    "ini": ("emulator-ideal", "inproc", "of_ini", "runs/ini", "soak"),
+    "environment": ("emulator-0-10v", "any-edges", "of_environment", "runs/environment", "nightly"),
+    "command line": ("emulator-skewed", "inproc?exchange=block", "of_command_line", "runs/command_line", "ci"),
+    "indirect": ("emulator-real", "mean-between-faults", "of_indirect", "runs/indirect", "soak"),
+}
+NAMES = ("rig", "dut", "scenario_dir", "runs_dir", "hil_profile")
+TELLS_ALL = """
+import pytest
+
+def test_it(rig, dut, scenario_dir, runs_dir, hil_profile):
+    print("<", rig.description()["name"], dut.name, scenario_dir, runs_dir, hil_profile, ">")
+"""
+
+
+def test_each_option_is_taken_from_parameter_then_command_line_then_environment_then_ini(
     user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    user.makepyfile("def test_it(hil_profile, runs_dir):\n    print(f'<{hil_profile} {runs_dir}>')")
-    run(user, "-s").stdout.fnmatch_lines(["*<ci build/runs>*"])
-    user.makeini("[pytest]\nanalogrig_hil_profile = soak\nanalogrig_runs_dir = a")
-    run(user, "-s").stdout.fnmatch_lines(["*<soak a>*"])
-    monkeypatch.setenv("ANALOGRIG_HIL_PROFILE", "nightly")
-    run(user, "-s").stdout.fnmatch_lines(["*<nightly a>*"])
-    run(user, "-s", "--hil-profile", "ci").stdout.fnmatch_lines(["*<ci a>*"])
+    path = user.makepyfile(TELLS_ALL)
+    told: dict[str, tuple[str, ...]] = {}
+
+    def tell(level: str, *arguments: str) -> None:
+        (line,) = [line for line in run(user, "-s", path.name, *arguments).outlines if "<" in line]
+        told[level] = tuple(line.partition("< ")[2].removesuffix(" >").split())
+
+    for _, _, folder, *_ in LEVELS.values():
+        user.mkdir(folder)
+    tell("default")
+    options = [f"analogrig_{name} = {value}" for name, value in zip(NAMES, LEVELS["ini"], strict=True)]
+    user.makeini("\n".join(["[pytest]", *options]))
+    tell("ini")
+    for name, value in zip(NAMES, LEVELS["environment"], strict=True):
+        monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
+    tell("environment")
+    given = [f"--{name.replace('_', '-')}={value}" for name, value in zip(NAMES, LEVELS["command line"], strict=True)]
+    tell("command line", *given)
+    of_parameters = [
+        f'@pytest.mark.parametrize("{name}", ["{value}"], indirect=True)\n'
+        for name, value in zip(NAMES, LEVELS["indirect"], strict=True)
+    ]
+    path.write_text(TELLS_ALL.replace("def test_it", "".join(of_parameters) + "def test_it"))
+    tell("indirect", *given)
+    assert told == LEVELS
 
 
-def test_indirect_parametrization_of_a_fixture_comes_first(user: pytest.Pytester) -> None:
-    user.makepyfile(
-        """
-        import pytest
-
-        @pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
-        @pytest.mark.parametrize("dut", ["inproc"], indirect=True)
-        def test_it(bench):
-            assert bench.rig.description()["name"] == "emulator-ideal"
-            assert bench.dut.name == "inproc"
-        """
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("hil_profile", "tea", "must be one of ci, nightly, soak, not 'tea'"),
+        ("scenario_dir", "nowhere", "nowhere is no folder"),
+        ("runs_dir", "short.toml/runs", "short.toml is no folder"),
+    ],
+)
+def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, name: str, value: str, complaint: str
+) -> None:
+    path = user.makepyfile(
+        "import pytest\n\n"
+        f"@pytest.mark.parametrize({name!r}, [{value!r}], indirect=True)\ndef test_it({name}):\n    pass\n"
     )
-    run(user, "--rig", "no-such-rig", "--dut", "no-such-device").assert_outcomes(passed=1)
+    result = user.runpytest_inprocess("-p", "no:cacheprovider", path.name)
+    result.stdout.fnmatch_lines([f"parameter {name} of *::test_it*: {complaint}"])
+    user.makeini(f"[pytest]\nanalogrig_{name} = {value}")
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: *tox.ini: analogrig_{name}: {complaint}"])
+    monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: ANALOGRIG_{name.upper()}: {complaint}"])
+    flag = f"--{name.replace('_', '-')}"
+    refused(user, path.name, f"{flag}={value}").stderr.fnmatch_lines([f"ERROR: {flag}: {complaint}"])
 
 
-def test_profile_that_does_not_exist_is_a_usage_error_in_one_line(user: pytest.Pytester) -> None:
-    result = run(user, "--hil-profile", "tea")
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
-    result.stderr.fnmatch_lines(["*--hil-profile: must be one of ci, nightly, soak, not 'tea'*"])
+def test_rig_or_device_that_does_not_exist_fails_in_one_line_with_who_named_it(
+    user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user.makepyfile("def test_rig(rig):\n    pass\n\ndef test_device(dut):\n    pass\n")
+    monkeypatch.setenv("ANALOGRIG_DUT", "no-such")
+    result = run(user, "--rig", "none")
+    result.assert_outcomes(errors=2)
+    result.stdout.fnmatch_lines(
+        ["--rig: no rig is called 'none': *", "ANALOGRIG_DUT: no device is called 'no-such': *"]
+    )
+    assert "Traceback" not in result.stdout.str()
+    assert "another exception" not in result.stdout.str()
 
 
 def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) -> None:
     user.makepyfile(
-        "import pytest\n\n@pytest.mark.needs('tweak', 'fly')\ndef test_it(rig):\n    pass\n\n"
-        "@pytest.mark.needs('tweak')\ndef test_other(rig):\n    pass\n"
+        """
+        import pytest
+
+        @pytest.mark.needs("excite", "tweak")
+        @pytest.mark.parametrize("rig", ["emulator", "recording:RECORDED"], indirect=True)
+        def test_it(rig):
+            pass
+        """.replace("RECORDED", str(recorded(user.path)))
     )
     result = run(user, "-rs")
     result.assert_outcomes(passed=1, skipped=1)
-    result.stdout.fnmatch_lines(["*rig emulator cannot fly (it can excite, tweak)*"])
+    result.stdout.fnmatch_lines(["*rig recording:*run.npz cannot excite and tweak (it can nothing but play)*"])
+
+
+def recorded(folder: Path) -> Path:
+    with open_rig("emulator") as rig, open_dut("inproc") as dut:
+        Bench(rig, dut).play(Scenario(10, Excitation(), name="ten"), 1).save(folder / "run.npz")
+    return folder / "run.npz"
+
+
+def test_need_that_no_rig_knows_ends_the_collection_in_one_line_with_those_known(user: pytest.Pytester) -> None:
+    user.makepyfile("import pytest\n\n@pytest.mark.needs('twaek')\ndef test_it(rig):\n    pass\n")
+    result = refused(user)
+    result.stderr.fnmatch_lines(["ERROR: *::test_it: needs: no rig is known to 'twaek': there are excite, tweak"])
+    assert len(result.errlines) <= 2
 
 
 def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
@@ -202,25 +291,70 @@ def test_inconclusive_play_fails_the_test_with_its_reason(user: pytest.Pytester)
     result.stdout.fnmatch_lines(["*INCONCLUSIVE: device deaf: no estimate for sample *"])
 
 
-def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Pytester) -> None:
+@pytest.mark.parametrize("dut", ["host", pytest.param("qemu-m4", marks=needs_firmware)])
+def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Pytester, dut: str) -> None:
     user.makepyfile(
-        """
+        f"""
+        import os, signal, sys
+
+        sys.path.append({str(Path(__file__).parents[2])!r})
+        from tests.harness.processes import descendants
+
         def test_first(play, dut):
             dut.configure(dut.estimator.__class__(warm_up_n=33))
-            dut.close()
+            device = descendants(os.getpid())[-1]
+            os.kill(device, signal.SIGSTOP)
+            print("<stopped", device, ">")
+            play("short.toml")
 
         def test_second(play, dut):
             assert dut.estimator.warm_up_n != 33
             assert play("short.toml").detects()
         """
     )
-    run(user, "--dut", "host").assert_outcomes(passed=2)
+    result = run(user, "--dut", dut, "-rA")
+    result.assert_outcomes(failed=1, passed=1)
+    result.stdout.fnmatch_lines([f"device {dut}: no * within 2 s *"])
+    (stopped,) = re.findall("<stopped ([0-9]+) >", result.stdout.str())
+    assert ends(int(stopped))
 
 
-def test_device_elsewhere_belongs_to_one_worker(user: pytest.Pytester) -> None:
-    user.makepyfile("import pytest\n\n@pytest.mark.parametrize('n', range(4))\ndef test_it(n, dut):\n    pass\n")
-    result = user.runpytest_subprocess("-n", "2", "--dist", "load", "--dut", "serial:/dev/null")
-    result.stdout.fnmatch_lines(["*device serial:/dev/null: one worker owns it*"])
+SHARED = """
+import os, pytest
+
+@pytest.mark.parametrize("n", range(4))
+def test_on_the_device(n, dut):
+    assert dut.handshake()
+    print(f"<{os.environ['PYTEST_XDIST_WORKER']}>")
+
+@pytest.mark.parametrize("n", range(4))
+def test_without(n):
+    pass
+"""
+
+
+def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pytester) -> None:
+    user.makepyfile(SHARED)
+    with board() as port:
+        result = user.runpytest_subprocess("-n", "2", "--dut", f"serial:{port}", "-rP")
+    result.assert_outcomes(passed=8)
+    assert len({line for line in result.outlines if re.fullmatch(r"<gw\d>", line)}) == 1
+
+
+def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
+    user.makepyfile(SHARED)
+    result = refused(user, "-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
+    result.stderr.fnmatch_lines(["ERROR: device serial:/dev/null: one worker owns it, and --dist loadfile may not: *"])
+
+
+@contextlib.contextmanager
+def board() -> Iterator[str]:
+    """A board at a serial port."""
+    child = host_child()
+    try:
+        yield child.first_line()
+    finally:
+        child.end()
 
 
 def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
@@ -232,3 +366,123 @@ def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment, cwd="/"
     )
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+# ------------------------------------------------------------------------------------------------ folder of what failed
+
+
+DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
+
+
+def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
+    """What an earlier session has left, as a suite."""
+    return run(user, "--scenario-dir", "build/runs", *arguments)
+
+
+def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(user: pytest.Pytester) -> None:
+    user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 40.0\n')
+    user.makepyfile(DETECTS_SOON.format(within=1.5))
+    first = run(user, "--dut", "deafer.toml")
+    first.assert_outcomes(failed=1)
+    first.stdout.fnmatch_lines(["judge it again with: pytest --scenario-dir *"])
+    (left,) = user.path.glob("build/runs/*/scenario.toml")
+    statement = tomllib.loads(left.read_text())["statement"]
+    assert statement["name"] == "detects"
+    assert statement["limits"] == {"within": 1.5}
+    assert statement["test"].endswith("::test_it")
+    result = again(user)  # the scenario's [expect] alone would pass
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*scenario.toml: K at 300: * samples, allowed *"])
+    assert len(list(user.path.glob("build/runs/*"))) == 1, "one more of the same"
+    again(user, "--dut", "inproc").assert_outcomes(passed=1)
+
+
+def test_property_that_failed_with_every_seed_fails_again_only_if_it_does_with_every_seed(
+    user: pytest.Pytester,
+) -> None:
+    user.makepyfile(
+        """
+        from harness.properties import with_some_seed
+
+        def test_it(play):
+            assert with_some_seed(play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
+        """
+    )
+    run(user, "--dut", "inproc").assert_outcomes(failed=1)
+    (left,) = user.path.glob("build/runs/*/scenario.toml")
+    table = tomllib.loads(left.read_text())
+    assert (table["seed"], table["statement"]["tries"]) == (7, 3)
+    again(user).assert_outcomes(failed=1)
+    left.write_text(left.read_text().replace("tries = 3", "tries = 3000").replace("1e-05", "2e-3"))
+    again(user).assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize(
+    ("told", "complaint"),
+    [
+        ('name = "no_such"', "statement: name: there is none that is called 'no_such': there are *detects*"),
+        (
+            'name = "detects"\n[statement.limits]\nwihtin = 1.0',
+            "statement: limits: unknown key 'wihtin' (known: within)",
+        ),
+        ('name = "estimates"', "statement: limits: the key 'within' is lacking"),
+        ('name = "estimates"\nlimits.within = "x"', "statement: limits: within: must be a number *"),
+    ],
+)
+def test_statement_that_says_nothing_is_told_in_one_line(user: pytest.Pytester, told: str, complaint: str) -> None:
+    folder = user.mkdir("suite")
+    (folder / "wrong.toml").write_text(SHORT.format(head="", expect="") + f"\n[statement]\n{told}\n")
+    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines([f"*wrong.toml: {complaint.replace('[', '[[]')}"])
+
+
+def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:
+    folder = user.mkdir("suite")
+    (folder / "one.toml").write_text(SHORT.format(head='dut = "inproc:./evil.so"', expect=""))
+    result = run(user, "--scenario-dir", "suite")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*the scenario is for inproc:./evil.so, which is not opened on the word of a file: *"])
+    run(user, "--scenario-dir", "suite", "--dut", "inproc").assert_outcomes(passed=1)
+    user.makeini("[pytest]\nanalogrig_dut = inproc:./evil.so")
+    result = run(user, "--scenario-dir", "suite")
+    result.stdout.fnmatch_lines(["*evil.so*"])
+    assert "on the word of a file" not in result.stdout.str()
+
+
+FALLS_APART = """
+import pathlib, sys
+
+from hypothesis import given
+
+from harness.strategies import profile, seeds
+
+@profile()
+@given(seed=seeds())
+def test_it(play, seed):
+    found = play("short.toml", seed).estimates(within=1e-9)
+    left = sorted(pathlib.Path("build/runs").glob("*"))
+    print("<left", seed, *(path.name for path in left), ">", flush=True)
+    if left:
+        (folder,) = left
+        assert {"run.npz", "scenario.toml"} == {path.name for path in folder.iterdir()}
+        STOP
+    assert found
+"""
+
+
+def test_property_that_is_ended_while_it_shrinks_has_left_a_counterexample(user: pytest.Pytester) -> None:
+    user.makepyfile(FALLS_APART.replace("STOP", "import os; os.kill(os.getpid(), 9)"))
+    result = run(user, "-s", "--dut", "inproc")
+    assert result.ret == -9
+    again(user).assert_outcomes(failed=1)
+
+
+def test_counterexample_is_replaced_while_it_shrinks_and_ends_as_the_simplest(user: pytest.Pytester) -> None:
+    user.makepyfile(FALLS_APART.replace("STOP", "pass"))
+    result = run(user, "-s", "--dut", "inproc")
+    result.assert_outcomes(failed=1)
+    (left,) = user.path.glob("build/runs/*")
+    assert tomllib.loads((left / "scenario.toml").read_text())["seed"] == 0
+    assert (left / "report.html").is_file()
+    assert [path.name for path in left.parent.iterdir()] == [left.name], "something is left besides"

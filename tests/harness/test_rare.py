@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +15,7 @@ import pytest
 from harness import rare
 from harness.campaign.spec import rig_table
 from harness.campaign.workers import Processes, ThisProcess
-from harness.certificate import certify, question_of
+from harness.certificate import certify, estimate_once, question_of
 from harness.cli import main
 from harness.devices import DeviceDescription, describe
 from harness.errors import ConfigurationError
@@ -74,10 +77,17 @@ def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.M
     assert 1e-8 < rate < 1e-5
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer branches, within this process."""
+    monkeypatch.setattr("harness.certificate.false_alarm_rate", functools.partial(false_alarm_rate, branches=200))
+
+
+@pytest.mark.usefixtures("quick")
 def test_rig_on_which_no_branch_comes_to_an_alarm_leaves_the_answer_open() -> None:
     """Without noise there is nothing to be louder; that is no proof of silence."""
     device, ideal = describe("inproc").as_table(), rig_table("emulator-ideal")
-    answer = certify(question_of(ideal, device, HEALTHY, far=1e-5, confidence=0.99, rare=8), ThisProcess())
+    answer = certify(question_of(ideal, device, HEALTHY, far=1e-5, confidence=0.99, rare=64), ThisProcess())
     assert (answer.outcome, answer.alarms, answer.rate) == ("inconclusive", 0, (0.0, 1.0))
 
 
@@ -132,28 +142,59 @@ def asked(dut: str = "inproc", **settings: Any) -> Any:
     return question_of(rig_table("emulator"), describe(dut).as_table(), HEALTHY, **settings)
 
 
-def test_rare_rate_certifies_or_stays_open_and_does_not_depend_on_the_workers() -> None:
-    settings: dict[str, Any] = {"confidence": 0.99, "rare": 8}
-    certified = certify(asked(far=1e-5, **settings), Processes(2))
+class Remembering(ThisProcess):
+    """Plays each seed once, whatever is asked of the rate."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, Any] = {}
+
+    def play(self, work: Callable[[Any], Any], tasks: Iterator[Any]) -> Iterator[tuple[Any, Any]]:
+        for task in tasks:
+            if task not in self._known:
+                self._known[task] = work(task)
+            yield task, self._known[task]
+
+
+@pytest.mark.usefixtures("quick")
+def test_rare_rate_certifies_refutes_or_stays_open() -> None:
+    settings: dict[str, Any] = {"confidence": 0.99, "rare": 64}
+    worker = Remembering()
+    certified = certify(asked(far=1e-5, **settings), worker)
     assert certified.outcome == "certified"
     assert 1e-8 < certified.rate[0] < certified.rate[1] < 1e-6
-    assert certify(asked(far=1e-5, **settings), ThisProcess()) == certified
-    assert certify(asked(far=sum(certified.rate) / 2.0, **settings), ThisProcess()).outcome == "inconclusive"
+    assert certify(asked(far=sum(certified.rate) / 2.0, **settings), worker).outcome == "inconclusive"
+    assert certify(asked(far=1e-9, **settings), worker).outcome == "refuted"
 
 
+def test_estimates_do_not_depend_on_the_workers() -> None:
+    work = functools.partial(estimate_once, asked(far=1e-5, confidence=0.99, rare=64).as_json())
+    assert dict(Processes(2).play(work, iter(range(4)))) == dict(ThisProcess().play(work, iter(range(4))))
+
+
+@pytest.mark.usefixtures("quick")
 def test_device_whose_rare_rate_is_above_the_limit_is_refuted(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["certify", "--dut", "inproc", "--far", "1e-9", "--confidence", "0.99", "--rare", "8"]) == 1
+    options = ["--far", "1e-9", "--confidence", "0.99", "--rare", "64", "--workers", "1"]
+    assert main(["certify", "--dut", "inproc", *options]) == 1
     assert "(a rare rate): REFUTED" in capsys.readouterr().out
 
 
-def test_what_cannot_be_is_refused(tmp_path: Any) -> None:
+def test_device_that_is_not_excited_has_no_rare_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    still = tmp_path / "still.toml"
+    still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
+    options = ["--far", "1e-5", "--rare", "--workers", "1", "--scenario", str(still)]
+    assert main(["certify", "--dut", "inproc", *options]) == 3
+    assert "INCONCLUSIVE: the trigger was armed in 0 of" in capsys.readouterr().err
+
+
+def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
     other = tmp_path / "other.toml"
     other.write_text('kind = "inproc"\n[estimator]\ntrigger = "prediction-error"\nceiling = 50.0\n')
     with pytest.raises(ConfigurationError, match="for the trigger cusum, not prediction-error of other"):
-        certify(asked(str(other), far=1e-8, confidence=0.99, rare=8), ThisProcess())
+        certify(asked(str(other), far=1e-8, confidence=0.99, rare=64), ThisProcess())
     with pytest.raises(ConfigurationError, match="certify: a rare rate is estimated within this process"):
-        certify(asked("host", far=1e-8, confidence=0.99, rare=8), ThisProcess())
-    with pytest.raises(ConfigurationError, match="certify: rare must be 8 to 10000 estimates, not 3"):
-        asked(far=1e-8, confidence=0.99, rare=3)
+        certify(asked("host", far=1e-8, confidence=0.99, rare=64), ThisProcess())
+    for few in (0, 3, 63):
+        with pytest.raises(ConfigurationError, match=f"certify: rare must be 64 to 10000 estimates, not {few}"):
+            asked(far=1e-8, confidence=0.99, rare=few)
     with pytest.raises(ConfigurationError, match="certify: a rare rate is estimated, or alarms are waited for"):
-        asked(far=1e-8, confidence=0.99, rare=8, sequential=True)
+        asked(far=1e-8, confidence=0.99, rare=64, sequential=True)

@@ -12,7 +12,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,10 +20,10 @@ from emulator.excitation import Excitation
 from harness import config
 from harness.bench import Bench
 from harness.dut import open_dut
-from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigTimeout
+from harness.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
 from harness.rigs.description import described as described_rig
 from harness.rigs.description import open_rig
-from harness.rigs.instrument import Recorded, Turn
+from harness.rigs.instrument import PotBox, Turn
 from harness.rigs.real import LEAD_N, RealRig, records
 from harness.rigs.red_pitaya import RedPitaya
 from harness.rigs.rig import Performance
@@ -85,8 +84,11 @@ def test_verdicts_are_those_of_the_emulated_rig(bench: str) -> None:
             assert abs(mine.latency_n - other.latency_n) <= 2
 
 
-def test_each_play_begins_with_the_pots_of_its_scenario(bench: str) -> None:
-    with open_rig(bench) as rig:
+def test_each_play_begins_with_the_pots_of_its_scenario(ideal: Served, tmp_path: Path) -> None:
+    """Without noise all its records are the same, to the bit."""
+    file = ideal.rigs_file(tmp_path)
+    file.write_text(file.read_text().replace('range = "HV"', 'range = "HV", noise_lsb = 0.0'))
+    with open_rig(str(file)) as rig:
         first, again = (volts(rig.perform(THESIS, 1)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
@@ -158,6 +160,8 @@ FAILURES = {
     'acquisition.drop_out="hang up"': RigClosed,
     'acquisition.drop_out="silence"': RigTimeout,
     "acquisition.never_filled=true": RigTimeout,
+    "acquisition.stale_n=1": RecordStale,
+    "acquisition.triggered_early=true": RecordStale,
 }
 
 
@@ -200,24 +204,45 @@ def test_run_after_one_that_failed_is_a_good_one(tmp_path: Path) -> None:
     assert outcomes == ["inconclusive", "passed"]
 
 
-class Disobedient(RedPitaya):
-    """Does something else with the turns of a record."""
+def test_record_of_the_play_before_is_found_out(tmp_path: Path) -> None:
+    """The fourth that the instrument takes: before each of those that count there is one of rest."""
+    fourth = ("--defect", "acquisition.stale_n=2", "--defect", "acquisition.drop_out_record=4")
+    with (
+        served(*fourth) as instrument,
+        open_rig(str(instrument.rigs_file(tmp_path))) as rig,
+        open_dut("inproc") as dut,
+    ):
+        first, second, third = (judge(Bench(rig, dut).play(SHORT, 1)) for _ in range(3))
+    assert [first.outcome, second.outcome, third.outcome] == ["passed", "inconclusive", "passed"]
+    assert "the record is an old one: to the bit it has been given before" in second.reasons[0]
 
-    late_s = 0.0
 
-    def record(self, samples: int, turns: Sequence[Turn] = (), while_recording: Any = None) -> Recorded:
-        mine = [Turn(delay_s + self.late_s, pot, dial) for delay_s, pot, dial in turns] if self.late_s else []
-        return super().record(samples, mine, while_recording)
+class Disobedient:
+    """A box of pots that does something else with the turns of a record."""
+
+    def __init__(self, box: PotBox, late_s: float) -> None:
+        self.names = box.names
+        self.turn = box.turn
+        self._box, self._late_s = box, late_s
+
+    def schedule(self, turns: Sequence[Turn]) -> None:
+        late = [Turn(delay_s + self._late_s, pot, dial) for delay_s, pot, dial in turns]
+        self._box.schedule(late if self._late_s else [])
 
 
 @pytest.mark.parametrize(("late_s", "said"), [(0.0, "nothing in the samples"), (60 / 20e3, "was turned at 1260")])
 def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
-    late_s: float, said: str, bench: str, monkeypatch: pytest.MonkeyPatch
+    late_s: float, said: str, bench: str
 ) -> None:
-    monkeypatch.setattr(Disobedient, "late_s", late_s)
+    def connected(address: str, timeout_s: float) -> RedPitaya:
+        instrument = RedPitaya.open(address, timeout_s)
+        assert instrument.pots is not None
+        instrument.pots = Disobedient(instrument.pots, late_s)
+        return instrument
+
     scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])
     description = config.build(RealDescription, described_rig(bench)[0], "bench")
-    with RealRig(description, Disobedient.open) as rig, open_dut("inproc") as dut:
+    with RealRig(description, connected) as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, 1))
     assert verdict.outcome == "inconclusive"
     assert "the pot that was to be turned at sample 1200 (K 18000)" in verdict.reasons[0]
@@ -237,7 +262,7 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
             blocks = rig.perform(SHORT, 1).blocks
             with pytest.raises(FAILURES[defect], match=instrument.address):
                 next(blocks)
-        if "drop_out" not in defect:
+        if "drop_out" not in defect and "stale" not in defect:  # those are over
             verdict = judge(played(str(file), SHORT, 1))
             assert verdict.outcome == "inconclusive"
             assert instrument.address in verdict.reasons[0]
@@ -328,13 +353,13 @@ WRONG = {
     "inputs.displacement": ("inputs.velocity", "inputs must be force and displacement, not force, velocity"),
     "generator.gain = 10.0": ("generator.gain = 0.0", "gain must be within"),
     "gain = 10.0": ("gain = 10.0\ngenerator.offset_v = 50.0", "limits.force_v"),
-    "redpitaya://": ("picoscope://", "give it as redpitaya://NAME"),
+    "redpitaya://": ("picoscope://", "give it as redpitaya://HOST[:PORT] or nidaqmx://CARD"),
     "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
     "timeout_s = 2.0": ("timeout_s = 2.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
     "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
     '2, range = "HV"': ('2, range = "HV", least_v = 900.0', "inputs.displacement: 0 V at the computer must be within"),
-    "127.0.0.1:1": ("127.0.0.1:1/?timeout=1", "give it as redpitaya://NAME"),
+    "127.0.0.1:1": ("127.0.0.1:1/?timeout=1", "give it as redpitaya://HOST[:PORT]"),
     "[rig.bench]": ("[rig.bench]\nlimits.dials.M = [0.5, 2.0]", "dials.M must be"),
 }
 

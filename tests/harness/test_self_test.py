@@ -22,11 +22,10 @@ from harness.rigs.emulator import CardDescription, ComputerDescription, Emulator
 from harness.rigs.rig import Block, Performance, Rig
 from harness.run import CHANNELS
 from harness.scenario import Scenario
-from harness.self_test import checks
 from harness.self_test.conduct import self_test
 from harness.self_test.findings import Check, Findings
 from harness.self_test.response import SecondOrder
-from harness.self_test.timing import Edges, Levels, Line, averaged_n, lateness
+from harness.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))
@@ -166,9 +165,10 @@ def ranges(**changed: tuple[float, float]) -> dict[str, tuple[float, float]]:
     return {**WIDE, **changed}
 
 
-TWICE_FORCE_LSB = 2.0 * checks.MOST_OFFSET_V / (12.0 / 4096)
-TWICE_LSB = 2.0 * checks.MOST_OFFSET_V / (10.0 / 4096)
-SWING_LSB = 9.0 / (12.0 / 4096), 5.43 / (10.0 / 4096)
+FORCE_LSB_V, LSB_V = 12.0 / 4096, 10.0 / 4096
+SWING_LSB = 9.0 / FORCE_LSB_V, 5.43 / LSB_V
+# Twice and half of the limits that harness/README.md promises, section Self-test: gain of 1 % of the force and 5 %,
+# offset of 60 mV, noise of 0.2 % of the swing, skew of 0.1 sample (5 us), 50 ppm, mass of 30 %, damping of 15 %
 
 FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
     "leads swapped": (lambda: Altered(emulated(), swapped), ["identity"]),
@@ -190,25 +190,25 @@ FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
         lambda: emulated(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
         ["range use of displacement"],
     ),
-    "gain of force": (lambda: emulated(gain_error=[-2 * checks.MOST_FORCE_GAIN, 0, 0, 0]), ["gain of force"]),
-    "gain of displacement": (lambda: emulated(gain_error=[0, 2 * checks.MOST_GAIN, 0, 0]), ["gain of displacement"]),
-    "offset of force": (lambda: emulated(offset_lsb=[TWICE_FORCE_LSB, 0, 0, 0]), ["offset of force"]),
-    "offset of displacement": (lambda: emulated(offset_lsb=[0, -TWICE_LSB, 0, 0]), ["offset of displacement"]),
+    "gain of force": (lambda: emulated(gain_error=[-0.02, 0, 0, 0]), ["gain of force"]),
+    "gain of displacement": (lambda: emulated(gain_error=[0, 0.10, 0, 0]), ["gain of displacement"]),
+    "offset of force": (lambda: emulated(offset_lsb=[0.120 / FORCE_LSB_V, 0, 0, 0]), ["offset of force"]),
+    "offset of displacement": (lambda: emulated(offset_lsb=[0, -0.120 / LSB_V, 0, 0]), ["offset of displacement"]),
     "displacement late": (lambda: emulated(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
     "force late": (lambda: emulated(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
     "force noisy": (
-        lambda: Altered(emulated(), noisier("force", 2 * checks.MOST_NOISE * SWING_LSB[0])),
+        lambda: Altered(emulated(), noisier("force", 0.004 * SWING_LSB[0])),
         ["noise of force"],
     ),
     "displacement noisy": (
-        lambda: Altered(emulated(), noisier("displacement", 2 * checks.MOST_NOISE * SWING_LSB[1])),
+        lambda: Altered(emulated(), noisier("displacement", 0.004 * SWING_LSB[1])),
         ["noise of displacement"],
     ),
-    "card fast": (lambda: emulated(clock_drift_ppm=2 * checks.MOST_CLOCK_PPM), ["clock ratio"]),
-    "card slow": (lambda: emulated(clock_drift_ppm=-2 * checks.MOST_CLOCK_PPM), ["clock ratio"]),
-    "pot of M": (lambda: Altered(emulated(), play=pots(mass_kg=115.0 * (1 + 2 * checks.MOST_MASS))), ["mass"]),
+    "card fast": (lambda: emulated(clock_drift_ppm=100.0), ["clock ratio"]),
+    "card slow": (lambda: emulated(clock_drift_ppm=-100.0), ["clock ratio"]),
+    "pot of M": (lambda: Altered(emulated(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
     "pot of B": (
-        lambda: Altered(emulated(), play=pots(damping_n_s_per_m=3021.0 * (1 - 2 * checks.MOST_DAMPING))),
+        lambda: Altered(emulated(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
         ["damping"],
     ),
     "a dielectric that soaks": (lambda: Altered(emulated(), soaked), ["shape of displacement"]),
@@ -220,6 +220,18 @@ FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
 def test_one_fault_is_found_by_its_name_and_no_other(fault: str) -> None:
     rig, names = FAULTS[fault]
     assert wrong(rig()) == names
+
+
+def test_half_of_each_limit_is_well() -> None:
+    rig = emulated(
+        gain_error=[-0.005, 0.025, 0, 0],
+        offset_lsb=[0.030 / FORCE_LSB_V, -0.030 / LSB_V, 0, 0],
+        skew_s=[0.0, 2.5e-6, 0, 0],
+        clock_drift_ppm=25.0,
+        noise_lsb=0.001 * SWING_LSB[1],
+    )
+    turned = Altered(rig, play=pots(mass_kg=115.0 * 1.15, damping_n_s_per_m=3021.0 * 0.925))
+    assert self_test(turned, 1).reasons == ()
 
 
 def test_an_inverted_signal_on_a_range_of_one_sign_is_off_scale() -> None:
@@ -312,7 +324,7 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
         late_n = float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
-        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         found_n, error_n = lateness(codes, levels, edges, numbered(line, edges), 0.0)
         assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
 
@@ -323,7 +335,7 @@ def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
         line, late_n = Line(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged)
         levels = Levels.of(codes)
-        edges = Edges.of(levels.state, 0.5 * line.period_n)
+        edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         assert averaged_n(edges) == pytest.approx(averaged, abs=0.03)
         found_n, _ = lateness(codes, levels, edges, numbered(line, edges), 0.0)
         assert found_n == pytest.approx(late_n, abs=5e-3)
@@ -343,7 +355,7 @@ def square_wave(line: Line, late_n: float, averaged: float) -> Codes:
     return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
 
 
-def numbered(line: Line, edges: Edges) -> Line:
+def numbered(line: Line, edges: SeenEdges) -> Line:
     """The same line, its instants those next to the middle edge as the edges have them."""
     turns = np.rint((edges.line().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
@@ -501,18 +513,33 @@ def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.
 
 
 def test_doctor_that_cannot_tell_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """At 100 kHz a tenth of a sample is 1 us, and the computer's own amplifiers are known to half of one."""
-    path = tmp_path / "fast.toml"
-    path.write_text(RIG_FILE.format(faults="").replace("noise_lsb", "rate_hz = 100000.0\nnoise_lsb", 1))
+    """With noise of 4 LSB of 12 bits, which is within its limit, the shape is known to a ninth of its own."""
+    path = tmp_path / "noisy.toml"
+    path.write_text(RIG_FILE.format(faults="").replace("noise_lsb = 1.0", "noise_lsb = 4.0"))
     assert main(["doctor", "--rig", str(path)]) == 3
     said = capsys.readouterr().out
-    assert said.startswith("self-test of fast, program front: 1 NOT MEASURED")
-    assert "standard error would have to be at most 0.017" in said
+    assert said.startswith("self-test of noisy, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.056" in said
 
 
 def test_doctor_of_no_rig_is_a_matter_of_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--rig", "nowhere"]) == 2
     assert "no rig is called" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("late_us", [0.0, 4.0, -10.0, 10.0])
+def test_skew_of_a_fast_card_is_held_against_microseconds(late_us: float) -> None:
+    """At 60 kHz 5 us are 0.3 samples, of which the amplifiers' half a microsecond is known no better than 0.03."""
+    skew_s = [max(0.0, -1e-6 * late_us), max(0.0, 1e-6 * late_us), 0.0, 0.0]
+    check = value(self_test(emulated(rate_hz=60e3, skew_s=skew_s), 1), "skew")
+    assert check.value == pytest.approx(0.06 * (late_us + 0.625), abs=0.03)  # ideal amplifiers do not delay
+    assert check.state == ("wrong" if abs(late_us) > 5.0 else "well")
+
+
+def test_card_that_is_too_fast_for_the_self_test_is_told_so() -> None:
+    with pytest.raises(SelfTestError, match="the self-test goes up to 120750 samples/s, and the rig takes 300000"):
+        self_test(emulated(rate_hz=300e3), 1)
+    assert self_test(emulated(rate_hz=120e3), 1).well
 
 
 def test_what_cannot_be_measured_is_said() -> None:

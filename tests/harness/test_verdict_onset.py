@@ -15,7 +15,7 @@ from harness.catalogue import Change
 from harness.errors import RecordingError
 from harness.plant import Plant
 from harness.played import Played
-from harness.pytest_plugin import _latency
+from harness.pytest_plugin.playing import _latency
 from harness.report.page import render
 from harness.run import Run, Segment
 from harness.summary import summary

@@ -8,15 +8,16 @@ no sooner than it says, so that what others do meanwhile falls into the record.
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from harness.instrument.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
-from harness.instrument.scpi import ScpiError
-from harness.instrument.table import Table
 from harness.links.wire import Clock
+from harness.served.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
+from harness.served.scpi import ScpiError
+from harness.served.table import Table
 
 CLOCK_HZ = 125_000_000
 BUFFER_N = 16_384
@@ -31,6 +32,7 @@ _LOST = slice(3 * BUFFER_N // 8, 5 * BUFFER_N // 8)
 """Of a record in the middle of which the samples are lost."""
 
 MOST_PPM = 10_000.0
+MOST_STALE_N = 8
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,18 @@ class AcquisitionFaults:
     connection is closed, or nothing follows."""
     drop_out_record: int = 1
     """Which: the first is 1."""
+    stale_n: int = 0
+    """Instead of that record it hands out the one so many before, or the first."""
+    triggered_early: bool = False
+    """ACQ:TRig:STAT? says that a trigger has come as soon as it is set."""
 
     def __post_init__(self) -> None:
         if not abs(self.clock_ppm) <= MOST_PPM:
             raise ValueError(f"clock_ppm must be within +-{MOST_PPM:g}, not {self.clock_ppm:g}")
         if self.drop_out_record < 1:
             raise ValueError(f"drop_out_record must be 1 or more, not {self.drop_out_record}")
+        if not 0 <= self.stale_n <= MOST_STALE_N:
+            raise ValueError(f"stale_n must be 0 to {MOST_STALE_N}, not {self.stale_n}")
 
 
 @dataclass(frozen=True)
@@ -83,13 +91,13 @@ class Settings:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class Buffer:
     """What a trigger has left in the buffer."""
 
     codes: Codes
     """(16384, 2)"""
-    switches: tuple[str, str]
-    """With which they were taken."""
+    lsb_v: tuple[float, float]
+    """Volts per code, of each input as it was switched."""
 
 
 @dataclass
@@ -130,13 +138,15 @@ class Acquisition:
         """
         self._clock = clock
         self.settings = Settings()
-        self.record: Record | None = None
+        self.record: Buffer | None = None
         self._table = table
         self._input_faults = inputs[0]
         self._inputs = Inputs(*inputs)
         self._faults = faults
         self._doing: _Waiting | _Filling | None = None
         self._records = 0
+        self._buffers: deque[Buffer] = deque(maxlen=faults.stale_n + 1)
+        """The last ones, as they were taken."""
         self._dropped_out = False
         self._tune(self.settings.decimation)
 
@@ -166,7 +176,8 @@ class Acquisition:
     @property
     def triggered(self) -> bool:
         """What ACQ:TRig:STAT? says."""
-        return self.record is not None or isinstance(self._doing, _Filling)
+        early = self._faults.triggered_early and isinstance(self._doing, _Waiting) and self._doing.trigger != "DISABLED"
+        return early or self.record is not None or isinstance(self._doing, _Filling)
 
     @property
     def filled(self) -> bool:
@@ -284,7 +295,9 @@ class Acquisition:
             codes[MIDDLE_N:] = 0
         if self._faults.drop_out == "zeros" and self._records == self._faults.drop_out_record:
             codes[_LOST] = 0
-        self.record, self._doing = Record(codes, self.settings.switches), None
+        self._buffers.append(Buffer(codes, self._inputs.lsb_v(self.settings.switches)))
+        is_stale = self._records == self._faults.drop_out_record
+        self.record, self._doing = self._buffers[0 if is_stale else -1], None
 
     def _samples(self, count: int) -> Volts:
         return self._inputs.samples(self._table.look, count, averages=self.settings.averages)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from harness.instrument.acquisition import AcquisitionFaults
-from harness.instrument.description import InstrumentDescription
-from harness.instrument.red_pitaya import RedPitaya
-from harness.instrument.scpi import Call, Command, Response
-from harness.instrument.server import BUFFERED_BYTES, MOST_CLIENTS, Instrument, Server
-from tests.instrument.serving import LONG_S
-from tests.instrument.talk import SEQUENCE, front
+from harness.served.acquisition import AcquisitionFaults
+from harness.served.description import InstrumentDescription
+from harness.served.red_pitaya import ServedRedPitaya
+from harness.served.scpi import Call, Command, Response
+from harness.served.server import BUFFERED_BYTES, MOST_CLIENTS, Servable, Server
+from tests.served.serving import LONG_S
+from tests.served.talk import SEQUENCE, front
 
 DRIVE = "OUTPUT1:STATE ON"
 LIVE = "OUTPUT1:STATE?"
@@ -83,7 +83,7 @@ class Bench:
 
 
 @contextlib.asynccontextmanager
-async def bench(instrument: Instrument, **patience_s: float) -> AsyncIterator[Bench]:
+async def bench(instrument: Servable, **patience_s: float) -> AsyncIterator[Bench]:
     server = Server(instrument, **patience_s)
     _, port = await server.listen("127.0.0.1", 0)
     served = Bench(server, port)
@@ -95,9 +95,9 @@ async def bench(instrument: Instrument, **patience_s: float) -> AsyncIterator[Be
             await client.leave()
 
 
-def red_pitaya(faults: AcquisitionFaults | None = None) -> RedPitaya:
+def red_pitaya(faults: AcquisitionFaults | None = None) -> ServedRedPitaya:
     description = InstrumentDescription(acquisition=faults or AcquisitionFaults())
-    return RedPitaya(front, np.random.default_rng(1), description)
+    return ServedRedPitaya(front, np.random.default_rng(1), description)
 
 
 def in_time(course: Callable[[], Coroutine[Any, Any, None]]) -> None:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.instrument.scpi import MOST_ERRORS
-from tests.instrument.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
-from tests.instrument.serving import LONG_S, Served, ended, serving
-from tests.instrument.talk import SEQUENCE, asking, interpreter, record, say
+from harness.served.scpi import MOST_ERRORS
+from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
+from tests.served.serving import LONG_S, Served, ended, serving
+from tests.served.talk import SEQUENCE, asking, interpreter, record, say
 
 ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from emulator.excitation import Excitation
-from harness.instrument.scpi import ScpiError
+from harness.served.scpi import ScpiError
 
 MOST_VOLTS = 1.0
 """Of its output, either way."""

@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from harness.errors import ConfigurationError
-from harness.instrument.scpi import MOST_LINE_BYTES, Command, DropOut, Interpreter, ScpiError
+from harness.served.scpi import MOST_LINE_BYTES, Command, DropOut, Interpreter, ScpiError
 
 MOST_CLIENTS = 16
 IDLE_S = 10.0
@@ -35,7 +35,7 @@ _KEEPALIVE = ((socket.TCP_KEEPIDLE, 15), (socket.TCP_KEEPINTVL, 5), (socket.TCP_
 _log = logging.getLogger(__name__)
 
 
-class Instrument(Protocol):
+class Servable(Protocol):
     """What can be served."""
 
     @property
@@ -70,7 +70,7 @@ class _Client:
 class Server:
     """Serves one instrument; every connection has its own queue of errors."""
 
-    def __init__(self, instrument: Instrument, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S) -> None:
+    def __init__(self, instrument: Servable, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S) -> None:
         self._instrument = instrument
         self._slow_s = slow_s
         self._idle_s = idle_s

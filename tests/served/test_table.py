@@ -7,8 +7,8 @@ import pytest
 
 from emulator.errors import EmulatorError
 from emulator.excitation import Excitation
-from harness.instrument.table import AT_A_TIME_N, Booster, Stage, Table, Turn, Wiring
-from tests.instrument.talk import front
+from harness.served.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
+from tests.served.talk import front
 
 RATE_HZ = 20e3
 SQUARE = Excitation("square", 0.01, 0.99, 100.0, clock="free")
@@ -41,7 +41,7 @@ def test_a_long_look_is_played_in_parts_that_cannot_be_seen() -> None:
 def test_a_pot_turns_right_after_the_look_at_or_before_its_instant_and_in_order_of_time() -> None:
     laid = table()
     laid.generate(SQUARE)
-    laid.schedule([Turn(900 / RATE_HZ, "B", 0.8), Turn(300 / RATE_HZ, "K", 0.6), Turn(1e3, "M", 0.1)])
+    laid.schedule([DueTurn(900 / RATE_HZ, "B", 0.8), DueTurn(300 / RATE_HZ, "K", 0.6), DueTurn(1e3, "M", 0.1)])
     tweaks = ((300, {"K_dial": 0.6}), (900, {"B_dial": 0.8}))
     assert np.abs(laid.look(1500) - played(1500, tweaks)).max() < ROUNDING_V
 
@@ -67,7 +67,7 @@ def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest()
 
 
 def test_leads_have_gain_offset_and_limits_and_may_be_swapped() -> None:
-    force, displacement = Stage(gain=-0.5, offset_v=0.25), Stage(offset_v=-1.0, limits_v=(-0.5, 3.0))
+    force, displacement = Amplifier(gain=-0.5, offset_v=0.25), Amplifier(offset_v=-1.0, limits_v=(-0.5, 3.0))
     laid = table(Wiring(force=force, displacement=displacement, swapped=True))
     laid.generate(SQUARE)
     emulated = played(1000)
@@ -88,7 +88,7 @@ def test_another_rate_leaves_generator_pots_and_turns_as_they_are() -> None:
     laid = table()
     laid.generate(SQUARE)
     laid.turn("B", 0.8)
-    laid.schedule([Turn(0.04, "K", 0.6)])
+    laid.schedule([DueTurn(0.04, "K", 0.6)])
     laid.look(250)  # into the second period
     laid.look_at(2 * RATE_HZ)
     tweaks = ((0, {"B_dial": 0.8}), (1600, {"K_dial": 0.6}))
@@ -126,4 +126,4 @@ def test_a_generator_that_is_too_fast_for_the_looks_is_refused_and_goes_on_as_it
 )
 def test_a_stage_that_cannot_be_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValueError, match=field):
-        Stage(**{field: value})  # type: ignore[arg-type]
+        Amplifier(**{field: value})  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
 """Clients that no server deserves; as a program, each of them for some seconds, with what the server needed for it.
 
-    python -m tests.instrument.hostile SECONDS SEED
+    python -m tests.served.hostile SECONDS SEED
 
 A witness speaks to the server at the same time, as one who means well would.
 """
@@ -19,8 +19,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from tests.instrument.serving import Served, ended, serving
-from tests.instrument.talk import SEQUENCE
+from tests.served.serving import Served, ended, serving
+from tests.served.talk import SEQUENCE
 
 IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 MOST_GROWTH_KB = 96 * 1024

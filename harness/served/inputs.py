@@ -38,6 +38,9 @@ class InputFaults:
     gain_error: tuple[float, float] = (0.0, 0.0)
     """A fraction."""
     offset_v: tuple[float, float] = (0.0, 0.0)
+    reach: tuple[float, float] = (0.0, 0.0)
+    """By which fraction a converter takes more than its switch says. The volts that it says are right, so that its ends
+    are not at those of the range."""
     skew_s: float = 0.0
     """By so much IN2 is taken later than IN1; earlier, if it is negative."""
 
@@ -51,6 +54,9 @@ class InputFaults:
         for offset_v in self.offset_v:
             if not abs(offset_v) <= MOST_INPUT_V:
                 raise ValueError(f"offset_v must be within +-{MOST_INPUT_V:g}, not {offset_v:g}")
+        for reach in self.reach:
+            if not abs(reach) <= MOST_GAIN_ERROR:
+                raise ValueError(f"reach must be within +-{MOST_GAIN_ERROR:g}, not {reach:g}")
         if not abs(self.skew_s) <= MOST_SKEW_S:
             raise ValueError(f"skew_s must be within +-{MOST_SKEW_S:g}, not {self.skew_s:g}")
 
@@ -102,10 +108,11 @@ class Inputs:
 
     def codes(self, volts: Volts, switches: Sequence[str]) -> Codes:
         """What the converters make of samples: (n, 2), 0 for 0 V. ``switches``: the range of each channel."""
-        lsbs_v = np.array([lsb_v(switch) for switch in switches])
+        lsbs_v = np.array(self.lsb_v(switches))
+        most_v = lsbs_v * (1 << (BITS - 1))
         card = Card(
             bits=BITS,
-            ranges_v=tuple((-RANGES_V[switch], RANGES_V[switch]) for switch in switches),
+            ranges_v=tuple((-each_v, each_v) for each_v in most_v.tolist()),
             noise_lsb=tuple((self._faults.noise_v / lsbs_v).tolist()),
             gain_error=self._faults.gain_error,
             offset_lsb=tuple((self._faults.offset_v / lsbs_v).tolist()),
@@ -113,14 +120,15 @@ class Inputs:
         codes, _ = Sampler(card, self._rng).sample(volts)
         return (codes.astype(np.int32) - (1 << (BITS - 1))).astype(np.int16)
 
+    def lsb_v(self, switches: Sequence[str]) -> tuple[float, float]:
+        """Volts per code of each channel."""
+        nominal_v = [2.0 * RANGES_V[switch] / (1 << BITS) for switch in switches]
+        first_v, second_v = (each_v * (1.0 + more) for each_v, more in zip(nominal_v, self._faults.reach, strict=True))
+        return first_v, second_v
+
 
 def looks_per_sample(faults: InputFaults, sample_rate_hz: float) -> int:
     """So many that the later channel's instant is that of a look, if that can be; else it is close to one."""
     part = abs(faults.skew_s) * sample_rate_hz
     counts = range(LEAST_LOOKS, MOST_LOOKS + 1)
     return next((n for n in counts if abs(part * n - round(part * n)) < _AT_A_LOOK), MOST_LOOKS)
-
-
-def lsb_v(switch: str) -> float:
-    """Volts per code in a range."""
-    return 2.0 * RANGES_V[switch] / (1 << BITS)

@@ -9,10 +9,10 @@ from typing import Any
 
 from harness import config
 from harness.errors import ConfigurationError
-from harness.instrument.description import InstrumentDescription, left_out
-from harness.instrument.red_pitaya import RedPitaya
 from harness.links.wire import Clock
 from harness.rigs.emulator import EmulatorDescription, Stream, emulator_errors
+from harness.served.description import InstrumentDescription, left_out
+from harness.served.red_pitaya import ServedRedPitaya
 
 Keys = dict[str, Any]
 
@@ -35,7 +35,7 @@ class ServedDescription(EmulatorDescription):
             table = _merged(table, {"instrument": _parsed(defect)})
         return config.build(cls, table, str(path))
 
-    def laid(self, program: str, seed: int, clock: Clock | None = None) -> RedPitaya:
+    def laid(self, program: str, seed: int, clock: Clock | None = None) -> ServedRedPitaya:
         """The instrument, and on its table the very computer that an EmulatorRig plays on with that seed.
 
         With a ``clock`` its records take the time that they last.
@@ -47,7 +47,7 @@ class ServedDescription(EmulatorDescription):
                 described = self.instrument.beside(self.card.card())
             except ValueError as error:
                 raise ConfigurationError(f"{self.name}: card and instrument together: {error}") from error
-            return RedPitaya(
+            return ServedRedPitaya(
                 lambda rate_hz: self.computer.wired(program, seed, rate_hz),
                 Stream.CARD.generator(seed),
                 described,

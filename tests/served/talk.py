@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.suspension import SuspensionComputer
-from harness.instrument.description import InstrumentDescription
-from harness.instrument.red_pitaya import RedPitaya
-from harness.instrument.scpi import Interpreter
+from harness.served.description import InstrumentDescription
+from harness.served.red_pitaya import ServedRedPitaya
+from harness.served.scpi import Interpreter
 
 SEQUENCE = (
     "GEN:RST",
@@ -46,7 +46,7 @@ def front(rate_hz: float) -> SuspensionComputer:
 def interpreter(
     description: InstrumentDescription | None = None, computer: Callable[[float], SuspensionComputer] = front
 ) -> Interpreter:
-    return Interpreter(RedPitaya(computer, np.random.default_rng(1), description).commands)
+    return Interpreter(ServedRedPitaya(computer, np.random.default_rng(1), description).commands)
 
 
 def asking(interpreter: Interpreter) -> Ask:

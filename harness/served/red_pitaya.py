@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 
 from emulator.errors import EmulatorError
 from emulator.suspension import SuspensionComputer
-from harness.instrument.acquisition import (
+from harness.links.wire import Clock
+from harness.served.acquisition import (
     BUFFER_N,
     CLOCK_HZ,
     LARGEST_V,
@@ -42,12 +43,11 @@ from harness.instrument.acquisition import (
     Settings,
     with_switch,
 )
-from harness.instrument.description import InstrumentDescription
-from harness.instrument.generator import MOST_VOLTS, SHAPES, Generator
-from harness.instrument.inputs import RANGES_V, Codes, lsb_v
-from harness.instrument.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
-from harness.instrument.table import Table, Turn
-from harness.links.wire import Clock
+from harness.served.description import InstrumentDescription
+from harness.served.generator import MOST_VOLTS, SHAPES, Generator
+from harness.served.inputs import RANGES_V, Codes
+from harness.served.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
+from harness.served.table import DueTurn, Table
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
@@ -55,7 +55,7 @@ _ORDERS = {"BEND": ">", "LEND": "<"}
 _IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 
 
-class RedPitaya:
+class ServedRedPitaya:
     """The instrument on a table, with a computer that is switched on. Its state is the same for all who speak to it."""
 
     def __init__(
@@ -76,7 +76,7 @@ class RedPitaya:
         self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition, clock)
         self._generator = Generator()
         self._pots = tuple(self._table.dials)
-        self._scheduled: list[Turn] = []
+        self._scheduled: list[DueTurn] = []
 
     @property
     def live(self) -> bool:
@@ -241,15 +241,15 @@ class RedPitaya:
         channel, record = _channel(call), self._acquisition.record
         if record is None:
             raise ScpiError(-230, "no record is complete")
-        data = self._formed(record.codes[first : first + count, channel], record.switches[channel])
+        data = self._formed(record.codes[first : first + count, channel], record.lsb_v[channel])
         return Broken(data, hangs_up=self._acquisition.hangs_up) if self._acquisition.drops_out() else data
 
-    def _formed(self, codes: Codes, switch: str) -> str | bytes:
+    def _formed(self, codes: Codes, lsb_v: float) -> str | bytes:
         settings = self._acquisition.settings
         order, binary = _ORDERS[settings.order], settings.form == "BIN"
         if settings.units == "RAW":
             return codes.astype(f"{order}i2").tobytes() if binary else _braces(map(str, codes.tolist()))
-        volts: NDArray[np.float64] = codes.astype(np.float64) * lsb_v(switch)
+        volts: NDArray[np.float64] = codes.astype(np.float64) * lsb_v
         return volts.astype(f"{order}f4").tobytes() if binary else _braces(f"{v:.6g}" for v in volts.tolist())
 
     # ---- pots
@@ -280,7 +280,7 @@ class RedPitaya:
         if len(self._scheduled) == MOST_SCHEDULED:
             raise ScpiError(-223, f"{MOST_SCHEDULED} turns are scheduled")
         pot = self._pots[call.whole(0, 1, len(self._pots)) - 1]
-        self._scheduled.append(Turn(call.number(2, 0.0, MOST_DELAY_S), pot, call.number(1, 0.0, 1.0)))
+        self._scheduled.append(DueTurn(call.number(2, 0.0, MOST_DELAY_S), pot, call.number(1, 0.0, 1.0)))
 
 
 def _refusing(command: Command, call: Call) -> Response:

@@ -19,8 +19,9 @@ from emulator.excitation import TICKS_PER_SAMPLE, Edges, Excitation
 from emulator.machine import Mode
 from emulator.program import CHANNELS, SOURCE
 from emulator.suspension import SuspensionComputer
+from harness.run import MEASURED
 
-SEEN = tuple(CHANNELS.index(name) for name in ("force", "displacement"))
+SEEN = tuple(CHANNELS.index(name) for name in MEASURED)
 
 FIRST_RATE_HZ = 160e3
 AT_A_TIME_N = 1 << 16
@@ -31,7 +32,7 @@ _JUST_STARTED = 1e-9
 
 
 @dataclass(frozen=True)
-class Stage:
+class Amplifier:
     """An amplifier between instrument and computer: out = gain in + offset_v, within limits_v."""
 
     gain: float = 1.0
@@ -53,7 +54,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Booster(Stage):
+class Booster(Amplifier):
     """The stage behind the generator, whose +-1 V are to become the computer's +-10 V."""
 
     gain: float = 10.0
@@ -65,16 +66,16 @@ class Wiring:
 
     generator: Booster = field(default_factory=Booster)
     """To the force input."""
-    force: Stage = field(default_factory=Stage)
+    force: Amplifier = field(default_factory=Amplifier)
     """To IN1."""
-    displacement: Stage = field(default_factory=Stage)
+    displacement: Amplifier = field(default_factory=Amplifier)
     """To IN2."""
     swapped: bool = False
     """The force comes to IN2, and the displacement to IN1."""
 
 
 @dataclass(frozen=True)
-class Turn:
+class DueTurn:
     """A pot that is to be turned, so long from now."""
 
     delay_s: float
@@ -97,7 +98,7 @@ class Table:
         self._computer = _switched_on(computer(rate_hz))
         self._waveform: Excitation | None = None
         self._started_tick = 0
-        self._due: list[tuple[int, Turn]] = []
+        self._due: list[tuple[int, DueTurn]] = []
         self.rate_hz = rate_hz
 
     def look_at(self, rate_hz: float) -> None:
@@ -130,7 +131,7 @@ class Table:
         """
         self._computer.machine.turn({pot: dial})
 
-    def schedule(self, turns: Iterable[Turn]) -> None:
+    def schedule(self, turns: Iterable[DueTurn]) -> None:
         """These and no others, from this instant on."""
         ticks = [(self._now_tick + round(turn.delay_s / self._tick_s), turn) for turn in turns]
         self._due = sorted(ticks, key=lambda due: due[0])

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from emulator.excitation import Excitation
 from emulator.suspension import SuspensionComputer
-from harness.instrument.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
-from harness.instrument.description import InstrumentDescription
-from harness.instrument.inputs import InputFaults
-from harness.instrument.red_pitaya import MOST_SCHEDULED, RedPitaya
-from harness.instrument.scpi import DropOut, Interpreter
-from harness.instrument.table import Booster, Stage, Wiring
-from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
+from harness.served.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
+from harness.served.description import InstrumentDescription
+from harness.served.inputs import InputFaults
+from harness.served.red_pitaya import MOST_SCHEDULED, ServedRedPitaya
+from harness.served.scpi import DropOut, Interpreter
+from harness.served.table import Amplifier, Booster, Wiring
+from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14
 """Of +-20 V on 14 bits."""
@@ -354,7 +354,9 @@ def test_noise_is_as_large_as_asked_and_independent_on_the_two_inputs() -> None:
 
 def test_gain_and_offset_errors_are_those_of_wiring_and_inputs_one_after_the_other() -> None:
     """The booster's offset is there before the generator is: in two periods nothing is left of that."""
-    wiring = Wiring(Booster(gain=9.5, offset_v=0.1), Stage(gain=-1.0), Stage(gain=1.02, offset_v=-0.2), swapped=True)
+    wiring = Wiring(
+        Booster(gain=9.5, offset_v=0.1), Amplifier(gain=-1.0), Amplifier(gain=1.02, offset_v=-0.2), swapped=True
+    )
     ask = defective(wiring, InputFaults(gain_error=(0.01, -0.02), offset_v=(0.0, 0.05)))
     say(ask, POINT_SAMPLES)
     emulated = played(excitation=Excitation("square", 0.195, 9.505, 100.0, clock="free"))
@@ -430,7 +432,7 @@ class Hands:
 
 def test_record_in_real_time_is_full_when_its_time_is_over_and_a_pot_turns_where_it_was_turned() -> None:
     hands = Hands()
-    instrument = RedPitaya(front, np.random.default_rng(0), clock=hands)
+    instrument = ServedRedPitaya(front, np.random.default_rng(0), clock=hands)
     ask = asking(Interpreter(instrument.commands))
     say(ask, POINT_SAMPLES)
     assert ask("ACQ:TRig:STAT?") == "TD"

@@ -10,9 +10,9 @@ import tomllib
 from pathlib import Path
 
 from harness import config
-from harness.instrument.description import InstrumentDescription
-from tests.instrument.serving import LONG_S, serving
-from tests.instrument.talk import interpreter
+from harness.served.description import InstrumentDescription
+from tests.served.serving import LONG_S, serving
+from tests.served.talk import interpreter
 
 SECTION = (
     (Path(__file__).parents[2] / "harness" / "README.md")

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields, replace
 
-from emulator.program import CHANNELS
 from emulator.sampler import Card
-from harness.instrument.acquisition import AcquisitionFaults
-from harness.instrument.inputs import InputFaults
-from harness.instrument.table import Wiring
+from harness.served.acquisition import AcquisitionFaults
+from harness.served.inputs import InputFaults
+from harness.served.table import SEEN, Wiring
 
 _ON_BOTH = {"noise_lsb", "gain_error", "offset_lsb", "skew_s", "clock_drift_ppm"}
 _OF_THE_CARD = {"bits", "rate_hz", "ranges_v", "throughput_hz"}
-_SEEN = (CHANNELS.index("force"), CHANNELS.index("displacement"))
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,7 @@ class InstrumentDescription:
 
         :raises ValueError: together they are too large.
         """
-        own, (first, second) = self.inputs, _SEEN
+        own, (first, second) = self.inputs, SEEN
         lsb_v, noise_lsb = card.lsb_v, card.noise_lsb
         gain_error, offset_lsb, skew_s = (
             card.per_channel(name).tolist() for name in ("gain_error", "offset_lsb", "skew_s")
@@ -41,7 +39,8 @@ class InstrumentDescription:
         noise_v = (float(noise_lsb[first] * lsb_v[first]), float(noise_lsb[second] * lsb_v[second]))
         return replace(
             self,
-            inputs=InputFaults(
+            inputs=replace(
+                own,
                 noise_v=(math.hypot(own.noise_v[0], noise_v[0]), math.hypot(own.noise_v[1], noise_v[1])),
                 gain_error=both(own.gain_error, gain_error),
                 offset_v=both(own.offset_v, (offset_lsb * lsb_v).tolist()),

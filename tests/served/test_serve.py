@@ -15,13 +15,13 @@ import pyvisa
 
 from emulator.excitation import Excitation
 from harness.cli import main
-from harness.instrument.scpi import Interpreter
-from harness.instrument.served import ServedDescription
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
-from tests.instrument.serving import LONG_S, Served, ended, serving
-from tests.instrument.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
+from harness.served.rig import ServedDescription
+from harness.served.scpi import Interpreter
+from tests.served.serving import LONG_S, Served, ended, serving
+from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
 
 LSB_V = 40.0 / 2**14
 

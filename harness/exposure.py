@@ -1,0 +1,117 @@
+"""In which samples a false alarm could have come: the exposure, of which every rate of false alarms is one.
+
+A device that is warming up, is held off after an alarm, has no equation for want of the samples before, or is not
+excited, raises no alarm whatever it is worth: its silence is no evidence.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.catalogue import SteppedFlag
+from harness.run import CHANNELS, LOST, Run
+
+MOST_UNEXCITED = 0.5
+"""Of the samples: with more it is as if nobody had looked."""
+
+_FORCE = CHANNELS.index("force")
+
+_NOT_HEARD = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Of one run."""
+
+    samples: int
+    armed: int
+    """Samples in which the trigger was armed."""
+    unexcited: int
+    """Samples before the force had moved, or after its edges had ceased."""
+    estimator: Mapping[str, Any]
+    """The device's settings, as ``EstimatorConfig.as_table`` gives them."""
+
+    @property
+    def no_evidence(self) -> str:
+        """Why nothing of this is evidence of anything, in one line; empty if it is."""
+        because = self._because()
+        return because and f"the trigger was armed in {self.armed} of {self.samples} samples: {because}"
+
+    def _because(self) -> str:
+        if self.estimator.get("trigger") == "none":
+            return "the device has none"
+        if self.unexcited > MOST_UNEXCITED * self.samples:
+            edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
+            return (
+                f"in {self.unexcited} the device was not excited (the force had no edge of {edge_codes:g} codes,"
+                f" or none for {idle_n} samples)"
+            )
+        return "" if self.armed else f"the warm-up takes {self.estimator.get('warm_up_n', 0)}"
+
+
+def exposure(run: Run) -> Exposure:
+    """Of all records, each of which is a run of its own to the device."""
+    estimator = run.conditions.dut["estimator"]
+    parts = [
+        exposed(
+            run.codes[start:end, _FORCE],
+            run.flags[start:end],
+            run.alarm_index[(run.alarm_index >= start) & (run.alarm_index < end)] - start,
+            estimator,
+        )
+        for start, end in run.records
+    ]
+    return Exposure(run.samples, sum(part.armed for part in parts), sum(part.unexcited for part in parts), estimator)
+
+
+def exposed(
+    force: NDArray[np.uint16], flags: NDArray[np.uint8], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
+) -> Exposure:
+    """Of one record of n samples, from the first on.
+
+    :param force: (n,) codes.
+    :param flags: (n,) as of a Run.
+    :param alarms: (a,) the samples with an alarm; each was armed, whatever else is known of it.
+    """
+    heard = (flags & _NOT_HEARD) == 0
+    excited = _excited(force, heard, estimator) & ((flags & SteppedFlag.IDLE) == 0)
+    armed = _watched(heard & ((flags & SteppedFlag.GATHERING) == 0), alarms, estimator) & excited
+    armed &= estimator.get("trigger") != "none"
+    armed[alarms] = True
+    return Exposure(len(force), int(armed.sum()), int((~excited).sum()), estimator)
+
+
+def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], estimator: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """(n,): the force has moved by what is an edge to the device, and the last edge was not too long ago."""
+    codes, edge_codes = force.astype(np.int32), float(estimator.get("edge_codes", 0.0))
+    edges = np.flatnonzero((np.abs(np.diff(codes)) >= edge_codes) & heard[1:] & heard[:-1]) + 1
+    excited = np.ones(len(codes), np.bool_)
+    if len(edges):
+        excited[: edges[0]] = False
+    else:
+        known = codes[heard]
+        excited[heard] = np.maximum.accumulate(known) - np.minimum.accumulate(known) >= edge_codes
+    idle_n = int(estimator.get("idle_n", 0))
+    for edge, following in itertools.pairwise([0, *edges.tolist(), len(codes)]):
+        if idle_n and following - edge > idle_n:
+            excited[edge:following] &= np.cumsum(heard[edge:following]) - heard[edge] < idle_n
+    return excited
+
+
+def _watched(
+    equations: NDArray[np.bool_], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
+) -> NDArray[np.bool_]:
+    """(n,): of the samples with an equation those beyond warm-up and hold-off, which count equations."""
+    count = np.cumsum(equations, dtype=np.int32)
+    watched = equations & (count > int(estimator.get("warm_up_n", 0)))
+    hold_off_n = int(estimator.get("hold_off_n", 0))
+    if hold_off_n and len(alarms):
+        last = np.searchsorted(alarms, np.arange(len(count))) - 1  # of the alarms before the sample
+        watched &= (last < 0) | (count > count[alarms[last]] + hold_off_n)
+    return watched

@@ -1,0 +1,293 @@
+"""The shipped properties as experiments: each plays what it needs, from a scenario and a seed on, and says what it
+found.
+
+The tests beside this module draw scenarios and state limits; what fails is left with both, and judged again by the
+function that failed (``harness.statement``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from harness.bench import Bench
+from harness.devices import DeviceDescription, InprocDevice, from_table
+from harness.dut import Dut, connect
+from harness.errors import AnalogrigError
+from harness.played import Played, rate_below
+from harness.rare import false_alarm_rate
+from harness.rigs.emulator import EmulatorRig
+from harness.rigs.recording import RecordingRig
+from harness.scenario import Scenario
+from harness.statement import Finding, Play, experiment
+from harness.statistics import Decision, SequentialTest, lower_rate, mean_bounds
+from harness.trials import Trials, are_possible
+from harness.verdict import judge
+
+LONGEST_TIMEOUT_S = 0.5
+"""Of a line on which faults are tried: some cost one, or a few."""
+
+_WITNESS_N = 2000
+"""Samples of the play that is left of many trials; more, if its first alarm came later."""
+
+_AFTER_N = 100
+"""Samples of it after that alarm."""
+
+
+def described(dut: Dut) -> DeviceDescription:
+    """As it is configured now."""
+    return from_table({key: value for key, value in dut.description().items() if key != "identity"}, dut.name)
+
+
+def _played(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
+    return [play(scenario, seed + number, allow_inconclusive=True) for number in range(plays)]
+
+
+def _invalid(*plays: Played) -> Finding | None:
+    """Nothing is said of plays that are not valid."""
+    for played in plays:
+        if not played.verdict.valid:
+            return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}", run=played.run)
+    return None
+
+
+# --------------------------------------------------------------------------------------------------------- false alarms
+
+
+@experiment
+def rate_of_plays_below(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int
+) -> Finding:
+    """``harness.played.rate_below`` of so many plays."""
+    return rate_below(rate, _played(play, scenario, seed, plays), confidence=confidence)
+
+
+@experiment
+def false_alarms_at_most(
+    play: Play, scenario: Scenario, seed: int, allowed: int, samples: int, samples_each: int
+) -> Finding:
+    """No more than so many in trials of ``samples_each`` that are, once warm, ``samples`` altogether."""
+    trials = _trials(play, f"takes {samples} samples: analogrig certify")
+    scenario = dataclasses.replace(scenario, samples=samples_each)
+    warm_n = samples_each - described(play.bench.dut).estimator.warm_up_n
+    runs = -(-samples // warm_n)
+    alarms = [trials.alarms(scenario, seed + number) for number in range(runs)]
+    count = sum(map(len, alarms))
+    why = f"{count} false alarms in {runs * warm_n} samples, allowed {allowed}"
+    if count <= allowed:
+        return Finding(holds=True, why=why)
+    most = _with_most(alarms)
+    return _witnessed(play, scenario, seed + most, alarms[most], why)
+
+
+@experiment
+def false_alarms_of_plants_rarer(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plants: int, samples_each: int
+) -> Finding:
+    """That they are more frequent over plants that are drawn cannot be said with that confidence."""
+    from harness.strategies import random_suspensions
+
+    trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
+    scenario = dataclasses.replace(scenario, samples=samples_each)
+    drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
+    alarms = [trials.alarms(each, seed) for each in drawn]
+    count, samples = sum(map(len, alarms)), plants * samples_each
+    low = lower_rate(count, samples, confidence)
+    why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
+    if low <= rate:
+        return Finding(holds=True, why=why)
+    most = _with_most(alarms)
+    return _witnessed(play, drawn[most], seed, alarms[most], why)
+
+
+@experiment
+def rare_false_alarms_rarer(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
+) -> Finding:
+    """The same of a rate that is too low to be waited for, by ``harness.rare``."""
+    _trials(play, "needs the estimator in this process")
+    rig, device = play.bench.rig, described(play.bench.dut)
+    if device.estimator.trigger != "cusum":
+        pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
+    if not isinstance(rig, EmulatorRig):
+        raise TypeError(type(rig))
+    rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
+    low, high = mean_bounds(rates, confidence)
+    why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
+    if low <= rate:
+        return Finding(holds=True, why=why)
+    return _witnessed(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
+
+
+def _trials(play: Play, otherwise: str) -> Trials:
+    """Skips where they are not what the bench would give."""
+    rig, device = play.bench.rig, described(play.bench.dut)
+    if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
+        pytest.skip(f"{otherwise}, or an emulated rig and --dut inproc, not {play.bench.dut.name}")
+    return Trials(rig, device)
+
+
+def _with_most(alarms: list[NDArray[np.int64]]) -> int:
+    return int(np.argmax([len(each) for each in alarms]))
+
+
+def _witnessed(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
+    """With a play that leaves a recording."""
+    samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
+    witness = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
+    return Finding(holds=False, why=why, run=play(witness, seed, allow_inconclusive=True).run)
+
+
+# ------------------------------------------------------------------------------------------------ latency and diagnoses
+
+
+@experiment
+def changes_are_noticed_soon_and_rightly_named(
+    play: Play, scenario: Scenario, seed: int, plays: int, latency: float, right: float, confidence: float
+) -> Finding:
+    """Mean latency over mean bound is at most ``latency``; and of the diagnoses at least the part ``right`` may be."""
+    every = _played(play, scenario, seed, plays)
+    if (invalid := _invalid(*every)) is not None:
+        return invalid
+    tweaks = [(played, tweak) for played in every for tweak in played.verdict.tweaks]
+    missed = [played for played, tweak in tweaks if tweak.latency_n is None or tweak.bound_n is None]
+    if missed:
+        return Finding(holds=False, why=f"{len(missed)} of {len(tweaks)} changes were missed", run=missed[0].run)
+    ratio = sum(tweak.latency_n or 0 for _, tweak in tweaks) / sum(tweak.bound_n or 0 for _, tweak in tweaks)
+    if ratio > latency:
+        why = f"mean latency is {ratio:.2f} times the mean bound, allowed {latency:g}"
+        return Finding(holds=False, why=why, run=_slowest(every).run)
+    said = [(played, tweak.diagnosis) for played, tweak in tweaks if tweak.diagnosis is not None]
+    wrong = [played for played, diagnosis in said if not diagnosis.right]
+    why = f"mean latency is {ratio:.2f} times the mean bound; {len(wrong)} of {len(said)} changes were called wrongly"
+    if said and lower_rate(len(wrong), len(said), confidence) > 1.0 - right:
+        return Finding(holds=False, why=f"{why}, allowed {1.0 - right:.0%}", run=wrong[0].run)
+    return Finding(holds=True, why=why)
+
+
+def _slowest(plays: list[Played]) -> Played:
+    return max(plays, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
+
+
+@experiment
+def single_changes_are_rightly_named(
+    play: Play,
+    scenario: Scenario,
+    seed: int,
+    expected: float,
+    refuted: float,
+    miss: float,
+    false_failure: float,
+    most_plays: int,
+    silent: int,
+) -> Finding:
+    """Wald's test of the part that is called wrongly, ``expected`` against ``refuted``; a device that has named nothing
+    in ``silent`` plays does not name changes at all, which is allowed."""
+    test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
+    wrong = None
+    for number in range(most_plays):
+        played = play(scenario, seed + number, allow_inconclusive=True)
+        if (invalid := _invalid(played)) is not None:
+            return invalid
+        right = [tweak.diagnosis.right for tweak in played.verdict.tweaks if tweak.diagnosis is not None]
+        wrong = played.run if wrong is None and not all(right) else wrong
+        test.add(len(right), right.count(False))
+        if test.decision is not Decision.OPEN or (number + 1 >= silent and not test.trials):
+            break
+    why = f"{test.events} of {test.trials} single changes were called wrongly"
+    if test.decision is Decision.BELOW or not test.trials:
+        return Finding(holds=True, why=why)
+    return Finding(holds=False, why=f"{why}, expected {expected:.0%}, refuted {refuted:.0%}", run=wrong)
+
+
+# -------------------------------------------------------------------------------------------------- whatever may happen
+
+
+@experiment
+def answers_with_numbers(play: Play, scenario: Scenario, seed: int) -> Finding:
+    """Whatever comes: the device answers, with finite numbers, and raises no alarm below its ceiling."""
+    played = play(scenario, seed, allow_inconclusive=True)
+    run, ceiling = played.run, played.verdict.ceiling
+    wrong = list(run.conditions.faults[:1])
+    for name in ("theta", "innovation", "statistic"):
+        rows = np.isfinite(getattr(run, name)).reshape(run.samples, -1).all(axis=1)
+        if not rows.all():
+            wrong.append(f"{name} is no number after sample {int(np.argmin(rows))}")
+    if (run.statistic < 0.0).any():
+        wrong.append(f"the statistic is negative after sample {int(np.argmax(run.statistic < 0.0))}")
+    if ceiling is not None:
+        low = run.alarm_index[run.statistic[run.alarm_index] < np.float32(ceiling)]
+        wrong += [f"an alarm at {index}: the statistic is below its ceiling {ceiling:g}" for index in low[:1].tolist()]
+    return Finding(not wrong, "; ".join(wrong) or f"{run.samples} samples, all answered with numbers", run=run)
+
+
+@experiment
+def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) -> Finding:
+    """While the force has no edge, up to sample ``until``, there is nothing to learn, and no alarm to raise."""
+    _configure(play, stuck_n=0)  # a displacement that does not move is a measurement then
+    played = play(scenario, seed, allow_inconclusive=True)
+    if (invalid := _invalid(played)) is not None:
+        return invalid
+    run, wrong = played.run, []
+    early = run.alarm_index[run.alarm_index < until].tolist()
+    wrong += [f"alarms in the pause, at {', '.join(map(str, early[:5]))}"] if early else []
+    wrong += [] if np.isfinite(run.theta).all() else ["theta is no number"]
+    return Finding(not wrong, "; ".join(wrong) or f"{run.samples} samples without harm", run=run)
+
+
+@experiment
+def alarms_keep_hold_off_and_warm_up(
+    play: Play, scenario: Scenario, seed: int, hold_off_n: int, warm_up_n: int, at_least: int
+) -> Finding:
+    """A device that is set to raise alarms as often as it may, and raises some, keeps those times."""
+    restless = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
+    _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **restless)
+    played = play(scenario, seed, allow_inconclusive=True)
+    if (invalid := _invalid(played)) is not None:
+        return invalid
+    run, index = played.run, played.run.alarm_index
+    if len(index) < at_least:
+        return Finding(holds=False, why=f"{len(index)} alarms, where at least {at_least} were due", run=run)
+    wrong = [f"an alarm at {index[0]}, in the warm-up of {warm_up_n} samples"] if index[0] < warm_up_n else []
+    gaps = np.diff(index)
+    if gaps.min() < hold_off_n:
+        at = index[int(np.argmin(gaps)) + 1]
+        wrong.append(f"an alarm at {at}, {gaps.min()} samples after the last, in the hold-off of {hold_off_n}")
+    return Finding(not wrong, "; ".join(wrong) or f"{len(index)} alarms, at least {gaps.min()} samples apart", run=run)
+
+
+def _configure(play: Play, **settings: Any) -> None:
+    """The device until the next test."""
+    dut = play.bench.dut
+    dut.configure(dataclasses.replace(dut.estimator, **settings))
+
+
+@experiment
+def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
+    """They leave the estimate as it is without them, or the run is INCONCLUSIVE, or refused with the cause."""
+    bench, device = play.bench, described(play.bench.dut)
+    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+    with contextlib.ExitStack() as stack:
+        if device.wire_faults:  # those with which it failed, when this is judged again
+            play = play.on(bench.rig, stack.enter_context(connect(dataclasses.replace(device, wire_faults=""))))
+        without = play(scenario, seed, allow_inconclusive=True)
+        if (invalid := _invalid(without)) is not None:
+            return invalid
+        clean = without.run
+        again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
+        try:
+            spoiled = stack.enter_context(connect(dataclasses.replace(device, wire_faults=faults)))
+            run = Bench(again, spoiled).play(again.scenario(), seed)
+        except AnalogrigError as error:
+            return Finding(holds=True, why=f"refused before the run: {error}")
+    is_same, verdict = run.theta_hash() == clean.theta_hash(), judge(run)
+    why = f"with {faults or 'no fault'} on the line the run is {verdict.outcome}"
+    why += " and the estimate as without" if is_same else ", and the estimate is another than without"
+    return Finding(is_same or not verdict.valid, why, run=run)

@@ -1,0 +1,113 @@
+"""Scenario files as tests: those of --scenario-dir."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from harness.pytest_plugin.devices import Devices, check_owner
+from harness.pytest_plugin.options import DUT, RIG, SCENARIO_DIR
+from harness.pytest_plugin.playing import Player
+
+if TYPE_CHECKING:
+    from harness.scenario import Scenario
+    from harness.statement import Finding
+
+DEVICES = pytest.StashKey[Devices]()
+"""Of the session."""
+
+
+def add_folder(config: pytest.Config) -> None:
+    """The scenarios are what was asked for if the command line names their folder and nothing else; they come on top
+    of all tests if the environment or the ini file does."""
+    folder = SCENARIO_DIR.said(config)
+    if not folder.value:
+        return
+    is_asked_for, named = folder.by == SCENARIO_DIR.flag, config.args_source is pytest.Config.ArgsSource.ARGS
+    if is_asked_for and not named:
+        config.args[:] = [folder.value]
+    elif is_asked_for or not named:
+        config.args.append(folder.value)
+
+
+def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    folder = SCENARIO_DIR.said(parent.config).value
+    if not folder or path.suffix != ".toml" or not path.is_relative_to(Path(folder).resolve()):
+        return None
+    return ScenarioFile.from_parent(parent, path=path) if _is_scenario(path) else None
+
+
+def _is_scenario(path: Path) -> bool:
+    """A rig or a device beside it is none."""
+    from harness import config
+    from harness.errors import AnalogrigError
+
+    with contextlib.suppress(AnalogrigError):
+        return "kind" not in config.read_toml(path)
+    return True
+
+
+class ScenarioFile(pytest.File):
+    """A file of --scenario-dir."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        yield ScenarioItem.from_parent(self, name=self.path.stem)
+
+
+class ScenarioItem(pytest.Item):
+    """One scenario: what a test asserted of it holds, or what it expects of the device."""
+
+    def runtest(self) -> None:
+        from harness.bench import Bench
+        from harness.rigs.description import open_rig
+        from harness.scenario import Scenario
+
+        check_owner(self)
+        scenario = Scenario.load(str(self.path))
+        devices, name = self.config.stash[DEVICES], self._device(scenario)
+        with open_rig(self._rig(scenario)) as rig:
+            try:
+                finding = self._found(Player(self, Bench(rig, devices.lease(name))), scenario)
+            finally:
+                if name == scenario.dut:
+                    devices.release(name)
+        if not finding:
+            raise ScenarioFailed(finding.why)
+
+    def _found(self, play: Player, scenario: Scenario) -> Finding:
+        from harness.scenario import DEFAULT_SEED
+        from harness.statement import judged
+
+        if scenario.statement is None:
+            return play(scenario).passes()
+        seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
+        return judged(scenario.statement, play, scenario, seed, str(self.path))
+
+    def _rig(self, scenario: Scenario) -> str:
+        given = RIG.given(self.config)
+        return given.value if given else scenario.rig or RIG.otherwise(self.config).value
+
+    def _device(self, scenario: Scenario) -> str:
+        from harness.devices import of_scenario
+
+        given = DUT.given(self.config)
+        return of_scenario(scenario.dut, given.value if given else "", DUT.otherwise(self.config).value)
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        from emulator.errors import EmulatorError
+        from harness.errors import AnalogrigError
+
+        if isinstance(excinfo.value, ScenarioFailed | AnalogrigError | EmulatorError):
+            return f"{self.path}: {str(excinfo.value).removeprefix(f'{self.path}: ')}"
+        return super().repr_failure(excinfo, style)
+
+    def reportinfo(self) -> tuple[Path, int, str]:
+        return self.path, 0, f"scenario {self.name}"
+
+
+class ScenarioFailed(Exception):  # noqa: N818 - a verdict, not an error
+    """The device did not do what the scenario asks."""

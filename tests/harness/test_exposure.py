@@ -1,0 +1,93 @@
+"""Exposure: the samples in which a false alarm could have come."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from harness.bench import Bench
+from harness.catalogue import SteppedFlag
+from harness.devices import describe
+from harness.dut import open_dut
+from harness.exposure import exposure
+from harness.plant import Plant
+from harness.played import Played, rate_below
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
+from harness.run import CHANNELS, Run
+from harness.scenario import Scenario
+from harness.trials import Trials
+from tests.harness.runs import ESTIMATOR, made_run
+
+FRONT = Plant(294.0, 3021.0, 24500.0)
+
+SQUARE_N = np.where(np.arange(600) // 50 % 2, 2000.0, 200.0)
+
+
+def made(**changes: object) -> Run:
+    """600 samples with edges of the force every 50."""
+    estimator = {**ESTIMATOR, "edge_codes": 64.0, **{key: value for key, value in changes.items() if key != "alarms"}}
+    return made_run(SQUARE_N, [(0, FRONT)], estimator=estimator, alarms=changes.get("alarms", ()))  # type: ignore[arg-type]
+
+
+def test_before_the_first_edge_and_in_the_warm_up_no_alarm_can_come() -> None:
+    assert exposure(made()).armed == 550
+    assert exposure(made(warm_up_n=150)).armed == 450
+    assert exposure(made(warm_up_n=600)).armed == 0
+    assert "the warm-up takes 600" in exposure(made(warm_up_n=600)).no_evidence
+
+
+def test_after_an_alarm_none_can_come_while_it_is_held_off() -> None:
+    assert exposure(made(hold_off_n=30, alarms=(300, 310, 590))).armed == 550 - 39 - 9
+
+
+def test_sample_with_an_alarm_was_armed_whatever_else_is_known() -> None:
+    assert exposure(made(warm_up_n=600, alarms=(20, 70))).armed == 2
+    assert exposure(made(trigger="none")).armed == 0
+
+
+def test_missing_samples_and_those_without_an_equation_are_not_exposed() -> None:
+    run = made(warm_up_n=150)
+    flags = run.flags.copy()
+    flags[300:310], flags[310:313] = SteppedFlag.MISSING, SteppedFlag.GATHERING
+    assert exposure(dataclasses.replace(run, flags=flags)).armed == 450 - 13
+
+
+def test_every_record_has_a_warm_up_of_its_own() -> None:
+    run = made(warm_up_n=150)
+    conditions = dataclasses.replace(run.conditions, records=(0, 300))
+    assert exposure(dataclasses.replace(run, conditions=conditions)).armed == 2 * 150
+
+
+@pytest.mark.parametrize("idle_n", [0, 400])
+def test_force_that_never_moves_is_no_evidence_even_where_the_device_does_not_say_so(idle_n: int) -> None:
+    estimator = {**ESTIMATOR, "edge_codes": 64.0, "idle_n": idle_n}
+    run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
+    found = exposure(run)
+    assert (found.armed, found.unexcited) == (0, 600)
+    assert "armed in 0 of 600 samples: in 600 the device was not excited" in found.no_evidence
+    assert not rate_below(0.5, [Played(run)], confidence=0.9)
+
+
+def test_samples_that_the_device_calls_idle_are_not_exposed_within_this_process_either() -> None:
+    """Pulses 1400 samples apart, where the device calls it lost after 1000: what it says, sample by sample, is the
+    reference for trials that have no messages."""
+    healthy = Scenario.load("healthy")
+    excitation = dataclasses.replace(healthy.excitation, shape="pulse", duty=0.3, frequency_hz=10.0)
+    scenario = dataclasses.replace(healthy, samples=9000, excitation=excitation, random_phase=False)
+    rig = open_rig("emulator")
+    assert isinstance(rig, EmulatorRig)
+    with open_dut("inproc", exchange="block") as dut:
+        run = Bench(rig, dut).play(scenario, 1)
+    idle = (run.flags & SteppedFlag.IDLE) != 0
+    assert 1000 < idle.sum() < 4000
+    innovations = (run.flags & (SteppedFlag.MISSING | SteppedFlag.REFUSED | SteppedFlag.GATHERING)) == 0
+    warm = np.cumsum(innovations) > 150
+    force = run.codes[:, CHANNELS.index("force")].astype(int)
+    moved = np.maximum.accumulate(np.abs(force - force[0])) >= 64
+    expected = int((innovations & warm & moved & ~idle).sum())
+    assert exposure(run).armed == expected
+    _, _, within = Trials(rig, describe("inproc")).exposed(scenario, 1)
+    assert (within.armed, within.unexcited) == (expected, exposure(run).unexcited)

@@ -1,0 +1,307 @@
+"""What every driver of an instrument has to do: each at an ideal computer, its instrument in this process."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator import Excitation, SuspensionComputer
+from emulator.opamp import preset
+from harness.errors import ConfigurationError, RecordStale, RigRefused
+from harness.rigs.instrument import DRIVERS, Instrument, Record, Turn, located
+from harness.rigs.ni_daqmx import NiDaqmx
+from harness.rigs.red_pitaya import RedPitaya
+from harness.rigs.scpi_connection import ScpiConnection
+from harness.served.acquisition import AcquisitionFaults
+from harness.served.description import InstrumentDescription
+from harness.served.inputs import InputFaults
+from harness.served.red_pitaya import ServedRedPitaya
+from harness.served.scpi import Interpreter
+from harness.served.table import Amplifier, Booster, Wiring
+from tests.harness.ni_stand_in import Card, library
+
+SAMPLES = 400
+AT_COMPUTER = Excitation(low_v=0.1, high_v=9.9, frequency_hz=100.0)
+"""Of the force, V."""
+
+
+def ideal(rate_hz: float) -> SuspensionComputer:
+    return SuspensionComputer("front", opamp=preset("ideal"), sample_rate_hz=rate_hz)
+
+
+class InThisProcess(ScpiConnection):
+    """No line to wait for: what is said is answered when ``send`` returns."""
+
+    def __init__(self, interpreter: Interpreter) -> None:
+        self.name = "here"
+        self._interpreter = interpreter
+        self._input = bytearray()
+        self._clock = time.monotonic
+        self._timeout_s = 1.0
+
+    def send(self, *commands: str) -> None:
+        for command in commands:
+            self._input += b"".join(self._interpreter.enter(command.encode()))
+
+    def close(self) -> None:
+        pass
+
+
+class Bench(ABC):
+    """An instrument at an ideal computer, both inputs of it in the range of ``WORD``, which ends at ``END_V``."""
+
+    WORD: str
+    END_V: float
+    INPUTS: tuple[int, int]
+    GENERATOR: float
+    """Volts at the generator for one at the computer's force input."""
+
+    @abstractmethod
+    def opened(
+        self, *, gain: float = 1.0, reach: float = 0.0, noise_lsb: float = 0.0, stale: bool = False
+    ) -> Instrument:
+        """
+        :param gain: between the computer and both inputs.
+        :param reach: by which fraction the converters take more than the range says.
+        :param stale: the second record that is asked for is an old one.
+        """
+
+    @abstractmethod
+    def is_off(self) -> bool:
+        """Whether the generator is."""
+
+    def ready(self, **settings: Any) -> Instrument:
+        """Everything set for a record."""
+        instrument = self.opened(**settings)
+        instrument.set_inputs([(number, self.WORD) for number in self.INPUTS])
+        low_v, high_v = (self.GENERATOR * volts for volts in (AT_COMPUTER.low_v, AT_COMPUTER.high_v))
+        instrument.set_excitation(dataclasses.replace(AT_COMPUTER, low_v=low_v, high_v=high_v))
+        instrument.rest(0.0)
+        return instrument
+
+
+class RedPitayaBench(Bench):
+    WORD, END_V, INPUTS, GENERATOR = "LV", 1.0, (1, 2), 0.1
+
+    def opened(
+        self,
+        *,
+        gain: float = 1.0,
+        reach: float = 0.0,
+        noise_lsb: float = 0.0,
+        stale: bool = False,
+        faults: AcquisitionFaults | None = None,
+    ) -> RedPitaya:
+        """A record is taken while the computer comes to rest, before each of those that are asked for."""
+        noise_v = noise_lsb * 2.0 / (1 << 14)
+        described = InstrumentDescription(
+            Wiring(Booster(10.0), Amplifier(gain), Amplifier(gain)),
+            InputFaults(noise_v=(noise_v, noise_v), reach=(reach, reach)),
+            faults or AcquisitionFaults(stale_n=2 if stale else 0, drop_out_record=4),
+        )
+        self.served = ServedRedPitaya(ideal, np.random.default_rng(1), described)
+        return RedPitaya(InThisProcess(Interpreter(self.served.commands)), 1.0)
+
+    def is_off(self) -> bool:
+        return not self.served.live
+
+
+class NiBench(Bench):
+    WORD, END_V, INPUTS, GENERATOR = "10V", 10.0, (0, 1), 1.0
+
+    def opened(self, *, gain: float = 1.0, reach: float = 0.0, noise_lsb: float = 0.0, stale: bool = False) -> NiDaqmx:
+        self.card = Card(gain=gain, reach=reach, noise_v=noise_lsb * 20.0 / (1 << 16), stale=stale)
+        return NiDaqmx(library(self.card), "Dev1", 1.0)
+
+    def is_off(self) -> bool:
+        return self.card.output_v == 0.0
+
+
+BENCHES: dict[str, Callable[[], Bench]] = {"redpitaya": RedPitayaBench, "nidaqmx": NiBench}
+
+
+@pytest.fixture(params=DRIVERS)
+def bench(request: pytest.FixtureRequest) -> Bench:
+    """A driver without one here cannot be tested, and fails."""
+    return BENCHES[request.param]()
+
+
+def exact(samples: int = SAMPLES) -> np.ndarray:
+    """(n, 2) volts at the computer."""
+    return np.concatenate(list(ideal(20e3).play(AT_COMPUTER, samples)))[:, :2]
+
+
+# ---- addresses
+
+
+@pytest.mark.parametrize(
+    ("url", "address"),
+    [
+        ("redpitaya://rp-f0a1b2.local", "rp-f0a1b2.local"),
+        ("RedPitaya://192.168.1.20:5001", "192.168.1.20:5001"),
+        ("redpitaya://[fe80::1]:5000", "[fe80::1]:5000"),
+        ("nidaqmx://Dev1", "Dev1"),
+        ("nidaqmx://cDAQ1Mod1", "cDAQ1Mod1"),
+    ],
+)
+def test_address_is_what_the_driver_of_the_scheme_takes(url: str, address: str) -> None:
+    kinds = {"redpitaya": RedPitaya, "nidaqmx": NiDaqmx}
+    assert located(url) == (kinds[url.partition(":")[0].lower()], address)
+
+
+@pytest.mark.parametrize(
+    ("url", "form"),
+    [
+        ("redpitaya://", "redpitaya://HOST[:PORT]"),
+        ("redpitaya://host:0", "redpitaya://HOST[:PORT]"),
+        ("redpitaya://host:99999", "redpitaya://HOST[:PORT]"),
+        ("redpitaya://host/path", "redpitaya://HOST[:PORT]"),
+        ("redpitaya://somebody@host", "redpitaya://HOST[:PORT]"),
+        ("redpitaya://a host", "redpitaya://HOST[:PORT]"),
+        ("redpitaya:host", "redpitaya://HOST[:PORT]"),
+        ("nidaqmx://Dev1/ai0", "nidaqmx://CARD"),
+        ("nidaqmx://", "nidaqmx://CARD"),
+        ("picoscope://x", "redpitaya://HOST[:PORT] or nidaqmx://CARD"),
+        ("", "redpitaya://HOST[:PORT] or nidaqmx://CARD"),
+    ],
+)
+def test_address_that_is_none_is_refused_with_the_form_of_one(url: str, form: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        located(url)
+    assert str(caught.value) == f"instrument {url!r}: give it as {form}"
+
+
+@pytest.mark.parametrize("address", ["ip:192.168.2.1", "usb:1.2.5", "ip:pluto.local"])
+def test_addresses_of_other_kinds_of_instruments_are_left_to_their_drivers(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of libm2k have colons that are no port's."""
+
+    class Adalm2000(NiDaqmx):
+        @classmethod
+        def is_address(cls, address: str) -> bool:
+            return address.startswith(("ip:", "usb:"))
+
+    monkeypatch.setattr("harness.rigs.ni_daqmx.NiDaqmx", Adalm2000)
+    assert located(f"nidaqmx://{address}") == (Adalm2000, address)
+
+
+# ---- what it has
+
+
+def test_levels_beyond_the_generator_are_refused_with_both(bench: Bench) -> None:
+    kind = type(bench.opened())
+    least_v, most_v = kind.datasheet.output_v
+    kind.check(Excitation(low_v=least_v, high_v=most_v))
+    for low_v, high_v in ((least_v - 1e-3, most_v), (least_v, most_v + 1e-3)):
+        with pytest.raises(ConfigurationError, match=f"have to give {low_v:g} V to {high_v:g} V, and has"):
+            kind.check(Excitation(low_v=low_v, high_v=high_v))
+
+
+def test_record_is_what_the_computer_does_in_volts_and_in_codes(bench: Bench) -> None:
+    """Exact to half a step of the converter, and to what the force's edge moves before the sample that shows it."""
+    gain = 0.9 * bench.END_V / 10.0
+    instrument = bench.ready(gain=gain)
+    record = instrument.record(SAMPLES)
+    lsb_v = 2.0 * bench.END_V / (1 << instrument.datasheet.bits)
+    assert record.volts.shape == record.codes.shape == record.clipped.shape == (SAMPLES, 2)
+    np.testing.assert_allclose(record.volts, gain * exact(), atol=0.5 * lsb_v + 1e-5)
+    np.testing.assert_allclose(record.volts, record.codes * lsb_v, atol=1e-6)
+    assert not record.clipped.any()
+
+
+def test_generator_is_on_in_a_record_alone(bench: Bench) -> None:
+    instrument = bench.ready()
+    assert bench.is_off()
+    instrument.record(SAMPLES)
+    assert not bench.is_off()
+    instrument.make_safe()
+    assert bench.is_off()
+
+
+def test_somebody_else_may_act_while_a_record_is_taken(bench: Bench) -> None:
+    acted = []
+    bench.ready().record(SAMPLES, lambda: acted.append(bench.is_off()))
+    assert len(acted) == 1
+
+
+# ---- clipping is a matter of codes
+
+
+@pytest.mark.parametrize("reach", [-0.05, 0.0, 0.05])
+def test_sample_is_clipped_where_the_converter_ends_whatever_its_volts_say(reach: float, bench: Bench) -> None:
+    """The force goes to 1.02 of the range: a converter that takes 5 % more measures it, one that takes 5 % less clips
+    at volts that lie within the range."""
+    gain = 1.02 * bench.END_V / AT_COMPUTER.high_v
+    record = bench.ready(gain=gain, reach=reach).record(SAMPLES)
+    beyond = gain * exact() > bench.END_V * (1.0 + reach)
+    assert beyond[:, 0].any() == (reach <= 0.0)
+    np.testing.assert_array_equal(record.clipped, beyond)
+    assert record.volts.max() == pytest.approx(bench.END_V * min(1.02, 1.0 + reach), rel=3e-4)
+
+
+# ---- an old record
+
+
+def differs(record: Record, other: Record) -> bool:
+    return not np.array_equal(record.codes, other.codes)
+
+
+def test_record_that_was_given_before_is_told_by_its_bits(bench: Bench) -> None:
+    instrument = bench.ready(noise_lsb=0.5, stale=True)
+    first = instrument.record(SAMPLES)
+    instrument.rest(0.0)
+    second = instrument.record(SAMPLES)
+    assert not first.repeats
+    assert second.repeats
+
+
+def test_noise_makes_each_record_another(bench: Bench) -> None:
+    instrument = bench.ready(noise_lsb=0.05)
+    first, second = instrument.record(SAMPLES), instrument.record(SAMPLES)
+    assert differs(first, second)
+    assert not first.repeats
+    assert not second.repeats
+
+
+def test_what_a_red_pitaya_has_taken_at_rest_is_no_record() -> None:
+    at_rest = AcquisitionFaults(stale_n=1, drop_out_record=2)
+    assert RedPitayaBench().ready(noise_lsb=0.5, faults=at_rest).record(SAMPLES).repeats
+
+
+def test_red_pitaya_that_has_a_record_before_it_could_is_found_out() -> None:
+    early = AcquisitionFaults(triggered_early=True)
+    with pytest.raises(RecordStale, match=r"instrument here: the record is an old one: ACQ:TRig:STAT\? says 'TD'"):
+        RedPitayaBench().ready(faults=early).record(SAMPLES)
+
+
+# ---- pots
+
+
+def test_pots_are_turned_at_once_or_at_instants_of_the_next_record_alone() -> None:
+    instrument = RedPitayaBench().ready(gain=0.1)
+    assert instrument.pots is not None
+    still = instrument.record(SAMPLES)
+    instrument.rest(0.0)
+    instrument.pots.schedule([Turn(200.5 / instrument.datasheet.rate_hz, "K", 0.5)])
+    turned = instrument.record(SAMPLES)
+    np.testing.assert_array_equal(turned.codes[:201], still.codes[:201])
+    assert differs(turned, still)
+    instrument.rest(0.0)
+    instrument.pots.turn("K", 0.8511)  # facts 1: the dial of the front suspension
+    again = instrument.record(SAMPLES)
+    np.testing.assert_allclose(again.volts, still.volts, atol=1e-3)
+
+
+def test_pot_that_cannot_stand_there_is_refused_by_name() -> None:
+    instrument = RedPitayaBench().ready()
+    assert instrument.pots is not None
+    assert instrument.pots.names == ("M", "B", "K")
+    with pytest.raises(RigRefused, match="instrument here: turning K to 1.5: it says -222"):
+        instrument.pots.turn("K", 1.5)
