@@ -638,5 +638,6 @@ bool est_invariants_hold(const est_t* const self) {
             return false;  // MISRA D4
         }
     }
-    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) && within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
+    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
+           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
 }
