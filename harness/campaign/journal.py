@@ -45,7 +45,6 @@ class Journal:
 
         :raises RecordingError: it cannot be written.
         """
-        self.rows[chunk] = rows
         with self._on_disk():
             self._write(_line({"chunk": list(chunk), "rows": rows}))
 

@@ -8,17 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from harness.campaign import build
 from harness.campaign.plan import Case, Cell, Chunk, Plan
 from harness.campaign.players import Players
-from harness.catalogue import SteppedFlag
 from harness.errors import ConfigurationError, DeviceError, LinkError, RigError
-from harness.exposure import exposure
+from harness.exposure import Exposure, exposure
 from harness.run import Run
 from harness.trials import Trials
-from harness.verdict import TweakVerdict, Verdict, judge, refusals
+from harness.verdict import TweakVerdict, Verdict, judge, no_evidence
 
 Row = dict[str, Any]
 """Of one trial, in plain values; see ``row``."""
@@ -66,19 +63,15 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
 
     ``armed``: the samples in which the trigger was armed. ``changes``: for each [latency or null, bound or null,
     missed, late], in samples. ``errors``: relative errors of M, B, K at the end, or none. ``theta``: the first digits
-    of the hash of all estimates, which tells builds apart. ``why``: the first reason why it has not passed. A trial
-    that shows nothing, since the trigger was never armed, is inconclusive.
+    of the hash of all estimates, which tells builds apart. ``why``: the first reason why it has not passed.
     """
-    shown, outcome, reasons = exposure(run), verdict.outcome, verdict.reasons
-    if outcome == "passed" and not shown.armed and verdict.ceiling is not None:
-        outcome, reasons = "inconclusive", (shown.no_evidence,)
     return _row(
         run.conditions.seed,
-        outcome,
+        verdict.outcome,
         drawn,
-        why=reasons[0] if reasons else "",
+        why=verdict.reasons[0] if verdict.reasons else "",
         samples=run.samples,
-        armed=shown.armed,
+        armed=exposure(run).armed,
         false_alarms=len(verdict.false_alarms),
         changes=[_change(tweak) for tweak in verdict.tweaks],
         errors=_errors(verdict),
@@ -122,21 +115,19 @@ def count_alarms(case: Case) -> Count:
 
 
 def _counted(trials: Trials, case: Case) -> Count:
-    alarms, flags, shown = trials.exposed(case.scenario, case.seed)
-    missing, refused = (int(np.count_nonzero(flags & flag)) for flag in (SteppedFlag.MISSING, SteppedFlag.REFUSED))
-    invalid = [*case.scenario.caveats, *refusals(refused), *case.scenario.expect.gaps(len(flags), missing)]
-    return _count(len(alarms), shown.armed, case.seed, [*invalid, shown.no_evidence])
+    seen, scenario = trials.watched(case.scenario, case.seed), case.scenario
+    reasons = no_evidence(seen.exposure, scenario.expect, refused=seen.refused, missing=seen.missing)
+    return _count(len(seen.alarms), seen.exposure, case.seed, [*scenario.caveats, *reasons])
 
 
 def _counted_on_bench(case: Case) -> Count:
     run = _players.play(case)
-    verdict, shown = judge(run), exposure(run)
-    invalid = () if verdict.valid else verdict.reasons
-    return _count(len(run.alarm_index), shown.armed, case.seed, [*invalid, shown.no_evidence])
+    verdict = judge(run)
+    return _count(len(run.alarm_index), exposure(run), case.seed, () if verdict.valid else verdict.reasons)
 
 
-def _count(alarms: int, armed: int, seed: int, faults: Sequence[str]) -> Count:
-    return Count(alarms, armed, next((f"seed {seed}: {fault}" for fault in faults if fault), ""))
+def _count(alarms: int, shown: Exposure, seed: int, faults: Sequence[str]) -> Count:
+    return Count(alarms, shown.armed, f"seed {seed}: {faults[0]}" if faults else "")
 
 
 @functools.lru_cache(maxsize=2)

@@ -383,7 +383,7 @@ def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spec", "why"),
-    [("samples = 140", "the warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "the device was not excited")],
+    [("samples = 140", "its warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "in 900 it was not excited")],
 )
 def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Path, spec: str, why: str) -> None:
     still = tmp_path / "still.toml"
