@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from harness.bench import Bench
 from harness.campaign.comparison import Comparison, compare
-from harness.campaign.trial import Row, row
+from harness.campaign.rows import Row, row
 from harness.run import CHANNELS, MEASURED, Run
 from harness.scenario import Scenario
 from harness.statistics import mean_interval, rate_interval, upper_rate

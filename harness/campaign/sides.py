@@ -11,7 +11,7 @@ from typing import Any
 from harness.campaign.difference import differences, named
 from harness.campaign.plan import Plan
 from harness.campaign.results import Results
-from harness.campaign.trial import Row, row
+from harness.campaign.rows import Row, is_valid, row
 from harness.errors import ConfigurationError, RecordingError
 from harness.run import Run
 from harness.verdict import judge
@@ -117,7 +117,7 @@ def _unnamed(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
     """By what was played; without those of which nothing is said."""
-    return {key: each for key, each in trials if each["outcome"] != "inconclusive"}
+    return {key: each for key, each in trials if is_valid(each)}
 
 
 def _recordings(paths: Sequence[Path]) -> tuple[Observation, ...]:

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from harness.campaign import build
 from harness.campaign.plan import Case, Cell, Chunk, Plan
 from harness.campaign.players import Players
+from harness.campaign.rows import Row, row, row_of_none
 from harness.errors import ConfigurationError, DeviceError, LinkError, RigError
 from harness.exposure import Exposure, exposure
-from harness.run import Run
 from harness.trials import Trials
-from harness.verdict import TweakVerdict, Verdict, judge, no_evidence
-
-Row = dict[str, Any]
-"""Of one trial, in plain values; see ``row``."""
+from harness.verdict import judge, no_evidence
 
 _players = Players()
 
@@ -47,50 +42,8 @@ def _played(plan: Plan, cell: Cell, seed: int) -> Row:
     try:
         run = _players.play(plan.case(cell, seed))
     except (DeviceError, LinkError, RigError) as error:
-        return _row(seed, "inconclusive", drawn, why=" ".join(str(error).split()))
+        return row_of_none(seed, drawn, " ".join(str(error).split()))
     return row(run, judge(run), drawn)
-
-
-def _change(tweak: TweakVerdict) -> list[int | None]:
-    """At its likeliest instant; one that was not found in the samples is as one that nobody could see."""
-    if tweak.unseen:
-        return [None, None, False, False]
-    return [tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late]
-
-
-def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
-    """What is kept of a trial.
-
-    ``armed``: the samples in which the trigger was armed. ``changes``: for each [latency or null, bound or null,
-    missed, late], in samples. ``errors``: relative errors of M, B, K at the end, or none. ``theta``: the first digits
-    of the hash of all estimates, which tells builds apart. ``why``: the first reason why it has not passed.
-    """
-    return _row(
-        run.conditions.seed,
-        verdict.outcome,
-        drawn,
-        why=verdict.reasons[0] if verdict.reasons else "",
-        samples=run.samples,
-        armed=exposure(run).armed,
-        false_alarms=len(verdict.false_alarms),
-        changes=[_change(tweak) for tweak in verdict.tweaks],
-        errors=_errors(verdict),
-        theta=verdict.theta_hash[:16],
-    )
-
-
-def _errors(verdict: Verdict) -> list[float]:
-    """Of the last estimate; one of numbers beyond all measure is none."""
-    found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
-    return found if all(map(math.isfinite, found)) else []
-
-
-_NOTHING: Row = {"samples": 0, "armed": 0, "false_alarms": 0, "changes": [], "errors": [], "theta": ""}
-
-
-def _row(seed: int, outcome: str, drawn: Mapping[str, float] | None, *, why: str, **found: Any) -> Row:
-    said = {"drawn": dict(drawn or {}), "why": why}
-    return {"seed": seed, "outcome": outcome, **_NOTHING, **found} | {key: each for key, each in said.items() if each}
 
 
 @dataclass(frozen=True)
@@ -140,17 +93,3 @@ def _plan(text: str) -> tuple[Plan, list[Cell]]:
 def close_devices() -> None:
     """Let go of the devices and rigs that this thread's chunks have opened."""
     _players.close()
-
-
-def samples_of(rows: list[Row]) -> Mapping[str, int]:
-    """Counts of valid trials: ``samples``, those in which the trigger was ``armed``, ``false_alarms``, ``visible``
-    changes, ``missed`` ones."""
-    valid = [each for each in rows if each["outcome"] != "inconclusive"]
-    changes = [change for each in valid for change in each["changes"] if change[1] is not None]
-    return {
-        "samples": sum(each["samples"] for each in valid),
-        "armed": sum(each["armed"] for each in valid),
-        "false_alarms": sum(each["false_alarms"] for each in valid),
-        "visible": len(changes),
-        "missed": sum(change[2] for change in changes),
-    }

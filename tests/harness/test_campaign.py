@@ -22,8 +22,9 @@ from harness.campaign.conduct import Tally, conduct, journal_of
 from harness.campaign.journal import Journal
 from harness.campaign.plan import Chunk, Plan, one_worker_only, rig_table
 from harness.campaign.results import Results, Summary, text
+from harness.campaign.rows import row
 from harness.campaign.spec import CampaignSpec
-from harness.campaign.trial import close_devices, play_chunk, row
+from harness.campaign.trial import close_devices, play_chunk
 from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
 from harness.devices import DeviceDescription, describe
