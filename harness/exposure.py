@@ -42,13 +42,12 @@ class Exposure:
     def _because(self) -> str:
         if self.estimator.get("trigger") == "none":
             return "the device has no trigger"
-        warm_up_n, idle_n = int(self.estimator.get("warm_up_n", 0)), self.estimator.get("idle_n", 0)
-        if self.samples - self.unexcited > warm_up_n or self.unexcited == 0:
-            return f"its warm-up takes {warm_up_n}"
-        edge_codes = self.estimator.get("edge_codes", 0.0)
+        if 2 * self.unexcited <= self.samples:
+            return f"its warm-up takes {self.estimator.get('warm_up_n', 0)}"
+        edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
         return (
             f"in {self.unexcited} it was not excited (the force had no edge of {edge_codes:g} codes, or none for"
-            f" {idle_n} samples), and its warm-up takes {warm_up_n}"
+            f" {idle_n} samples)"
         )
 
 
