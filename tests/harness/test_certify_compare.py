@@ -412,6 +412,17 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
     assert not any(each.shown for each in found.differences)
 
 
+def test_two_recordings_of_one_play_on_one_side_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        run = Bench(rig, dut).play(scenario, 0)
+    for name in ("one", "two"):
+        run.save(tmp_path / "a" / name / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "one")]) == 2
+    named = " and ".join(str(tmp_path / "a" / name / "run.npz") for name in ("one", "two"))
+    assert f"{named} are of one scenario, rig and seed" in capsys.readouterr().err
+
+
 def test_recordings_that_have_no_play_in_common_are_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

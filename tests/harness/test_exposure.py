@@ -19,6 +19,7 @@ from harness.rigs.emulator import EmulatorRig
 from harness.run import CHANNELS, Run
 from harness.scenario import Scenario
 from harness.trials import Trials
+from harness.verdict import judge
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(294.0, 3021.0, 24500.0)
@@ -91,3 +92,14 @@ def test_samples_that_the_device_calls_idle_are_not_exposed_within_this_process_
     assert exposure(run).armed == expected
     within = Trials(rig, describe("inproc")).watched(scenario, 1).exposure
     assert (within.armed, within.unexcited) == (expected, exposure(run).unexcited)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "why"),
+    [({"warm_up_n": 600}, "its warm-up takes 600"), ({"trigger": "none"}, "the device has no trigger")],
+)
+def test_run_in_which_no_alarm_could_come_is_inconclusive(estimator: dict[str, object], why: str) -> None:
+    verdict = judge(made(**estimator))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons == (f"no alarm could come in any of 600 samples: {why}",)
+    assert judge(made()).outcome == "passed"
