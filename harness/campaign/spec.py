@@ -137,8 +137,6 @@ class CampaignSpec:
     name: str = ""
 
     def __post_init__(self) -> None:
-        if "/" in self.name or self.name in {".", ".."} or not self.name.isprintable():
-            raise ValueError(f"name must be one that a file can have, not {self.name!r}")
         if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
         for name in ("rigs", "devices"):
@@ -161,7 +159,10 @@ class CampaignSpec:
         :raises ConfigurationError: absent, not TOML, or no campaign; names the file and the key.
         """
         path = config.locate("campaigns", name)
-        return config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
+        spec = config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
+        if "/" in spec.name or spec.name in {"", ".", ".."} or not spec.name.isprintable():
+            raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
+        return spec
 
 
 @dataclass(frozen=True)
@@ -210,6 +211,17 @@ class Plan:
     """With the ``build`` of each."""
     analogrig: str
     """The build of analogrig itself."""
+
+    def __post_init__(self) -> None:
+        for name, tables in (("rigs", self.rigs), ("devices", self.devices)):
+            if not tables or not all(isinstance(table.get("name"), str) for table in tables):
+                raise ValueError(f"{name} must be at least one, each with its name")
+
+    @property
+    def size(self) -> int:
+        """The number of cells."""
+        combinations = math.prod(len(values) for values in self.spec.grid.axes().values())
+        return len(self.rigs) * len(self.devices) * combinations
 
     @classmethod
     def of(cls, spec: CampaignSpec) -> Plan:
@@ -286,11 +298,10 @@ class Plan:
 
     def _check(self) -> None:
         spec = self.spec
-        count = len(self.rigs) * len(self.devices) * math.prod(len(values) for values in spec.grid.axes().values())
         where = f"campaign {spec.name}"
-        if count > MAX_CELLS or count * spec.trials > MAX_TRIALS:
+        if self.size > MAX_CELLS or self.size * spec.trials > MAX_TRIALS:
             raise ConfigurationError(
-                f"{where}: {count} cells of {spec.trials} trials;"
+                f"{where}: {self.size} cells of {spec.trials} trials;"
                 f" at most {MAX_CELLS} cells and {MAX_TRIALS} trials in all"
             )
         axes = {*spec.grid.axes(), *spec.draw.axes()}

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from harness.campaign.workers import Workers
 
 
+MOST_WORKERS = 16
+"""For each processor."""
+
+
 def add(commands: Any) -> None:
     command = commands.add_parser(
         "campaign", help="many trials over plants, changes, noise, rigs and devices, to one file of results"
@@ -100,7 +104,11 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
         with contextlib.closing(Dask(arguments.cluster)) as cluster:
             yield cluster
         return
-    count = arguments.workers if arguments.workers is not None else min(len(os.sched_getaffinity(0)), useful)
+    processors = len(os.sched_getaffinity(0))
+    count = arguments.workers if arguments.workers is not None else min(processors, useful)
+    if not 1 <= count <= MOST_WORKERS * processors:
+        most = f"{MOST_WORKERS * processors} on these {processors} processors"
+        raise ConfigurationError(f"--workers must be 1 to {most}, not {count}")
     yield ThisProcess() if alone or count == 1 else Processes(count)
 
 

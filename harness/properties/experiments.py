@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 from harness.bench import Bench
-from harness.devices import DeviceDescription, InprocDevice, from_table
+from harness.devices import DeviceDescription, InprocDevice, recorded
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
 from harness.played import Played, rate_below
@@ -39,10 +40,13 @@ _WITNESS_N = 2000
 _AFTER_N = 100
 """Samples of it after that alarm."""
 
+_EVER = 1e9
+"""Of the bound: an alarm before the next change."""
+
 
 def described(dut: Dut) -> DeviceDescription:
     """As it is configured now."""
-    return from_table({key: value for key, value in dut.description().items() if key != "identity"}, dut.name)
+    return recorded(dut.description())
 
 
 def _played(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
@@ -155,24 +159,31 @@ def changes_are_noticed_soon_and_rightly_named(
     every = _played(play, scenario, seed, plays)
     if (invalid := _invalid(*every)) is not None:
         return invalid
-    tweaks = [(played, tweak) for played in every for tweak in played.verdict.tweaks]
-    missed = [played for played, tweak in tweaks if tweak.latency_n is None or tweak.bound_n is None]
+    missed = [finding for played in every if not (finding := played.detects(_EVER))]
     if missed:
-        return Finding(holds=False, why=f"{len(missed)} of {len(tweaks)} changes were missed", run=missed[0].run)
-    ratio = sum(tweak.latency_n or 0 for _, tweak in tweaks) / sum(tweak.bound_n or 0 for _, tweak in tweaks)
+        why = f"in {len(missed)} of {plays} plays changes were missed: {missed[0].why}"
+        return Finding(holds=False, why=why, run=missed[0].run)
+    tweaks = [tweak for played in every for tweak in played.verdict.tweaks if tweak.bound_n is not None]
+    ratio = sum(tweak.latency_n or 0 for tweak in tweaks) / sum(tweak.bound_n or 0 for tweak in tweaks)
+    why = f"mean latency is {ratio:.2f} times the mean bound, allowed {latency:g}"
     if ratio > latency:
-        why = f"mean latency is {ratio:.2f} times the mean bound, allowed {latency:g}"
         return Finding(holds=False, why=why, run=_slowest(every).run)
-    said = [(played, tweak.diagnosis) for played, tweak in tweaks if tweak.diagnosis is not None]
-    wrong = [played for played, diagnosis in said if not diagnosis.right]
-    why = f"mean latency is {ratio:.2f} times the mean bound; {len(wrong)} of {len(said)} changes were called wrongly"
-    if said and lower_rate(len(wrong), len(said), confidence) > 1.0 - right:
-        return Finding(holds=False, why=f"{why}, allowed {1.0 - right:.0%}", run=wrong[0].run)
+    said = [tweak.diagnosis for tweak in tweaks if tweak.diagnosis is not None]
+    wrong_n = sum(not diagnosis.right for diagnosis in said)
+    why += f"; {wrong_n} of {len(said)} changes were called wrongly"
+    if said and lower_rate(wrong_n, len(said), confidence) > 1.0 - right:
+        first = _wrongly_named(every)
+        return Finding(holds=False, why=f"{why}, allowed {1.0 - right:.0%}: {first.why}", run=first.run)
     return Finding(holds=True, why=why)
 
 
-def _slowest(plays: list[Played]) -> Played:
+def _slowest(plays: Sequence[Played]) -> Played:
     return max(plays, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
+
+
+def _wrongly_named(plays: Sequence[Played]) -> Finding:
+    """The first of them; there is one."""
+    return next(finding for played in plays if not (finding := played.isolates()))
 
 
 @experiment
@@ -190,20 +201,22 @@ def single_changes_are_rightly_named(
     """Wald's test of the part that is called wrongly, ``expected`` against ``refuted``; a device that has named nothing
     in ``silent`` plays does not name changes at all, which is allowed."""
     test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
-    wrong = None
+    every: list[Played] = []
     for number in range(most_plays):
         played = play(scenario, seed + number, allow_inconclusive=True)
         if (invalid := _invalid(played)) is not None:
             return invalid
         right = [tweak.diagnosis.right for tweak in played.verdict.tweaks if tweak.diagnosis is not None]
-        wrong = played.run if wrong is None and not all(right) else wrong
+        every.append(played)
         test.add(len(right), right.count(False))
         if test.decision is not Decision.OPEN or (number + 1 >= silent and not test.trials):
             break
     why = f"{test.events} of {test.trials} single changes were called wrongly"
     if test.decision is Decision.BELOW or not test.trials:
         return Finding(holds=True, why=why)
-    return Finding(holds=False, why=f"{why}, expected {expected:.0%}, refuted {refuted:.0%}", run=wrong)
+    first = _wrongly_named(every)
+    why = f"{why}, where {expected:.0%} are expected and {refuted:.0%} too many: {first.why}"
+    return Finding(holds=False, why=why, run=first.run)
 
 
 # -------------------------------------------------------------------------------------------------- whatever may happen

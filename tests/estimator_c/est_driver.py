@@ -117,6 +117,15 @@ class Estimator:
         self._c.driver_variance.restype = ctypes.c_float
         self._c.driver_noise_variance.restype = ctypes.c_float
 
+    def default(self) -> Mapping[str, float]:
+        """est_config_default(), by the names that the harness has for its fields."""
+        config = Config()
+        self._c.driver_default(ctypes.byref(config))
+        names = {"kind": "trigger"}
+        fields = {names.get(name, name): getattr(config, name) for name, *_ in Config._fields_ if name != "custom"}
+        c1, c2 = fields.pop("c")
+        return fields | {"c1": c1, "c2": c2}
+
     def init(self, **changes: float | tuple[float, float]) -> bool:
         """est_init() with the default configuration and these changes."""
         config = Config()
