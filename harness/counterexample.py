@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import config
+from harness.devices import recorded
 from harness.run import Run
 from harness.statement import Statement
 
@@ -29,6 +30,8 @@ class Counterexample:
     """From which on the statement looks for plays; None: that of the run."""
     dut: str = ""
     """How the user named the device, if that is known."""
+    why: str = ""
+    """What was found instead of the statement."""
 
     def command(self, scenario: Path) -> str:
         """The line that plays the run again, from its scenario file, and the device beside it if it has no name."""
@@ -36,6 +39,11 @@ class Counterexample:
         if self.seed not in (None, self.run.conditions.seed):
             words += ["--seed", str(self.run.conditions.seed)]
         return shlex.join([*words, "--dut", self._device() or str(scenario.with_name(DEVICE_FILE))])
+
+    def suite_command(self, folder: Path) -> str:
+        """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
+        place = recorded(self.run.conditions.dut).elsewhere
+        return shlex.join(["pytest", "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
@@ -108,12 +116,12 @@ def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> st
     ``scenario``, ``rig``, ``dut``: how the user named them, if that is known: a file is recorded without its folder.
     """
     words = ["analogrig", "run", "--seed", str(run.conditions.seed)]
-    for flag, given, recorded, is_it in (
+    for flag, given, table, is_it in (
         ("--scenario", scenario, run.conditions.scenario, _is_scenario),
         ("--rig", rig, run.conditions.rig, _is_rig),
         ("--dut", dut, run.conditions.dut, _is_device),
     ):
-        name = next((name for name in (given, str(recorded["name"])) if name and is_it(name, run)), None)
+        name = next((name for name in (given, str(table["name"])) if name and is_it(name, run)), None)
         if name is None:
             return ""
         words += [flag, name]

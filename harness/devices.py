@@ -621,6 +621,14 @@ def of_scenario(filed: str, given: str, otherwise: str) -> str:
     )
 
 
+def recorded(description: Mapping[str, Any]) -> DeviceDescription:
+    """That of a record of ``Dut.description()``.
+
+    :raises ConfigurationError: it describes no device.
+    """
+    return from_table({key: value for key, value in description.items() if key != "identity"}, "the recorded device")
+
+
 def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:
     """A description from plain values; ``where`` leads every error.
 

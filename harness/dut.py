@@ -36,7 +36,7 @@ from harness.catalogue import (
     Status,
 )
 from harness.conversation import Conversation
-from harness.devices import DeviceDescription, describe, from_table
+from harness.devices import DeviceDescription, describe, recorded
 from harness.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -376,14 +376,13 @@ def reopen_dut(description: Mapping[str, Any], *, listener: CanListener | None =
 
     What a file names is not opened on its word alone: a device elsewhere must be named again.
     """
-    table = {key: value for key, value in description.items() if key != "identity"}
-    recorded = from_table(table, "the recorded device")
-    if recorded.elsewhere:
+    described = recorded(description)
+    if described.elsewhere:
         raise ConfigurationError(
-            f"the recorded device was {recorded.elsewhere}, and is not opened on the word of a recording:"
-            f" say --dut {recorded.elsewhere}, or another"
+            f"the recorded device was {described.elsewhere}, and is not opened on the word of a recording:"
+            f" say --dut {described.elsewhere}, or another"
         )
-    return connect(_changed(recorded, changes), listener)
+    return connect(_changed(described, changes), listener)
 
 
 def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:

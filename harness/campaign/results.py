@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from harness import config
-from harness.campaign.spec import Cell, Plan
+from harness.campaign.plan import Cell, Plan
 from harness.campaign.trial import Row, samples_of
 from harness.errors import ConfigurationError, RecordingError
+from harness.plant import PARAMETERS
+from harness.scenario import MAX_SAMPLES
 from harness.statistics import ConfidenceSequence
 from harness.storage import replacing
 
@@ -63,7 +66,7 @@ class Results:
         try:
             results = cls(config.build(Plan, table["plan"], str(path)), tuple(map(tuple, table["cells"])))
             results._check()
-        except (ConfigurationError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (ConfigurationError, LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise RecordingError(f"{path}: damaged results of a campaign ({error})") from error
         return results
 
@@ -88,20 +91,37 @@ class Results:
         return next((each for each in ("failed", "inconclusive") if each in outcomes), "passed")
 
     def _check(self) -> None:
-        if len(self.rows) != len(self.plan.cells()):
-            raise ValueError(f"{len(self.rows)} cells, where the plan has {len(self.plan.cells())}")
-        for row in (row for rows in self.rows for row in rows):
-            _check_row(row)
+        if len(self.rows) != self.plan.size:
+            raise ValueError(f"{len(self.rows)} cells, where the plan has {self.plan.size}")
+        spec = self.plan.spec
+        for rows in self.rows:
+            for row in rows:
+                _check_row(row)
+            if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
+                raise ValueError("rows of other seeds than the plan has")
+            if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
+                raise ValueError(f"a cell of {len(rows)} trials")
 
 
 def _check_row(row: Any) -> None:
+    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``trial.row``."""
     if row["outcome"] not in ("passed", "failed", "inconclusive"):
         raise ValueError("a row without an outcome")
     counts = [row[name] for name in ("false_alarms", "armed", "samples")]
-    if not all(type(count) is int and count >= 0 for count in (row["seed"], *counts)) or counts != sorted(counts):
+    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in counts) or counts != sorted(counts):
         raise ValueError("a row whose counts cannot be")
     if not all(_is_change(*change) for change in row["changes"]):
         raise ValueError("a change that is none")
+    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
+        raise ValueError("errors that are none")
+    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
+        raise ValueError("a text that is none")
+    if not all(map(_is_number, row.get("drawn", {}).values())):
+        raise ValueError("a drawn value that is none")
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
 def _is_change(latency_n: object, bound_n: object, missed: object, late: object) -> bool:
@@ -166,7 +186,9 @@ class Summary:
             latency_p95_n=float(latencies[-(-95 * len(latencies) // 100) - 1]) if latencies else None,
             bound_n=statistics.fmean(bounds) if bounds else None,
             error={
-                name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5 for i, name in enumerate("MBK") if errors
+                name: statistics.fmean(each[i] ** 2 for each in errors) ** 0.5
+                for i, name in enumerate(PARAMETERS)
+                if errors
             },
             doubt=next(
                 (f"seed {row['seed']}: {row.get('why', '')}" for row in rows if row["outcome"] == "inconclusive"), ""

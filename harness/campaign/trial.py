@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from harness.campaign import build
+from harness.campaign.plan import Case, Cell, Chunk, Plan
 from harness.campaign.players import Players
-from harness.campaign.spec import Case, Cell, Chunk, Plan
 from harness.catalogue import SteppedFlag
 from harness.errors import ConfigurationError, DeviceError, LinkError, RigError
 from harness.exposure import exposure
@@ -64,7 +65,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
     """What is kept of a trial.
 
     ``armed``: the samples in which the trigger was armed. ``changes``: for each [latency or null, bound or null,
-    missed, late], in samples. ``errors``: relative errors of M, B, K at the end, or null. ``theta``: the first digits
+    missed, late], in samples. ``errors``: relative errors of M, B, K at the end, or none. ``theta``: the first digits
     of the hash of all estimates, which tells builds apart. ``why``: the first reason why it has not passed. A trial
     that shows nothing, since the trigger was never armed, is inconclusive.
     """
@@ -80,9 +81,15 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
         armed=shown.armed,
         false_alarms=len(verdict.false_alarms),
         changes=[_change(tweak) for tweak in verdict.tweaks],
-        errors=list(verdict.estimates[-1].error.values()) if verdict.estimates else [],
+        errors=_errors(verdict),
         theta=verdict.theta_hash[:16],
     )
+
+
+def _errors(verdict: Verdict) -> list[float]:
+    """Of the last estimate; one of numbers beyond all measure is none."""
+    found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
+    return found if all(map(math.isfinite, found)) else []
 
 
 _NOTHING: Row = {"samples": 0, "armed": 0, "false_alarms": 0, "changes": [], "errors": [], "theta": ""}

@@ -14,8 +14,12 @@ from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, sh
 
 if TYPE_CHECKING:
     from harness.campaign.conduct import Tally
-    from harness.campaign.spec import Plan
+    from harness.campaign.plan import Plan
     from harness.campaign.workers import Workers
+
+
+MOST_WORKERS = 16
+"""For each processor."""
 
 
 def add(commands: Any) -> None:
@@ -54,9 +58,10 @@ def begin(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from harness.campaign.conduct import conduct, journal_of, unreachable
+    from harness.campaign.plan import Plan, one_worker_only
     from harness.campaign.report import page_of, write_page
     from harness.campaign.results import as_json, text
-    from harness.campaign.spec import CampaignSpec, Plan, one_worker_only
+    from harness.campaign.spec import CampaignSpec
     from harness.errors import WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))
@@ -100,7 +105,11 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
         with contextlib.closing(Dask(arguments.cluster)) as cluster:
             yield cluster
         return
-    count = arguments.workers if arguments.workers is not None else min(len(os.sched_getaffinity(0)), useful)
+    processors = len(os.sched_getaffinity(0))
+    count = arguments.workers if arguments.workers is not None else min(processors, useful)
+    if not 1 <= count <= MOST_WORKERS * processors:
+        most = f"{MOST_WORKERS * processors} on these {processors} processors"
+        raise ConfigurationError(f"--workers must be 1 to {most}, not {count}")
     yield ThisProcess() if alone or count == 1 else Processes(count)
 
 

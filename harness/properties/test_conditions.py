@@ -40,14 +40,16 @@ that is not taken from this plant, of a damping ratio of 0.4, leaves them colour
 def test_edges_that_drift_past_the_samples_are_no_change(play: Play, drift_ppm: float, seed: int) -> None:
     phase = 2e-4 if drift_ppm < 0.0 else 1.0 - 2e-4  # they come to a sample's instant after a thousand samples
     excitation = Excitation(low_v=0.1, high_v=9.9, phase=phase, clock="free", drift_ppm=drift_ppm)
-    assert with_some_seed(play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
+    found = with_some_seed(play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
+    assert found
 
 
 @pytest.mark.parametrize("rig", ["emulator-0-10v"], indirect=True)
 @profile()
 @given(seed=seeds())
 def test_samples_that_are_missing_are_no_change(play: Play, seed: int) -> None:
-    assert with_some_seed(play, "thesis", seed, Played.passes)
+    found = with_some_seed(play, "thesis", seed, Played.passes)
+    assert found
 
 
 @profile()
@@ -56,12 +58,13 @@ def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
     play: Play, drawn: st.DataObject, seed: int
 ) -> None:
     faults = drawn.draw(link_faults(sorted(described(play.bench.dut).fault_kinds())), "faults of the line")
-    assert faults_of_the_line_do_no_harm(play, SHORT, seed, faults)
+    found = faults_of_the_line_do_no_harm(play, SHORT, seed, faults)
+    assert found
 
 
 @pytest.mark.needs("excite")
 def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(play: Play) -> None:
-    assert false_alarms_at_most(
+    found = false_alarms_at_most(
         play,
         Scenario.load("healthy"),
         0,
@@ -69,11 +72,12 @@ def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(play: Pla
         samples=CERTIFIED.trials,
         samples_each=CERTIFIED_RUN_N,
     )
+    assert found
 
 
 @pytest.mark.needs("excite")
 def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(play: Play) -> None:
-    assert false_alarms_of_plants_rarer(
+    found = false_alarms_of_plants_rarer(
         play,
         Scenario.load("healthy"),
         1,
@@ -82,13 +86,14 @@ def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(play: Play
         plants=PLANTS_N,
         samples_each=CERTIFIED_RUN_N,
     )
+    assert found
 
 
 @pytest.mark.needs("excite")
 def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(play: Play) -> None:
     healthy = Scenario.load("healthy")
     excitation = dataclasses.replace(healthy.excitation, high_v=8.0)
-    assert rare_false_alarms_rarer(
+    found = rare_false_alarms_rarer(
         play,
         dataclasses.replace(healthy, plant=HEAVY, excitation=excitation),
         0,
@@ -97,3 +102,4 @@ def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(play
         estimates=HEAVY_ESTIMATES_N,
         branches=HEAVY_BRANCHES_N,
     )
+    assert found

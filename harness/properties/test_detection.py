@@ -26,9 +26,10 @@ MOST_INFORMATION = 6.0
 MOST_SLACK_N = 40
 PATIENT = Expectations(late_information_ratio=MOST_INFORMATION, late_slack_n=MOST_SLACK_N)
 
-PLAYS_N = 40
-MOST_LATENCY = 1.35
-"""Mean latency over mean bound: 1.20 on the thesis profile, with a standard error of 0.025 over PLAYS_N plays."""
+PLAYS_N, MOST_PLAYS_N = 40, 100
+MOST_LATENCY, DOUBTFUL_LATENCY = 1.35, 1.42
+"""Mean latency over mean bound: 1.22 on the thesis profile, with a standard error of 0.029 over PLAYS_N plays; what is
+between the two is played MOST_PLAYS_N times."""
 LEAST_RIGHT, SURELY = 0.9, 1.0 - 1e-7
 """Of the diagnoses on the thesis profile, of which two are hard: M falls by three quarters, B and K change at once."""
 
@@ -62,7 +63,8 @@ SINGLY = Scenario(
 def test_every_change_that_can_be_seen_is_found_once(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
     assume(is_playable(rig, scenario))
     assume(detectable(scenario, ARL0**MOST_INFORMATION))
-    assert with_some_seed(play, scenario, seed, Played.passes)
+    found = with_some_seed(play, scenario, seed, Played.passes)
+    assert found
 
 
 @pytest.mark.needs("excite")
@@ -70,19 +72,29 @@ def test_every_change_that_can_be_seen_is_found_once(rig: Rig, play: Play, scena
 @given(scenario=scenarios(most_changes=0), seed=seeds())
 def test_a_plant_that_does_not_change_raises_no_alarm(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
     assume(is_playable(rig, scenario))
-    assert with_some_seed(play, scenario, seed, Played.stays_quiet)
+    found = with_some_seed(play, scenario, seed, Played.stays_quiet)
+    assert found
 
 
 @pytest.mark.needs("tweak", "excite")
 def test_changes_are_noticed_soon_and_rightly_named(play: Play) -> None:
-    assert changes_are_noticed_soon_and_rightly_named(
-        play, Scenario.load("thesis"), 0, plays=PLAYS_N, latency=MOST_LATENCY, right=LEAST_RIGHT, confidence=SURELY
+    found = changes_are_noticed_soon_and_rightly_named(
+        play,
+        Scenario.load("thesis"),
+        0,
+        plays=PLAYS_N,
+        latency=MOST_LATENCY,
+        doubtful_latency=DOUBTFUL_LATENCY,
+        most_plays=MOST_PLAYS_N,
+        right=LEAST_RIGHT,
+        confidence=SURELY,
     )
+    assert found
 
 
 @pytest.mark.needs("tweak", "excite")
 def test_a_single_change_is_rightly_named(play: Play) -> None:
-    assert single_changes_are_rightly_named(
+    found = single_changes_are_rightly_named(
         play,
         SINGLY,
         0,
@@ -93,3 +105,4 @@ def test_a_single_change_is_rightly_named(play: Play) -> None:
         most_plays=MOST_SINGLE_PLAYS_N,
         silent=SILENT_N,
     )
+    assert found

@@ -43,7 +43,8 @@ def estimates(played: Played) -> Finding:
 @given(scenario=scenarios(most_changes=0), seed=seeds())
 def test_estimates_come_to_the_truth(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
     assume(is_playable(rig, scenario))
-    assert with_some_seed(play, scenario, seed, estimates)
+    found = with_some_seed(play, scenario, seed, estimates)
+    assert found
 
 
 @profile()
@@ -51,16 +52,19 @@ def test_estimates_come_to_the_truth(rig: Rig, play: Play, scenario: Scenario, s
 def test_whatever_comes_the_device_answers_with_numbers(
     play: Play, drawn: EmulatorDescription, scenario: Scenario, seed: int
 ) -> None:
-    assert answers_with_numbers(play.on(EmulatorRig(drawn), play.bench.dut), scenario, seed)
+    found = answers_with_numbers(play.on(EmulatorRig(drawn), play.bench.dut), scenario, seed)
+    assert found
 
 
 @pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
 def test_a_pause_of_the_excitation_does_no_harm(play: Play) -> None:
-    assert pause_does_no_harm(play, PAUSED, 1, until=PAUSE_END_N)
+    found = pause_does_no_harm(play, PAUSED, 1, until=PAUSE_END_N)
+    assert found
 
 
 @pytest.mark.needs("excite")
 def test_alarms_keep_the_hold_off_and_the_warm_up(play: Play) -> None:
-    assert alarms_keep_hold_off_and_warm_up(
+    found = alarms_keep_hold_off_and_warm_up(
         play, STEADY, 1, hold_off_n=HOLD_OFF_N, warm_up_n=WARM_UP_N, at_least=AT_LEAST
     )
+    assert found

@@ -69,7 +69,7 @@ class Record:
         runs = [played.run for played in self.plays]
         run = finding.run or next((each for each in runs if each.conditions.seed == seed), runs[-1])
         statement = finding.statement and dataclasses.replace(finding.statement, test=item.nodeid)
-        return Counterexample(run, statement, seed, DUT.of(item))
+        return Counterexample(run, statement, seed, DUT.of(item), finding.why)
 
 
 _RECORD = pytest.StashKey[Record]()
@@ -79,12 +79,12 @@ def record_of(item: pytest.Item) -> Record:
     return item.stash.setdefault(_RECORD, Record())
 
 
-@dataclass(frozen=True, repr=False)
 class Player:
     """Plays for one test, and keeps what it has played: ``harness.statement.Play``."""
 
-    item: pytest.Item
-    bench: Bench
+    def __init__(self, item: pytest.Item, bench: Bench) -> None:
+        self.item = item
+        self.bench = bench
 
     def __call__(
         self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
@@ -149,6 +149,7 @@ def _kept_if_it_fails(tried: Callable[..., None], item: pytest.Item) -> Callable
 
     @functools.wraps(tried)
     def example(*args: Any, **kwargs: Any) -> None:
+        __tracebackhide__ = True
         record.begin()
         try:
             tried(*args, **kwargs)
@@ -173,7 +174,8 @@ def _keep(record: Record, item: pytest.Item) -> None:
 
 
 def left_by(item: pytest.Item) -> str:
-    """Writes what a test that failed leaves; says where, and how to repeat it. Empty: it has played nothing.
+    """Writes what a test that failed leaves; says what was found, in full, where it is, and how to repeat it.
+    Empty: it has played nothing.
 
     A scenario of --scenario-dir is there already: what it leaves shall not be one more of them.
     """
@@ -183,16 +185,17 @@ def left_by(item: pytest.Item) -> str:
     shown = record.shown or record.counterexample(item)
     if shown is None:
         return ""
+    lines = [f"found: {shown.why}"] if shown.why else []
     suite = SCENARIO_DIR.of(item)
     if suite and all(each.resolve().is_relative_to(Path(suite).resolve()) for each in (item.path, folder)):
-        return f"repeat it with: {shown.command(item.path)}"
+        return "\n".join([*lines, f"repeat it with: {shown.command(item.path)}"])
     try:
         shown.write(folder)
     except _unwritten() as error:
-        return f"its recording could not be written to {folder}: {error}"
-    lines = [f"recording and scenario: {folder}", f"repeat it with: {shown.command(folder / SCENARIO_FILE)}"]
+        return "\n".join([*lines, f"its recording could not be written to {folder}: {error}"])
+    lines += [f"recording and scenario: {folder}", f"repeat it with: {shown.command(folder / SCENARIO_FILE)}"]
     if shown.statement is not None:
-        lines.append(f"judge it again with: pytest --scenario-dir {folder}")
+        lines.append(f"judge it again with: {shown.suite_command(folder)}")
     return "\n".join(lines)
 
 

@@ -55,7 +55,10 @@ class ScenarioFile(pytest.File):
     """A file of --scenario-dir."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        yield ScenarioItem.from_parent(self, name=self.path.stem)
+        from harness.counterexample import SCENARIO_FILE
+
+        is_left = self.path.name == SCENARIO_FILE  # by a test, after which its folder is called
+        yield ScenarioItem.from_parent(self, name=self.path.parent.name if is_left else self.path.stem)
 
 
 class ScenarioItem(pytest.Item):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
+from harness.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
 
 # y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.
@@ -80,14 +81,17 @@ def test_estimate_is_the_weighted_least_squares_one(
         assert theta[n - 1] == pytest.approx(expected, rel=2e-3, abs=2e-4)
 
 
-def test_variance_is_that_of_least_squares(estimator: Estimator) -> None:
+@pytest.mark.parametrize("forgetting", [1.0, 0.97])
+def test_variance_is_that_of_least_squares(estimator: Estimator, forgetting: float) -> None:
     data = record(noise=3.0)
-    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=1.0)
+    assert estimator.init(**SETTINGS, c=(0.0, 0.0), forgetting=forgetting)
     variance = estimator.run(*data).variance
     phi = np.column_stack([-delayed(data.y, 1), -delayed(data.y, 2), data.u, delayed(data.u, 1), np.ones(len(data.u))])[
         2:
     ]
-    covariance = np.linalg.inv(phi.T @ phi + np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]))
+    weight = forgetting ** np.arange(len(phi) - 1, -1, -1.0)
+    prior = np.diag([0.1, 0.1, 0.1, 0.1, 1e-4]) * forgetting ** len(phi)
+    covariance = np.linalg.inv((phi.T * weight) @ phi + prior)
     assert variance == pytest.approx(np.diag(covariance), rel=1e-2)
 
 
@@ -149,6 +153,12 @@ def test_lost_excitation_does_not_wind_up(estimator: Estimator) -> None:
     assert result.theta[-400 + 30, :4] == pytest.approx([0.5, 0.8, 0.0, -0.9], abs=0.02)
 
 
+def test_default_configuration_is_that_of_the_harness(estimator: Estimator) -> None:
+    harness = {key.name.lower(): np.float32(value) for key, value in EstimatorConfig().settings()}
+    default = estimator.default()
+    assert default == {name: harness[name] for name in default}
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -177,7 +187,7 @@ def test_lost_excitation_does_not_wind_up(estimator: Estimator) -> None:
         {"edge_codes": 0.0},
         {"edge_codes": 1.1e6},
         {"code_low": -1.1e6},
-        {"code_high": 1.1e6},
+        {"code_high": 1.000001e6},
         {"random_walk": 1.1e9},
         {"nc": 3},
         {"ceiling": 1.1e9},
