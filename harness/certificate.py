@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from harness import config
-from harness.campaign.spec import Case, device_of, open_table
+from harness.campaign.plan import Case, device_of, open_table
 from harness.campaign.trial import Count, close_devices, count_alarms
 from harness.campaign.workers import Workers
 from harness.errors import ConfigurationError
@@ -67,7 +67,7 @@ class Question:
     far: float
     confidence: float
     rig: Any
-    """In plain values, as ``campaign.spec.open_table`` takes it."""
+    """In plain values, as ``campaign.plan.open_table`` takes it."""
     device: Any
     scenario: Any
     first_seed: int = 0

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.journal import Journal
+from harness.campaign.plan import Chunk, Plan, device_as_planned
 from harness.campaign.results import Results
-from harness.campaign.spec import Chunk, Plan, device_as_planned
 from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
 from harness.campaign.workers import Workers
 from harness.devices import InprocDevice

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from harness.campaign.spec import Chunk, Plan
+from harness.campaign.plan import Chunk, Plan
 from harness.campaign.trial import Row
 from harness.errors import ConfigurationError, RecordingError
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import config
-from harness.campaign.spec import Cell, Plan
+from harness.campaign.plan import Cell, Plan
 from harness.campaign.trial import Row, samples_of
 from harness.errors import ConfigurationError, RecordingError
 from harness.plant import PARAMETERS

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from harness.campaign import build
+from harness.campaign.plan import Case, Cell, Chunk, Plan
 from harness.campaign.players import Players
-from harness.campaign.spec import Case, Cell, Chunk, Plan
 from harness.catalogue import SteppedFlag
 from harness.errors import ConfigurationError, DeviceError, LinkError, RigError
 from harness.exposure import exposure

@@ -31,6 +31,7 @@ from harness.rigs.instrument import Instrument, PotBox, Record, Turn, located
 from harness.rigs.lock import Lock
 from harness.rigs.pots import NoPots, Pots
 from harness.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
+from harness.rigs.self_test.conduct import self_test
 from harness.rigs.wiring import InstrumentPots, RealDescription, check_wiring
 from harness.run import CHANNELS, MEASURED, Channel, Segment
 from harness.scenario import Scenario
@@ -345,8 +346,6 @@ class RealRig:
 
         :raises RigError: it failed.
         """
-        from harness.self_test.conduct import self_test
-
         try:
             findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
         except (SelfTestError, ConfigurationError) as error:

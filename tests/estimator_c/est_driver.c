@@ -112,7 +112,7 @@ int driver_invariants_hold_if_damaged(int way) {
     switch (way) {
     case 0: self.config = 0; break;
     case 1: self.config = &invalid; break;
-    case 2: self.count++; break;
+    case 2: self.factors.weight = 0.0F; break;
     case 3: self.factors.d[1] = -1.0F; break;
     case 4: self.theta[0] = __builtin_nanf(""); break;
     case 5: self.trigger.statistic = -1.0F; break;

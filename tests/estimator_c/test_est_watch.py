@@ -53,18 +53,18 @@ def test_a_gap_ends_the_doubt_about_an_edge(estimator: Estimator) -> None:
     valid = np.ones(N)
     refreshes = []
     for valid[12] in (1, 0):
-        assert estimator.init(refresh_n=9)
-        refreshes.append(estimator.run(u[:19], y[:19], valid[:19]).counters["refreshes"])
+        assert estimator.init(refresh_n=14)
+        refreshes.append(estimator.run(u[:22], y[:22], valid[:22]).counters["refreshes"])
     assert refreshes == [0, 1]
 
 
 @pytest.mark.parametrize("refresh_n", [9, 10])
 def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refresh_n: int) -> None:
-    """EST_DOUBT_N of est_edges.h. C, due before, is taken with the first equation after them."""
+    """EST_DOUBT_N of est_edges.h. C, due before, is considered after them, compared an equation later, then taken."""
     u, y = front()
     edge = 10
     refreshes = []
-    for samples in (edge + 12, edge + 13):
+    for samples in (edge + 14, edge + 15):
         assert estimator.init(refresh_n=refresh_n)
         refreshes.append(estimator.run(u[:samples], y[:samples]).counters["refreshes"])
     assert refreshes == [0, 1]

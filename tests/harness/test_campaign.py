@@ -20,8 +20,9 @@ from harness.bench import Bench
 from harness.campaign import players
 from harness.campaign.conduct import Tally, conduct, journal_of
 from harness.campaign.journal import Journal
+from harness.campaign.plan import Chunk, Plan, one_worker_only, rig_table
 from harness.campaign.results import Results, Summary, text
-from harness.campaign.spec import CampaignSpec, Chunk, Plan, one_worker_only, rig_table
+from harness.campaign.spec import CampaignSpec
 from harness.campaign.trial import close_devices, play_chunk, row
 from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
@@ -598,6 +599,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     with Journal(journal_of(out), plan) as journal:
         journal.add(Chunk((0, 0)), play_chunk(plan.as_json(), (0, 0)))
     kept = journal_of(out).read_bytes()
+    library.unlink()  # as a linker does: it is still loaded
     library.write_bytes(LIBRARY.read_bytes())
     close_devices()
     with pytest.raises(ConfigurationError, match=r"own\.so is another build than the one that the campaign was begun"):

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
+from harness.campaign.plan import Plan
 from harness.campaign.report import render, write_page
 from harness.campaign.results import Results
-from harness.campaign.spec import CampaignSpec, Grid, Plan
+from harness.campaign.spec import CampaignSpec, Grid
 from harness.campaign.trial import Row
 from tests.browser import Watched
 

@@ -15,8 +15,9 @@ import pytest
 from scipy import stats
 
 from harness.bench import Bench
-from harness.campaign.comparison import Difference, _worded, compare, load, matched, permutation_p, sign_flip_p
-from harness.campaign.spec import rig_table
+from harness.campaign.comparison import Difference, _worded, compare, permutation_p, sign_flip_p
+from harness.campaign.plan import rig_table
+from harness.campaign.sides import load, matched
 from harness.campaign.trial import Count, Row
 from harness.campaign.workers import Processes, ThisProcess
 from harness.certificate import Certificate, Question, certify, question_of

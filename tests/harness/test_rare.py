@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from harness import rare
-from harness.campaign.spec import rig_table
+from harness.campaign.plan import rig_table
 from harness.campaign.workers import Processes, ThisProcess
 from harness.certificate import certify, estimate_once, question_of
 from harness.cli import main
