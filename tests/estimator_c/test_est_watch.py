@@ -201,11 +201,8 @@ def test_walking_parameters_are_followed_where_forgetting_nothing_is_stuck(estim
 def test_variance_of_walking_parameters_grows_without_excitation_up_to_the_prior(estimator: Estimator) -> None:
     """By 1 / forgetting (thesis Equ 3.21) and the walk (3.23) an equation."""
     p0, walk = 1e4, 1.0
-    assert estimator.init(
-        **{"na": 1, "nb": 1, "offset": 0, "refresh_n": 0, "stuck_n": 0, "kind": NONE},
-        **{"p0": p0, "forgetting": 0.5, "random_walk": walk},
-        c=(0.0, 0.0),
-    )
+    settings = {"na": 1, "nb": 1, "offset": 0, "p0": p0, "forgetting": 0.5, "random_walk": walk, "kind": NONE}
+    assert estimator.init(**settings, c=(0.0, 0.0), refresh_n=0, stuck_n=0)
     rng = np.random.default_rng(1)
     estimator.run(rng.normal(0.0, 1000.0, 50), rng.normal(0.0, 1000.0, 50))
     estimator.run(np.zeros(3), np.zeros(3))
