@@ -12,32 +12,30 @@
 #endif
 
 #define EFFECTS EST_ISOLATION_EFFECTS_N
-#define PUSH 3U  ///< the effect that stands for an onset between those that are tried
-#define NEVER UINT8_MAX
-
-#define EARLIEST_N 24U  ///< before the alarm
-#define LATEST_N 1U
+#define PUSH 3U  ///< the effect that stands for an onset between those that are tried; M, B and K are those before it
 
 /// Samples after an alarm before theta is taken for the plant again, and after which the extent is refined no more.
 #define SETTLED_N 100U
 
-/// In nats: one of two rivals at 2.5 % each; as much as a second change may explain by chance, onset and magnitude being at
-/// its choice; and what none but a second change explains.
-#define SURE 3.64F
-#define BY_CHANCE 2.0F
+/// In nats, by how much a change alone must be likelier than any other one alone, 20 times; than the two others together, 1.5
+/// times: as long as no force acts they explain just the same, and then soon far less; and than it and a second one by
+/// WORTH_TELLING or more, 7 times.
+#define SURE 3.0F
+#define MORE_LIKELY 0.4F
+#define ALONE 2.0F
+#define WORTH_TELLING 0.15F
+
+/// In nats: what none but a second change explains; and what an onset between two samples must explain more than one at a
+/// sample, since it has a number of its own to do so.
 #define NOT_BY_CHANCE 11.0F
+#define BETWEEN 2.0F
 
-/// In nats: by how much one change alone must lead the two others together, which have a magnitude more to fit the samples with.
-/// M alone is soon like a B and a K that grow alike, and so on round.
-#define AGAINST_TWO 2.0F
+/// The extent is not told before it is known to a standard deviation of 1.1 %. Here and in the normal equations a reciprocal
+/// variance is halved: what a deviation costs in nats is its square times that.
+#define EXTENT_KNOWN 4000.0F
 
-/// A second change must be known to so much before it is ruled out: a standard deviation of 5 %.
-#define RULED_OUT 400.0F
-
-/// The extent is not told before it is known to a standard deviation of 0.8 %.
-#define EXTENT_KNOWN 16000.0F
-
-/// Reciprocal variance, per noise variance, below which a change is not known at all.
+/// What is known of a change before any sample: a standard deviation of 1; and of a push: nothing.
+#define PRIOR 0.5F
 #define UNKNOWN 1.0e-3F
 
 /// Enough for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
@@ -185,10 +183,9 @@ static void drive(const est_isolation_t* const self, const uint32_t ago, const u
             damper += plant->damper[i] * x;
         }
     }
-    out[0]    = spring + damper - pushed(self, ago, age_n);
-    out[1]    = -damper;
-    out[2]    = -spring;
-    out[PUSH] = (age_n == 1U) ? 1.0F : 0.0F;
+    out[0] = spring + damper - pushed(self, ago, age_n);
+    out[1] = -damper;
+    out[2] = -spring;
 }
 
 /// y less what the plant as it was would have done, from its equation, whitened by C as in est_whitener.h.
@@ -206,95 +203,142 @@ static void enter_residual(est_isolation_t* const self, const uint32_t ago) {
 }
 
 static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
-    float  driving[EFFECTS];
-    float* matrix = onset->matrix;
-    drive(self, ago, age_n, driving);
+    float        first[PUSH];
+    const float* driving = self->driving;
+    float*       matrix  = onset->matrix;
+    if (age_n == 1U) {
+        drive(self, ago, age_n, first);
+        driving = first;
+    }
     for (uint8_t i = 0U; i < EFFECTS; i++) {
-        float* const past = onset->past[i];
-        const float  now  = driving[i] - (self->believed.c[0] * past[0]) - (self->believed.c[1] * past[1]);
-        past[1]           = past[0];
-        past[0]           = now;
-        onset->vector[i] += now * self->residual[0];
+        float* const past   = onset->past[i];
+        const float  pushes = (age_n == 1U) ? 1.0F : 0.0F;
+        const float  drives = (i == PUSH) ? pushes : driving[i];
+        const float  now    = drives - (self->believed.c[0] * past[0]) - (self->believed.c[1] * past[1]);
+        const float  weight = now * self->nats;
+        past[1]             = past[0];
+        past[0]             = now;
+        onset->vector[i] += weight * self->residual[0];
         for (uint8_t j = 0U; j <= i; j++) {
-            *matrix++ += now * onset->past[j][0];
+            *matrix++ += weight * onset->past[j][0];
         }
     }
 }
 
 // ---------------------------------------------        VERDICT         ---------------------------------------------
 
-/// An element of the normal equations once the push is eliminated; i >= j.
-static float element(const est_onset_t* const self, const uint8_t i, const uint8_t j) {
-    const float* const push = &self->matrix[6];
-    return self->matrix[((i * (i + 1U)) / 2U) + j] - ((push[i] * push[j]) / (push[PUSH] + UNKNOWN));
+static float greater(const float a, const float b) { return (a > b) ? a : b; }
+
+/// ln(exp(a) + exp(b)), to 0.03.
+static float either(const float a, const float b) {
+    const float most  = greater(a, b);
+    const float least = (a > b) ? b : a;
+    const float near  = greater(2.83F - (most - least), 0.0F);
+    return most + ((0.0866F * near) * near);
 }
 
-/// Of the pair i > j, whose number is i + j - 1.
-static void judge_pair(est_fit_t* const fit, const est_onset_t* const onset, const float* const vector, const float gain, const uint8_t i, const uint8_t j) {
-    const uint8_t pair = (uint8_t)(i + j - 1U);
-    const float   jj   = element(onset, j, j) + UNKNOWN;
-    const float   ij   = element(onset, i, j);
-    const float   left = element(onset, i, i) + UNKNOWN - (ij * ij / jj);
-    const float   rest = vector[i] - (ij * vector[j] / jj);
-    if (left > UNKNOWN) {
-        const float both = gain + (vector[j] * vector[j] / jj) + (rest * rest / left);
-        if (both > fit->pair[pair]) {
-            const float ii       = element(onset, i, i) + UNKNOWN;
-            fit->pair[pair]      = both;
-            fit->certainty[pair] = (ii > jj) ? ((left * jj) / ii) : left;
-        }
-    }
+/// What is left of a gain if a change x, known so well, must be worth telling.
+static float if_worth_telling(const float gain, const float x, const float known) {
+    const float size = (x < 0.0F) ? -x : x;
+    const float lack = greater(WORTH_TELLING - size, 0.0F);
+    return gain - ((known * lack) * lack);
 }
 
-/// What this onset explains, if it explains more than the others did.
-static void judge(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
-    const float push    = onset->vector[PUSH];
-    const float gain    = push * push / (onset->matrix[9] + UNKNOWN);
-    float       vector[3];
-    fit->onset[number] = 0.0F;
-    for (uint8_t i = 0U; i < 3U; i++) {
-        vector[i]         = onset->vector[i] - (onset->matrix[6U + i] * push / (onset->matrix[9] + UNKNOWN));
-        const float ii    = element(onset, i, i) + UNKNOWN;
-        const float alone = gain + (vector[i] * vector[i] / ii);
+/// One change, as the normal equations have it. Private.
+typedef struct {
+    float vector;
+    float known;   ///< half its reciprocal variance
+    float change;  ///< likeliest
+    float gain;
+} one_t;
+
+/// Of the pair i > j, whose number is i + j - 1; `ij`: their element of the normal equations.
+static void weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
+    const uint8_t pair  = (uint8_t)(i + j - 1U);
+    const float   share = ij / ones[j].known;
+    const float   left  = greater(ones[i].known - (ij * share), PRIOR);  // is not less but for rounding
+    const float   rest  = ones[i].vector - (share * ones[j].vector);
+    const float   x     = rest / left;
+    const float   both  = ones[j].gain + (rest * x);
+    fit->any_pair[pair] = either(fit->any_pair[pair], both);
+    fit->beside[j]      = greater(fit->beside[j], if_worth_telling(both, x, left));
+    fit->beside[i] =
+        greater(fit->beside[i], if_worth_telling(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
+}
+
+/// What an onset explains, with normal equations of M, B and K alone; `gain`: what it explains without them.
+static void weigh(est_fit_t* const fit, const float* const matrix, const float* const vector, const float gain, const uint8_t number, const uint8_t before_n) {
+    one_t        ones[PUSH];
+    const float* row = matrix;
+    for (uint8_t i = 0U; i < PUSH; i++) {
+        const float known  = row[i] + PRIOR;
+        const float change = vector[i] / known;
+        const float alone  = gain + (vector[i] * change);
+        ones[i]            = (one_t){ .vector = vector[i], .known = known, .change = change, .gain = alone };
+        fit->any_alone[i]  = either(fit->any_alone[i], alone);
+        fit->onset[number] = greater(fit->onset[number], alone);
         if (alone > fit->alone[i]) {
             fit->alone[i]    = alone;
-            fit->change[i]   = vector[i] / ii;
-            fit->known[i]    = ii;
-            fit->before_n[i] = onset->before_n;
+            fit->change[i]   = change;
+            fit->known[i]    = known;
+            fit->before_n[i] = before_n;
         }
-        fit->onset[number] = (alone > fit->onset[number]) ? alone : fit->onset[number];
         for (uint8_t j = 0U; j < i; j++) {
-            judge_pair(fit, onset, vector, gain, i, j);
+            weigh_pair(fit, ones, i, j, row[j]);
+        }
+        row = &row[i + 1U];
+    }
+}
+
+/// What this onset explains if it is at its sample.
+static void judge(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
+    fit->onset[number] = 0.0F;
+    weigh(fit, onset->matrix, onset->vector, 0.0F, number, onset->before_n);
+}
+
+/// The same if it is between its sample and another: with a push, which is eliminated.
+static void judge_pushed(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
+    const float* const push   = &onset->matrix[6];
+    const float        known  = push[PUSH] + UNKNOWN;
+    const float        change = onset->vector[PUSH] / known;
+    float              matrix[6];
+    float              vector[PUSH];
+    uint8_t            at = 0U;
+    for (uint8_t i = 0U; i < PUSH; i++) {
+        const float share = push[i] / known;
+        vector[i]         = onset->vector[i] - (push[i] * change);
+        for (uint8_t j = 0U; j <= i; j++) {
+            matrix[at] = onset->matrix[at] - (share * push[j]);
+            at++;
         }
     }
+    weigh(fit, matrix, vector, (change * onset->vector[PUSH]) - BETWEEN, number, onset->before_n);
 }
 
 static void begin_round(est_fit_t* const fit) { *fit = (est_fit_t){ .alone = { 0.0F } }; }
 
-/// The parameter that explains most alone.
+/// The likeliest parameter.
 static uint8_t best(const est_fit_t* const fit) {
-    const uint8_t first = (fit->alone[1] > fit->alone[0]) ? 1U : 0U;
-    return (fit->alone[2] > fit->alone[first]) ? 2U : first;
+    const uint8_t first = (fit->any_alone[1] > fit->any_alone[0]) ? 1U : 0U;
+    return (fit->any_alone[2] > fit->any_alone[first]) ? 2U : first;
 }
 
-/// What can be said so far. `unit`: squared codes per nat.
-static est_change_t verdict(const est_fit_t* const fit, const float unit, const float noise_variance) {
+/// What can be said so far.
+static est_change_t verdict(const est_fit_t* const fit) {
     static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
     const uint8_t one    = best(fit);
-    const float   two = fit->pair[2U - one];  // of the two others
-    bool ruled = (fit->known[one] > (EXTENT_KNOWN * noise_variance)) && ((fit->alone[one] - two) >= (AGAINST_TWO * unit));
+    const float   likely = fit->any_alone[one];
+    bool          sure   = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
+                ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
     for (uint8_t other = 0U; other < 3U; other++) {
         if (other != one) {
-            const uint8_t pair   = (uint8_t)(one + other - 1U);
-            const float   second = fit->pair[pair] - fit->alone[one];
-            if (second > (NOT_BY_CHANCE * unit)) {
+            if ((fit->any_pair[one + other - 1U] - likely) > NOT_BY_CHANCE) {
                 return EST_CHANGE_SEVERAL;  // MISRA D4
             }
-            ruled = ruled && (second < (BY_CHANCE * unit)) && (fit->certainty[pair] > (RULED_OUT * noise_variance)) &&
-                    ((fit->alone[one] - fit->alone[other]) >= (SURE * unit));
+            sure = sure && ((likely - fit->any_alone[other]) >= SURE);
         }
     }
-    return ruled ? alone[one] : EST_CHANGE_UNDECIDED;
+    return sure ? alone[one] : EST_CHANGE_UNDECIDED;
 }
 
 /// 1 - old/new of M; new/old - 1 of B and K.
@@ -305,22 +349,23 @@ static float extent_of(const est_change_t change, const float x) {
     return 1.0F + x;
 }
 
+/// The sample that is worked on comes after the alarm.
+static bool is_after_alarm(const est_isolation_t* const self) { return self->worked_n > self->onsets[0].before_n; }
+
 static void diagnose(est_isolation_t* const self) {
-    est_diagnosis_t* const out  = &self->diagnosis;
-    const float            unit = 2.0F * self->noise_variance;
-    const uint16_t         to_alarm_n = self->onsets[0].before_n;
-    if (self->worked_n <= to_alarm_n) {
+    est_diagnosis_t* const out = &self->diagnosis;
+    if (!is_after_alarm(self)) {
         return;  // MISRA D4
     }
-    out->samples_n = (uint16_t)(self->worked_n - to_alarm_n);
+    out->samples_n = (uint16_t)(self->worked_n - self->onsets[0].before_n);
     if (out->change == EST_CHANGE_UNDECIDED) {
-        out->change = verdict(&self->fit, unit, self->noise_variance);
+        out->change = verdict(&self->fit);
     }
     if ((out->change == EST_CHANGE_UNDECIDED) || (out->change == EST_CHANGE_SEVERAL)) {
         return;  // MISRA D4
     }
     const uint8_t one   = (uint8_t)((uint8_t)out->change - 1U);
-    const float   level = self->fit.alone[one] - (2.0F * unit);
+    const float   level = self->fit.alone[one] - 2.0F;
     out->extent         = extent_of(out->change, self->fit.change[one]);
     out->onset_n        = self->fit.before_n[one];
     out->onset_low_n    = out->onset_n;
@@ -339,48 +384,34 @@ static void diagnose(est_isolation_t* const self) {
 static void stop(est_isolation_t* const self) {
     self->active    = false;
     self->waiting_n = 0U;
-    self->quiet_n   = NEVER;
+    self->quiet     = false;
 }
 
-/// Onsets are tried around the last sample whose statistic was zero: the sooner the alarm, the stronger the change, the
-/// closer together. What a push makes up for is an onset so far off that the force of the change has not yet moved y.
-static uint32_t spacing(const uint8_t quiet_n) {
-    if (quiet_n < 5U) {
-        return 1U;  // MISRA D4
-    }
-    return (quiet_n < 9U) ? 2U : 4U;
-}
-
-/// How long before the alarm onset number i is tried: the first onset first.
-static uint8_t before(const uint8_t quiet_n, const uint8_t i, const uint8_t earliest_n) {
-    const uint32_t spacing_n = spacing(quiet_n);
-    const uint32_t later_n   = spacing_n * i;
-    const uint32_t n         = quiet_n + (spacing_n * (EST_ISOLATION_ONSETS_N / 2U));
-    const uint32_t latest_n  = later_n + LATEST_N;
-    const uint32_t wanted_n  = ((n > latest_n) ? n : latest_n) - later_n;
-    return (uint8_t)((wanted_n < earliest_n) ? wanted_n : earliest_n);
+/// How long before the alarm onset number i is tried, the first onset first. The longer it took to the alarm, the less did the
+/// change matter in between, and a push makes up for it.
+static uint8_t before(const uint8_t i, const uint8_t earliest_n) {
+    static const uint8_t wanted_n[EST_ISOLATION_ONSETS_N] = { 20U, 12U, 7U, 4U, 2U, 1U };
+    return (wanted_n[i] < earliest_n) ? wanted_n[i] : earliest_n;
 }
 
 static void start(est_isolation_t* const self, const est_t* const estimator) {
     const uint8_t past_n     = 4U;
-    const uint8_t known_n    = (self->known_n > past_n) ? (uint8_t)(self->known_n - past_n) : 0U;
-    const uint8_t earliest_n = (known_n < EARLIEST_N) ? known_n : (uint8_t)EARLIEST_N;
-    const uint8_t quiet_n    = self->quiet_n;
+    const uint8_t earliest_n = (self->known_n > past_n) ? (uint8_t)(self->known_n - past_n) : 0U;
+    const bool    was_quiet  = self->quiet;
     stop(self);
     self->since_n   = 0U;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
-    if ((quiet_n >= NEVER) || (earliest_n < LATEST_N) || !believe(&self->believed, self->config, self->force_zero)) {
+    if (!was_quiet || (earliest_n < 1U) || !believe(&self->believed, self->config, self->force_zero)) {
         return;  // MISRA D4
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        const uint8_t held_n = (quiet_n < EARLIEST_N) ? quiet_n : (uint8_t)EARLIEST_N;
-        self->onsets[i]      = (est_onset_t){ .before_n = before(held_n, i, earliest_n) };
+        self->onsets[i] = (est_onset_t){ .before_n = before(i, earliest_n) };
     }
     self->active         = true;
     self->turn           = 0U;
     self->worked_n       = 0U;
     self->waiting_n      = self->onsets[0].before_n;
-    self->noise_variance = est_noise_variance(estimator);
+    self->nats           = 0.5F / est_noise_variance(estimator);
     self->residual[0]    = kept(self, self->waiting_n)->innovation;
     self->residual[1]    = kept(self, self->waiting_n + 1U)->innovation;
 }
@@ -388,15 +419,15 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
     EST_ASSERT((self != NULL) && (config != NULL));
     *self           = (est_isolation_t){ .config = config, .force_zero = force_zero };
-    self->quiet_n   = NEVER;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
     return (config->na == 2U) && ((config->nb + config->nk) <= 3U) && (config->trigger.kind == EST_TRIGGER_CUSUM);
 }
 
 /// The plant is well: this is what it is.
 static void take_theta(est_isolation_t* const self, const est_t* const estimator) {
-    self->quiet_n = 0U;
-    for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
+    const uint8_t count = est_theta_count(estimator);
+    self->quiet         = true;
+    for (uint8_t i = 0U; i < count; i++) {
         self->believed.theta[i] = est_theta(estimator, i);
     }
     self->believed.c[0] = est_prefilter(estimator, 0U);
@@ -406,13 +437,11 @@ static void take_theta(est_isolation_t* const self, const est_t* const estimator
 static void enter_quiet(est_isolation_t* const self, const est_t* const estimator, const est_step_t step) {
     if (step.status != EST_UPDATED) {
         self->known_n = 0U;
-        self->quiet_n = NEVER;
+        self->quiet   = false;
     } else if ((step.statistic <= 0.0F) && (self->since_n >= SETTLED_N)) {
         take_theta(self, estimator);
-    } else if (self->quiet_n != NEVER) {
-        self->quiet_n = (uint8_t)((self->quiet_n < (NEVER - 1U)) ? (self->quiet_n + 1U) : self->quiet_n);
     } else {
-        // not known when the plant was last well
+        // theta takes the change in
     }
 }
 
@@ -438,25 +467,52 @@ void est_isolation_enter(est_isolation_t* const self, const est_t* const estimat
     }
 }
 
+/// The onset has come, and the sample is the first after it or a later one.
+static bool has_begun(const est_isolation_t* const self, const est_onset_t* const onset) {
+    return (self->worked_n + onset->before_n) > self->onsets[0].before_n;
+}
+
+/// How many this sample takes: up to the alarm nothing is judged.
+static uint8_t slices(const est_isolation_t* const self) {
+    uint8_t out = 1U;
+    for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
+        out = has_begun(self, &self->onsets[i]) ? (uint8_t)(out + 1U) : out;
+    }
+    return is_after_alarm(self) ? EST_ISOLATION_SLICES_N : out;
+}
+
+static void begin_sample(est_isolation_t* const self, const uint32_t ago) {
+    begin_round(&self->fit);
+    enter_residual(self, ago);
+    drive(self, ago, 2U, self->driving);
+    self->worked_n++;
+    self->slices_n = slices(self);
+}
+
+static void enter_and_judge(est_isolation_t* const self, const uint8_t number) {
+    est_onset_t* const onset = &self->onsets[number];
+    const uint32_t     age_n = (uint32_t)self->worked_n + onset->before_n - self->onsets[0].before_n;
+    enter_onset(self, onset, self->waiting_n - 1U, (uint16_t)age_n);
+    if (is_after_alarm(self)) {
+        judge(&self->fit, onset, number);
+    }
+}
+
 bool est_isolation_work(est_isolation_t* const self) {
     EST_ASSERT(self != NULL);
     if (!self->active || (self->waiting_n == 0U)) {
         return false;  // MISRA D4
     }
-    const uint32_t     ago   = self->waiting_n - 1U;
-    est_onset_t* const onset = &self->onsets[self->turn];
     if (self->turn == 0U) {
-        begin_round(&self->fit);
-        enter_residual(self, ago);
-        self->worked_n++;
-    }
-    const uint16_t later_n = (uint16_t)(self->onsets[0].before_n - onset->before_n);
-    if (self->worked_n > later_n) {
-        enter_onset(self, onset, ago, (uint16_t)(self->worked_n - later_n));
-        judge(&self->fit, onset, self->turn);
+        begin_sample(self, self->waiting_n - 1U);
+    } else if (self->turn <= EST_ISOLATION_ONSETS_N) {
+        enter_and_judge(self, (uint8_t)(self->turn - 1U));
+    } else {
+        const uint8_t number = (uint8_t)(self->turn - (EST_ISOLATION_ONSETS_N + 1U));
+        judge_pushed(&self->fit, &self->onsets[number], number);
     }
     self->turn++;
-    if (self->turn == EST_ISOLATION_ONSETS_N) {
+    if (self->turn >= self->slices_n) {
         self->turn = 0U;
         self->waiting_n--;
         diagnose(self);

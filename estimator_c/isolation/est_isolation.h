@@ -28,7 +28,11 @@ extern "C" {
 #define EST_ISOLATION_KEPT_N 40U
 
 /// Onsets that are tried.
-#define EST_ISOLATION_ONSETS_N 7U
+#define EST_ISOLATION_ONSETS_N 6U
+
+/// Slices of work that a sample takes after the alarm: it is prepared; then each onset, at its sample, and between it and
+/// another. One before it takes at most half as many.
+#define EST_ISOLATION_SLICES_N (1U + (2U * EST_ISOLATION_ONSETS_N))
 
 /// What is looked at, one by one, in every equation: the effects of M, B, K, and of a push at the onset.
 #define EST_ISOLATION_EFFECTS_N 4U
@@ -65,15 +69,16 @@ typedef struct {
     uint8_t before_n;                                                            ///< from this onset to the alarm
 } est_onset_t;
 
-/// The best of all onsets; gains in residual sum of squares [codes^2]. Private.
+/// What changes explain, in nats: the best of all onsets, or all of them together (any_). Private.
 typedef struct {
-    float   alone[3];      ///< gain if M, B, K alone has changed
-    float   change[3];     ///< and by how much: 1 - old/new for M, new/old - 1 for B and K
-    float   known[3];      ///< its reciprocal variance, per noise variance
-    uint8_t before_n[3];   ///< and when
-    float   pair[3];       ///< gain if M and B, M and K, B and K have changed
-    float   certainty[3];  ///< reciprocal variance of the less certain of the two, per noise variance
-    float   onset[EST_ISOLATION_ONSETS_N];  ///< largest gain of one parameter alone
+    float   any_alone[3];  ///< M, B, K alone has changed
+    float   any_pair[3];   ///< M and B, M and K, B and K have changed
+    float   alone[3];
+    float   beside[3];    ///< M, B, K has changed, and another by as much as is worth telling
+    float   change[3];    ///< of M, B, K alone, by how much: 1 - old/new for M, new/old - 1 for B and K
+    float   known[3];     ///< half its reciprocal variance
+    uint8_t before_n[3];  ///< and when
+    float   onset[EST_ISOLATION_ONSETS_N];  ///< most by one parameter alone
 } est_fit_t;
 
 /// The plant as it was, in samples. Private.
@@ -92,16 +97,18 @@ typedef struct {
 typedef struct {
     const est_config_t* config;
     float           force_zero;  ///< u where F = 0 [codes]
-    float           noise_variance;
+    float           nats;       ///< per squared code of residual
     uint8_t         newest;     ///< in kept
     uint8_t         known_n;    ///< in kept, without a gap
-    uint8_t         quiet_n;    ///< from the last sample whose statistic was zero
+    bool            quiet;      ///< the statistic has been zero: theta of the last such sample is the plant as it was
     uint8_t         since_n;    ///< samples since the alarm
     uint8_t         waiting_n;  ///< samples still to be worked on
-    uint8_t         turn;       ///< the onset to work on
+    uint8_t         turn;       ///< the slice of the sample to work on
+    uint8_t         slices_n;   ///< that this sample takes
     uint16_t        worked_n;   ///< samples from the first onset to the one worked on
     bool            active;     ///< after an alarm
     est_believed_t  believed;
+    float           driving[3];   ///< what drives the effects of M, B, K since an earlier sample
     float           residual[2];  ///< y less what the plant as it was would have done, newest first
     est_fit_t       fit;
     est_diagnosis_t diagnosis;
@@ -116,12 +123,12 @@ typedef struct {
 bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// To be called after every est_step(), with what went in and came out. Cost: some 180 instructions on a Cortex-M4F, at the
-/// alarm 2,800 (make cost). May be called from an interrupt. A gap before the diagnosis leaves it undecided.
+/// alarm 2,400 (make cost). May be called from an interrupt. A gap before the diagnosis leaves it undecided.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
 /// One slice of what is to be done after an alarm: one sample with one onset. True iff more is waiting. A sample waits for
-/// EST_ISOLATION_ONSETS_N calls; if more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided.
-/// Cost: some 700 instructions on a Cortex-M4F, at most 1,100; nothing before an alarm.
+/// up to EST_ISOLATION_SLICES_N calls; if more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided.
+/// Cost: some 680 instructions on a Cortex-M4F, at most 810; nothing before an alarm.
 bool est_isolation_work(est_isolation_t* self);
 
 /// The diagnosis of the last alarm: the change is stated once it is 95 % sure and then stays; the extent is refined until

@@ -92,8 +92,8 @@ class Isolated:
     most_n: NDArray[np.float64]
 
 
-ONSETS_N = 7
-"""As EST_ISOLATION_ONSETS_N in est_isolation.h: the slices of work that a sample takes."""
+SLICES_N = 13
+"""As EST_ISOLATION_SLICES_N in est_isolation.h: the slices of work that a sample takes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ class Estimator:
         self._c.driver_age_counters()
 
     def invariants_hold_if_damaged(self, way: int) -> bool:
-        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 8; 9: not at all."""
+        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 9; 10: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))
 
     def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
@@ -201,7 +201,7 @@ class Estimator:
         alarm, at, change, extent, refined, onset, least, most = found.T
         return Isolated(alarm, at, np.array(CHANGES)[change.astype(int)], extent, refined, onset, least, most)
 
-    def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = ONSETS_N) -> Diagnosed:
+    def diagnose(self, theta: ArrayLike, steps: NDArray[np.float64], slices: int = SLICES_N) -> Diagnosed:
         """What est_isolation makes of steps (n, 3) that are given: statistic, status, alarm; theta stays as it is.
 
         The force is a square wave, which the plant does not answer.

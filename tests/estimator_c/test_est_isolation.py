@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.estimator_c import isolation
-from tests.estimator_c.est_driver import GATHERING, ONSETS_N, PREDICTION_ERROR, REFUSED, Estimator
+from tests.estimator_c.est_driver import GATHERING, PREDICTION_ERROR, REFUSED, SLICES_N, Estimator
 from tests.estimator_c.isolation import Change
 from tests.estimator_c.performance import FULL, FULL_FREE, OWN_CLOCK, SHARED_CLOCK, Settings
 from tests.estimator_c.plants import FRONT, Excitation, random_plants, simulate
@@ -67,7 +67,7 @@ def test_verdict_does_not_depend_on_when_the_work_is_done(estimator: Estimator) 
     played = isolation.play(FRONT, {"B": 1.2}, FULL, 20, seed=2)
     assert estimator.init(**SHARED_CLOCK)
     at_once = estimator.isolate(played.u, played.y, played.onset)
-    later = estimator.isolate(played.u, played.y, played.onset, slices=12)
+    later = estimator.isolate(played.u, played.y, played.onset, slices=2 * SLICES_N - 2)
     assert np.array_equal(at_once.change, later.change)
     assert np.array_equal(at_once.refined, later.refined)
     assert (later.at >= at_once.at).all()
@@ -173,7 +173,7 @@ def test_work_is_due_from_the_alarm_on_and_done_in_slices(by_hand: Estimator) ->
     assert not left[:alarm].any()
     assert (left[alarm : alarm + 5] > 0).all()
     plenty = by_hand.diagnose(SUSPENSION, steps(), slices=1000)
-    assert (plenty.left[alarm + 1 :] == ONSETS_N - 1).all()
+    assert (plenty.left[alarm + 1 :] == SLICES_N - 1).all()
     assert plenty.samples_n == 30
 
 
