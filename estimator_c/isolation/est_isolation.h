@@ -128,7 +128,7 @@ void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_samp
 
 /// One slice of what is to be done after an alarm: one sample with one onset. True iff more is waiting. A sample waits for
 /// up to EST_ISOLATION_SLICES_N calls; if more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided.
-/// Cost: some 680 instructions on a Cortex-M4F, at most 810; nothing before an alarm.
+/// Cost: some 680 instructions on a Cortex-M4F, at most 830; nothing before an alarm.
 bool est_isolation_work(est_isolation_t* self);
 
 /// The diagnosis of the last alarm: the change is stated once it is 95 % sure and then stays; the extent is refined until
