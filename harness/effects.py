@@ -57,9 +57,7 @@ def text(table: Table) -> str:
         f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
     ]
     for rows in zip(*table.values(), strict=True):
-        figures = "".join(
-            f"{row.median_lsb:>10.2g}" if row.median_lsb < 10 else f"{row.median_lsb:>10.0f}" for row in rows
-        )
+        figures = "".join(f"{_rounded(row.median_lsb):>10}" for row in rows)
         lines.append(f"{rows[0].name:34}{figures}{rows[0].draws:>8}")
     return "\n".join(lines)
 

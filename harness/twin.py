@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 
 from harness.estimator_config import EstimatorConfig
 
@@ -20,8 +21,14 @@ SLIP_DOUBT = 1000.0
 
 CONTRACTION = 0.99
 REFRESH_STEP = 0.002
-REFRESH_STRIDE, REFRESH_DOUBT = 0.05, 100.0
+REFRESH_STRIDE = 0.05
 REFRESH_MEMORIES = 2.0
+
+SETTLED = 1.0001
+"""The whitening has settled once the variance of the noise is below this."""
+
+WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
+"""Below the first of these weights the limits of the d's are due, below the second even if the step is long anyway."""
 
 NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
 
@@ -84,7 +91,7 @@ class Whitener:
 
 
 class Covariance:
-    """P in units of the noise variance, as U D U' (Bierman 1977)."""
+    """P in units of the noise variance, as U D U' / weight (Bierman 1977); to forget is to lower the weight."""
 
     def __init__(self, prior: Sequence[float]) -> None:
         self.prior = list(prior)
@@ -93,45 +100,48 @@ class Covariance:
     def reset(self) -> None:
         """P := P0."""
         n = len(self.prior)
-        self.d = list(self.prior)
+        self.d, self.weight = list(self.prior), 1.0
         self.u = [[float(i == j) for j in range(n)] for i in range(n)]
 
     def inflate(self, factor: float) -> None:
         """Less certain by this factor, nowhere beyond the prior."""
-        self.d = [min(d * factor, p) for d, p in zip(self.d, self.prior, strict=True)]
+        self.d = [min(d * factor / self.weight, p) for d, p in zip(self.d, self.prior, strict=True)]
+        self.weight = 1.0
 
     def measure(self, phi: Sequence[float], variance: float, forgetting: float) -> tuple[Vector, float]:
-        """One equation. P phi and alpha = forgetting * variance + phi' P phi; Bierman, section V.3, thesis Equ 3.21."""
+        """One equation: its gain and the variance of its innovation; Bierman, section V.3, thesis Equ 3.21."""
         n = len(self.d)
         gain = [0.0] * n
-        alpha = forgetting * variance
+        self.weight *= forgetting
+        alpha = self.weight * variance
         for j in range(n):
             f = phi[j] + sum(self.u[i][j] * phi[i] for i in range(j))
             v = self.d[j] * f
             before, alpha = alpha, alpha + f * v
-            self.d[j] = min(self.d[j] * before / alpha / forgetting, self.prior[j])
+            self.d[j] *= before / alpha
             for i in range(j):
                 u = self.u[i][j]
                 self.u[i][j] = u - f / before * gain[i]
                 gain[i] += u * v
             gain[j] = v
-        return gain, alpha
+        return [g / alpha for g in gain], alpha / self.weight
 
     def walk(self, variance: float) -> None:
         """P := P + variance I: Thornton (1976), modified weighted Gram-Schmidt on (U, I)."""
         n = len(self.d)
         rows = [[*self.u[i], *(float(i == k) for k in range(n))] for i in range(n)]
-        weights = [*self.d, *([variance] * n)]
+        weights = [*self.d, *([variance * self.weight] * n)]
 
         def product(a: Vector, b: Vector) -> float:
             return sum(w * x * y for w, x, y in zip(weights, a, b, strict=True))
 
         for j in reversed(range(n)):
             norm = product(rows[j], rows[j])
-            self.d[j] = min(norm, self.prior[j])
+            self.d[j] = norm
             for i in range(j):
                 self.u[i][j] = product(rows[i], rows[j]) / norm
                 rows[i] = [x - self.u[i][j] * y for x, y in zip(rows[i], rows[j], strict=True)]
+        self.inflate(1.0)
 
 
 @dataclass
@@ -144,6 +154,14 @@ class Doubt:
     early: Vector = field(default_factory=list)
     late: Vector = field(default_factory=list)
     """Their shares in the whitened equations, newest first."""
+
+
+class Refresh(Enum):
+    """What is next to be done about C."""
+
+    WAITS = 0
+    COMPARES = 1
+    TAKES = 2
 
 
 def cusum(before: float, innovation: float, variance: float) -> float:
@@ -169,7 +187,9 @@ class Twin:
         self.y: Vector = []
         self.residuals = [0.0] * config.nc
         self.pending = self._past_n
-        self.equations = 0
+        self.settled = False  # the gains of the whitening have come to C
+        self.equations = 0  # since C was last considered
+        self.refresh = Refresh.WAITS
         self.since_n = 0  # samples since an edge of u
         self.statistic = 0.0
         self.rivals = [0.0, 0.0]
@@ -199,8 +219,13 @@ class Twin:
         if self.pending:
             self.pending -= 1
             self.theta, self.slipped = self.slipped or self.theta, None
+            if self.refresh is Refresh.TAKES:
+                self._take_c()
+                self.equations = 0
+            self.refresh = Refresh.WAITS
             if not self.pending:
                 self.whitener.restart()
+                self.settled = False
             step = TwinStep(statistic=self.statistic)
         else:
             step = self._equation(y)
@@ -253,17 +278,30 @@ class Twin:
         return [*phi, 1.0] if config.offset else phi
 
     def _equation(self, y: float) -> TwinStep:
+        self._limit()
         (*phi, target), variance = self.whitener.whiten([*self._regressor(), y])
+        self.settled = variance < SETTLED
         innovation = target - _dot(phi, self.theta)
         readings = self._otherwise(phi, target)
-        gain, alpha = self.covariance.measure(phi, variance, self.config.forgetting)
-        self.theta = [t + g * innovation / alpha for t, g in zip(self.theta, gain, strict=True)]
-        self._adapt(phi, target, innovation, alpha / self.config.forgetting)
-        alarm = self._watch(innovation, readings, self._noise_before * alpha / self.config.forgetting)
+        gain, variance = self.covariance.measure(phi, variance, self.config.forgetting)
+        self.theta = [t + g * innovation for t, g in zip(self.theta, gain, strict=True)]
+        self._adapt(phi, target, innovation, variance)
+        alarm = self._watch(innovation, readings, self._noise_before * variance)
         step = TwinStep(innovation, self.statistic, alarm)
         if alarm:
             self._alarm()
         return step
+
+    @property
+    def _considers_c(self) -> bool:
+        """At this equation."""
+        return bool(self.config.refresh_n) and self.equations + 1 >= self.config.refresh_n
+
+    def _limit(self) -> None:
+        """No d beyond the prior, from time to time: in a step that is short otherwise, if there is one in time."""
+        long = not self.settled or self.doubt is not None or self._considers_c
+        if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
+            self.covariance.inflate(1.0)
 
     def _otherwise(self, phi: Vector, target: float) -> tuple[float, float] | None:
         """The innovation had the edges in doubt come one sample early, and late."""
@@ -298,22 +336,41 @@ class Twin:
         if config.noise_estimated:
             square = min(innovation**2 / variance, NOISE_CLIP * self.noise_variance)
             self.noise_variance += NOISE_RATE * (square / NOISE_KEPT - self.noise_variance)
-        self.equations += 1
-        remembers_edge = (1.0 - config.forgetting) * self.since_n < REFRESH_MEMORIES
-        if config.refresh_n and self.equations >= config.refresh_n and self.doubt is None and remembers_edge:
+        if self._considers_c:
             self._refresh()
+        self.equations += 1
 
     def _refresh(self) -> None:
-        self.equations = 0
-        c = [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
-        step = max(abs(new - old) for new, old in zip(c, self.whitener.c, strict=True))
-        if step > REFRESH_STEP and _stable(c):
-            self.whitener.c = c
-            if step > REFRESH_STRIDE:
-                self.pending = 1
-                self.covariance.inflate(REFRESH_DOUBT)
-            else:
-                self.whitener.rows = [(list(c), 1.0) for _ in range(max(len(c), 1))]
+        """Whether A is worth taking C from, whether C is still near to it, and to take it are for three equations."""
+        stage, self.refresh = self.refresh, Refresh.WAITS
+        remembers_edge = (1.0 - self.config.forgetting) * self.since_n < REFRESH_MEMORIES
+        if self.doubt is not None:
+            return
+        if stage is Refresh.TAKES:
+            self._take_c()
+        elif stage is Refresh.COMPARES:
+            self._compare_c()
+        elif remembers_edge:
+            self.refresh = Refresh.COMPARES
+
+    @property
+    def _contracted(self) -> Vector:
+        return [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
+
+    def _compare_c(self) -> None:
+        step = max(abs(new - old) for new, old in zip(self._contracted, self.whitener.c, strict=True))
+        if step <= REFRESH_STEP:
+            self.equations = -1
+            return
+        self.refresh = Refresh.TAKES
+        if step > REFRESH_STRIDE or not self.settled:  # the whitening begins anew, and takes C with it
+            self.pending = 1
+
+    def _take_c(self) -> None:
+        self.equations = -1
+        if _stable(self._contracted):
+            self.whitener.c = self._contracted
+            self.whitener.rows = [(self._contracted, 1.0) for _ in range(max(self.config.na, 1))]
             self.refreshes += 1
 
     # ---- changes
@@ -367,7 +424,7 @@ class Twin:
         if self.config.reset == "all":
             self.theta = [0.0] * len(self.theta)
         self.covariance.reset()
-        self.equations = 0
+        self.equations, self.refresh = 0, Refresh.WAITS
         self.statistic, self.mean, self.mean_n = 0.0, 0.0, 0
         self.quiet_n = self.config.hold_off_n
         self._forget()

@@ -23,6 +23,9 @@
 /// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
 #define SLIP_DOUBT 1000.0F
 
+/// P must not grow without bound between two looks at it.
+#define FORGETTING_MIN 0.5F
+
 /// C is the estimate of A with its zeros moved towards the origin by this factor: a C whose zeros lie on the unit circle
 /// would remember for ever.
 #define CONTRACTION 0.99F
@@ -32,10 +35,8 @@
 #define REFRESH_STEP 0.002F
 
 /// A coefficient that moves by more than this makes another filter: what the old one left of the noise of the equations before
-/// is not white to the new one, which therefore begins anew; and what was estimated with the old one is biased, and so less
-/// certain than P says, by this factor.
+/// is not white to the new one, which therefore begins anew.
 #define REFRESH_STRIDE 0.05F
-#define REFRESH_DOUBT 100.0F
 
 /// The estimate remembers some 1 / (1 - forgetting) samples. After so many times that without an edge, what it says of A comes from
 /// the noise, which any A = C fits: C would follow it anywhere.
@@ -67,6 +68,8 @@ static est_shape_t asked_for(const est_config_t* const config) {
     };
 }
 
+EST_OUTLINE uint_fast8_t count_of(const est_config_t* const config) { return est_shape_count(est_shape_of(config)); }
+
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
            (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) &&
@@ -77,7 +80,7 @@ static bool variances_valid(const est_config_t* const config) {
     return within(config->p0, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->p0_offset, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
            within(config->noise_variance, EST_VARIANCE_MIN, EST_VARIANCE_MAX) &&
-           within(config->random_walk, 0.0F, EST_VARIANCE_MAX) && within(config->forgetting, 0.5F, 1.0F);
+           within(config->random_walk, 0.0F, EST_VARIANCE_MAX) && within(config->forgetting, FORGETTING_MIN, 1.0F);
 }
 
 static bool codes_valid(const est_config_t* const config) {
@@ -113,10 +116,9 @@ static void shift(float* const x, const uint_fast8_t n, const float newest) {
     x[0] = newest;
 }
 
-/// All of the past is kept, whatever the order needs: a loop of fixed length is the faster one.
 static void shift_u(est_t* const self, const float newest) {
     EST_UNROLL
-    for (uint_fast8_t i = EST_INPUT_PAST_MAX + 1U; i > 0U; i--) {
+    for (uint_fast8_t i = EST_INPUTS_KEPT - 1U; i > 0U; i--) {
         self->u[i] = self->u[i - 1U];
     }
     self->u[0] = newest;
@@ -145,7 +147,7 @@ static void restart(est_t* const self, const uint_fast8_t pending_n) {
 static void follow_slip(est_t* const self, const bool late) {
     const uint_fast8_t nb = self->config->nb;
     float* const  b  = &self->theta[self->config->na];
-    for (uint_fast8_t i = 0U; i < self->count; i++) {
+    for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
@@ -158,14 +160,37 @@ static void follow_slip(est_t* const self, const bool late) {
     }
 }
 
-/// What an alarm, a slip or a new C leaves to do to theta and P.
+/// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
+/// 3.5: noise on the output).
+EST_SHAPED void contracted(const est_t* const self, float* const c) {
+    const uint_fast8_t na     = est_shape_of(self->config).na;
+    float              factor = 1.0F;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        factor *= CONTRACTION;
+        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
+    }
+}
+
+static void refresh_prefilter(est_t* const self) {
+    float c[EST_NA_MAX];
+    contracted(self, c);
+    self->refresh_in = self->config->refresh_n;
+    if (est_whitener_accepts(c, EST_NA_MAX)) {
+        est_whitener_set(&self->whitener, c, EST_NA_MAX);
+        count(&self->counters.refreshes);
+    }
+}
+
+/// What an alarm, a slip or a C that moves far leaves to do.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
-    } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_DOUBT)) {
-        est_factors_inflate(&self->factors, self->config, REFRESH_DOUBT);
-    } else if (EST_WITH_EDGES && (self->renewal != EST_RENEWAL_NONE)) {
+        self->refresh_in = self->config->refresh_n;
+    } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
+    } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
+        refresh_prefilter(self);
     } else {
         // they are as they should be
     }
@@ -176,9 +201,11 @@ static void renew(est_t* const self) {
 /// left to do: that one is long enough.
 static void gather(est_t* const self) {
     self->pending_n--;
+    self->known = true;
     renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
+        self->settled = false;
         count(&self->counters.restarts);
     }
 }
@@ -216,7 +243,9 @@ static bool same(const float a, const float b) {
 static bool stuck(est_t* const self, const float y, const bool edge) {
     if (!same(y, self->y[0])) {
         self->same_n = 0U;
-    } else if (edge || (self->same_n > 0U)) {
+        return false;  // MISRA D4
+    }
+    if (edge || (self->same_n > 0U)) {
         self->same_n = (uint8_t)(self->same_n + ((self->same_n < UINT8_MAX) ? 1U : 0U));
     } else {
         // no edge that it has not answered
@@ -250,14 +279,13 @@ static void enter_edge(est_t* const self) {
 
 /// Takes in u(k). The equation of this sample can be made unless the samples that it reaches back to are not all known.
 static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
-    const est_config_t* const config = self->config;
     shift_u(self, sample.u);
-    const bool edge = self->known && est_edges_is_edge(config, self->u);
+    const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
     if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
         count(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
-    if (EST_WITH_WATCH || EST_WITH_EDGES || EST_WITH_ADAPTATION) {
+    if (EST_KNOWS_EDGES) {
         count(&self->edges.since_n);
     }
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
@@ -266,7 +294,6 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     if (edge) {
         enter_edge(self);
     }
-    self->known = true;
     if (self->pending_n > 0U) {
         gather(self);
         return EST_GATHERING;  // MISRA D4
@@ -292,22 +319,25 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 /// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
 /// they are taken against what was believed before the doubt.
-EST_INLINE void
-read_otherwise(est_t* const self, const est_shape_t shape, const float* const phi, float* const readings) {
-    const float e = (self->edges.age_n > 1U) ? est_equation_residual(phi, self->edges.theta, est_shape_count(shape))
-                                             : readings[0];  // theta has not moved since
+EST_INLINE void read_otherwise(est_t* const                self,
+                               const est_shape_t           shape,
+                               const est_equation_t* const equation,
+                               float* const                readings) {
+    const float e = (self->edges.age_n > 1U)
+                        ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
+                        : equation->innovation;  // theta has not moved since
     float       early;
     float       late;
     est_edges_shares(&self->edges, shape, &self->whitener, self->u, &early, &late);
-    readings[1] = e - early;
-    readings[2] = e - late;
+    readings[0] = e - early;
+    readings[1] = e - late;
 }
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
 static void keep_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
-        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, self->count));
+        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, count_of(self->config)));
     }
 #else
     (void)self;
@@ -325,52 +355,50 @@ static void follow_noise(est_t* const self, const float innovation, const float 
 }
 
 /// Whether one of the coefficients is further from the C in use than this.
-EST_INLINE bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
+EST_SHAPED bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
     bool out = false;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         const float step = c[i] - whitener->c[i];
-        out              = out || (step > distance) || (step < -distance);
+        out              = out || (est_magnitude(step) > distance);
     }
     return out;
-}
-
-/// After convergence the noise of the equations is coloured by A itself (thesis section 3.5: noise on the output).
-static void refresh_prefilter(est_t* const self) {
-    const uint_fast8_t na = self->config->na;
-    float c[EST_NA_MAX];
-    float factor = 1.0F;
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        factor *= CONTRACTION;
-        c[i] = (i < na) ? (self->theta[i] * factor) : 0.0F;
-    }
-    if (!further(&self->whitener, c, REFRESH_STEP) || !est_whitener_accepts(c, EST_NA_MAX)) {
-        return;  // MISRA D4
-    }
-    if (further(&self->whitener, c, REFRESH_STRIDE)) {
-        self->renewal = EST_RENEWAL_DOUBT;
-        restart(self, 1U);
-    }
-    est_whitener_set(&self->whitener, c, EST_NA_MAX);
-    count(&self->counters.refreshes);
 }
 
 static bool remembers_edge(const est_t* const self) {
     return ((1.0F - self->config->forgetting) * (float)self->edges.since_n) < REFRESH_MEMORIES;
 }
 
-/// Not while edges are in doubt: theta may have followed what did not happen.
-EST_INLINE void approach_refresh(est_t* const self) {
-    self->refresh_in--;
-    if (self->refresh_in > 0U) {
+/// Where C moves far, or the gains are on their way to it anyway, the whitening begins anew: C is then taken with the next
+/// sample, which has no equation.
+static void compare_prefilter(est_t* const self) {
+    float c[EST_NA_MAX];
+    contracted(self, c);
+    if (!further(&self->whitener, c, REFRESH_STEP)) {
+        self->renewal    = EST_RENEWAL_NONE;
+        self->refresh_in = self->config->refresh_n;
         return;  // MISRA D4
     }
-    if ((self->edges.age_n > 0U) || !remembers_edge(self)) {
-        self->refresh_in = 1U;
-    } else {
-        self->refresh_in = self->config->refresh_n;
+    self->renewal = EST_RENEWAL_PREFILTER;
+    if (!self->settled || further(&self->whitener, c, REFRESH_STRIDE)) {
+        self->pending_n = 1U;
+    }
+}
+
+/// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so that no
+/// step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
+static void consider_refresh(est_t* const self) {
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        self->renewal = EST_RENEWAL_NONE;
+    } else if (self->renewal == EST_RENEWAL_COMPARE) {
+        compare_prefilter(self);
+    } else if (self->renewal == EST_RENEWAL_PREFILTER) {
+        self->renewal = EST_RENEWAL_NONE;
         refresh_prefilter(self);
+    } else if (remembers_edge(self)) {
+        self->renewal = EST_RENEWAL_COMPARE;
+    } else {
+        // A comes from noise
     }
 }
 
@@ -386,18 +414,14 @@ static void zero(float* const x, const uint_fast8_t n) {
 /// estimate is worth keeping.
 static void estimate_afresh(est_t* const self) {
     if ((self->config->trigger.reset == EST_RESET_ALL) || !(self->trigger.statistic < FLT_MAX)) {
-        zero(self->theta, self->count);
+        zero(self->theta, EST_THETA_MAX);
         est_factors_reset(&self->factors, self->config);
     }
-    self->refresh_in = self->config->refresh_n;
-    self->renewal     = EST_RENEWAL_RESET;
+    self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
 }
 
 static void react(est_t* const self, const est_finding_t finding) {
-    if (finding == EST_QUIET) {
-        return;  // MISRA D4
-    }
     if (!EST_WITH_EDGES || (finding == EST_ALARM)) {
         count(&self->counters.alarms);
         estimate_afresh(self);
@@ -415,7 +439,9 @@ static void enter_gap(est_t* const self, const est_status_t status) {
         count_long(&self->counters.missing);
     }
     if (EST_WITH_EDGES && self->known && (self->edges.age_n > 0U)) {
-        react(self, est_trigger_end_doubt(&self->trigger, &self->config->trigger));
+        if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
+            react(self, EST_SLIP);
+        }
     }
     forget_samples(self);
 }
@@ -425,6 +451,7 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
         est_factors_walk(&self->factors, config);
+        est_factors_inflate(&self->factors, config, 1.0F);
     }
     keep_residual(self, phi);
     if (config->noise_estimated) {
@@ -432,31 +459,58 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
     }
 }
 
+/// P is kept bounded in a step that has nothing else to do besides, if there is one in time.
+EST_SHAPED void limit_factors(est_t* const self, const est_shape_t shape) {
+    const bool busy = (EST_WITH_EDGES && (self->edges.age_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
+    if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
+        if (EST_SHAPES_APART) {
+            est_factors_scale(&self->factors, self->config, shape, 1.0F);
+        } else {
+            est_factors_inflate(&self->factors, self->config, 1.0F);
+        }
+    }
+}
+
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
+    float weight_min;
+    if (self->settled) {
+        equation.variance = 1.0F;
+        weight_min        = EST_WEIGHT_DUE;
+    } else {
+        equation.variance = est_whitener_advance(&self->whitener, &self->settled);
+        weight_min        = EST_WEIGHT_OVERDUE;
+    }
+    if (self->factors.weight < weight_min) {
+        limit_factors(self, shape);
+    }
     est_equation_fill(self, shape, y, equation.phi);
-    equation.variance = self->whitener.settled ? 1.0F : est_whitener_advance(&self->whitener);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
-    float readings[EST_READINGS];
-    readings[0] = equation.innovation;
+    float readings[EST_OTHER_READINGS];
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        read_otherwise(self, shape, equation.phi, readings);
+        read_otherwise(self, shape, &equation, readings);
     }
     const float precision =
-        config->forgetting * est_equation_measure(&self->factors, config, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION && (self->refresh_in > 0U)) {
-        approach_refresh(self);
+        est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
+    if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
+        self->refresh_in--;
+    } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
+        consider_refresh(self);
+    } else {
+        // C stays
     }
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
     }
-    const est_finding_t finding = est_trigger_step(
-        &self->trigger, &config->trigger, readings, precision / self->noise_variance, self->edges.age_n);
+    const est_finding_t finding = est_trigger_step(&self->trigger, &config->trigger, equation.innovation,
+                                                   precision / self->noise_variance, readings, self->edges.age_n);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
-    step->alarm      = finding == EST_ALARM;
-    react(self, finding);
+    if (finding != EST_QUIET) {
+        step->alarm = finding == EST_ALARM;
+        react(self, finding);
+    }
 }
 
 /// The usual shapes have code of their own, unless the build has one anyway, or room is scarce.
@@ -514,12 +568,11 @@ est_config_t est_config_default(void) {
 
 bool est_init(est_t* const self, const est_config_t* const config) {
     EST_ASSERT((self != NULL) && (config != NULL));
-    if (!est_config_valid(config)) {
+    if (EST_WITH_CHECKS && !est_config_valid(config)) {
         return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
-    self->count          = (uint8_t)est_shape_count(est_shape_of(config));
-    self->adaptive       = adaptive(config);
+    self->adaptive       = EST_WITH_ADAPTATION && adaptive(config);
     self->refresh_in     = config->refresh_n;
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
@@ -548,17 +601,17 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
 
 uint8_t est_theta_count(const est_t* const self) {
     EST_ASSERT(self != NULL);
-    return self->count;
+    return (uint8_t)count_of(self->config);
 }
 
 float est_theta(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != NULL) && (index < self->count));
+    EST_ASSERT((self != NULL) && (index < count_of(self->config)));
     return self->theta[index];
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != NULL) && (index < self->count));
-    return est_factors_variance(&self->factors, self->count, index);
+    EST_ASSERT((self != NULL) && (index < count_of(self->config)));
+    return est_factors_variance(&self->factors, (uint_fast8_t)count_of(self->config), index);
 }
 
 float est_noise_variance(const est_t* const self) {
@@ -577,13 +630,14 @@ est_counters_t est_counters(const est_t* const self) {
 }
 
 bool est_invariants_hold(const est_t* const self) {
-    if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config) || (self->count != est_shape_count(est_shape_of(self->config)))) {
+    if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config)) {
         return false;  // MISRA D4
     }
-    for (uint_fast8_t i = 0U; i < self->count; i++) {
+    for (uint_fast8_t i = 0U; i < count_of(self->config); i++) {
         if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
             return false;  // MISRA D4
         }
     }
-    return within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
+    return within(self->factors.weight, FORGETTING_MIN * EST_WEIGHT_OVERDUE, 1.0F) &&
+           within(self->trigger.statistic, 0.0F, FLT_MAX) && within(self->noise_variance, EST_VARIANCE_MIN, FLT_MAX);
 }

@@ -190,10 +190,13 @@ typedef struct {
     uint16_t refreshes; ///< how often C was taken from the estimate of A
 } est_counters_t;
 
-/// P = U D U' with U unit upper triangular. Private to est_factors.c.
+#define EST_UPPER_N ((EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U)
+
+/// P = U D U' / weight with U unit upper triangular. Private to est_factors.c.
 typedef struct {
+    float weight;  ///< forgetting to the power of the equations since the d's were last limited
     float d[EST_THETA_MAX];
-    float upper[(EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U];  ///< U by columns, without its diagonal
+    float upper[EST_UPPER_N];  ///< U by columns, without its diagonal
 } est_factors_t;
 
 /// The gains of so many equations are needed to find those of the next.
@@ -210,11 +213,9 @@ typedef struct {
 
 /// Makes the noise of consecutive equations white. Private to est_whitener.c.
 typedef struct {
-    uint8_t n;        ///< how many equations there were, at most EST_NA_MAX
-    bool    settled;  ///< the gains are c and the variance is 1
     float c[EST_NA_MAX];
     float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< of the newest equation first
-    float precision[EST_NA_MAX];  ///< of the whitened equations, newest first
+    float precision[EST_NA_MAX];  ///< of the whitened equations, newest first; 0: there was none
     est_past_t past[EST_THETA_MAX + 1U];  ///< of the elements of the equation
 } est_whitener_t;
 
@@ -227,35 +228,36 @@ typedef struct {
     float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
 } est_edges_t;
 
-/// The readings of the recent edges: as recorded, one sample early, one sample late.
-#define EST_READINGS 3U
+/// The readings of the recent edges besides the recorded one: one sample early, one sample late.
+#define EST_OTHER_READINGS 2U
 
 /// The state of a trigger. Private to est_trigger.c.
 typedef struct {
     float    statistic;
-    float    rival[EST_READINGS - 1U];  ///< the cumulative sum as it would be under the other readings
+    float    rival[EST_OTHER_READINGS];  ///< the cumulative sum as it would be under the other readings
     uint16_t quiet_n;                   ///< innovations for which the statistic is still held at zero
     uint16_t mean_n;                    ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
 } est_trigger_t;
 
 /// The values of est_t.renewal. Private.
 #define EST_RENEWAL_NONE 0U
-#define EST_RENEWAL_RESET 1U  ///< P := P0, after an alarm
-#define EST_RENEWAL_DOUBT 2U  ///< less certain, after C has moved far
-#define EST_RENEWAL_EARLY 3U  ///< theta as before, but the edges of u come one sample earlier, and less certain
-#define EST_RENEWAL_LATE 4U   ///< one sample later
+#define EST_RENEWAL_COMPARE 1U    ///< nothing, but A is to be compared with C at the next one
+#define EST_RENEWAL_PREFILTER 2U  ///< nothing, but C is to be taken from A
+#define EST_RENEWAL_RESET 3U      ///< P := P0, after an alarm
+#define EST_RENEWAL_EARLY 4U      ///< theta as before, but the edges of u come one sample earlier, and less certain
+#define EST_RENEWAL_LATE 5U       ///< one sample later
 
 /// The state of an estimator. The fields are private; read them through the functions below. The small ones come first: an
 /// offset below 128 bytes is a shorter instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             count;      ///< of parameters
     uint8_t             same_n;     ///< samples since an edge of u for which y has been the same
     uint8_t             pending_n;  ///< samples to come before the next equation is complete
     bool                adaptive;   ///< there is more to adapt than theta and C
     uint8_t             renewal;    ///< what is to be done to P before the next equation
-    bool                known;      ///< the sample before this one is known
-    uint16_t            refresh_in;  ///< equations to come before C is taken from A; 0: never
+    bool                known;      ///< the sample before this one is known; if not, samples are pending
+    bool                settled;    ///< the gains of the whitener are c, and its variance is 1
+    uint16_t            refresh_in;  ///< equations to come before C is considered; 0: never
     float               noise_variance;  ///< [codes^2]
     float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
     float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
@@ -279,13 +281,13 @@ bool est_config_valid(const est_config_t* config);
 
 /// Makes the estimator ready for the first sample: theta zero, P = P0, counters zero.
 /// The configuration is not copied: it must stay as it is for as long as the estimator is used (it may be in flash).
-/// Returns false iff the configuration is not valid; the state is then unusable.
+/// Returns false iff the configuration is not valid; the state is then unusable. A build with -DEST_WITH_CHECKS=0 does not ask.
 /// Cost: as one est_step(). May be called from an interrupt.
 bool est_init(est_t* self, const est_config_t* config);
 
 /// Enters one sample: filters, regressor, U-D update (Bierman 1977), trigger.
-/// Cost: for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension; up to 1.3 times that when C is taken
-/// from A, or an edge is in doubt.
+/// Cost: for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension; up to 1.3 times that where
+/// an edge may have slipped, 1.2 times elsewhere.
 /// RAM: none beyond the state and some 300 bytes of stack. May be called from an interrupt.
 /// Bad data never fails and never enters the estimate: see est_status_t.
 est_step_t est_step(est_t* self, est_sample_t sample);

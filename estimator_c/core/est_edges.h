@@ -21,8 +21,7 @@ EST_INLINE void est_edges_age(est_edges_t* const self) {
 
 /// True iff u[0] comes after an edge, the values of u newest first.
 static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
-    const float step = u[0] - u[1];
-    return (step >= config->edge_codes) || (step <= -config->edge_codes);
+    return est_magnitude(u[0] - u[1]) >= config->edge_codes;
 }
 
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the

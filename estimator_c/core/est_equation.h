@@ -40,7 +40,7 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
 }
 
 /// What theta does not foresee of y(k), the element after the regressor.
-EST_INLINE float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
+EST_SHAPED float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
     float out = phi[n];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
@@ -68,19 +68,20 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     equation->innovation = est_equation_residual(phi, theta, count);
 }
 
-/// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3, with the
-/// forgetting factor of thesis Equ 3.21. Moves theta, and returns 1 / (forgetting * variance + phi' P phi).
+/// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3. The forgetting
+/// factor of thesis Equ 3.21 divides the weight of P, and with it every d at once. Moves theta, and returns the reciprocal
+/// of the innovation's variance, in noise variances.
 EST_INLINE float est_equation_measure(est_factors_t* const        self,
-                                      const est_config_t* const   config,
+                                      const float                 forgetting,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint_fast8_t      count       = est_shape_count(shape);  // cppcheck F3
-    const float        remembering = 1.0F / config->forgetting;
-    const float* const phi         = equation->phi;
+    const uint_fast8_t count   = est_shape_count(shape);  // cppcheck F3
+    const float* const phi     = equation->phi;
+    const float        weight  = forgetting * self->weight;
     float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled; MISRA D2
-    float              alpha   = config->forgetting * equation->variance;
-    float              inverse = (equation->variance > 1.0F) ? (remembering / equation->variance) : remembering;
+    float              alpha   = weight * equation->variance;
+    float              inverse = 0.0F;  // 1 / alpha, once there are u's that want it
     float*             column  = self->upper;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < count; j++) {
@@ -91,10 +92,10 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
         }
         const float v      = self->d[j] * f;
         const float p      = f * inverse;
-        const float shrunk = self->d[j] * (alpha * remembering);
+        const float shrunk = self->d[j] * alpha;
         alpha += f * v;
         inverse    = 1.0F / alpha;
-        self->d[j] = est_limited(shrunk * inverse, est_factors_prior(config, shape, j));
+        self->d[j] = (shrunk * inverse) + EST_D_MIN;
         EST_UNROLL
         for (uint_fast8_t i = 0U; i < j; i++) {
             const float u = *column;
@@ -108,7 +109,8 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
     for (uint_fast8_t i = 0U; i < count; i++) {
         theta[i] += gain[i] * scale;
     }
-    return inverse;
+    self->weight = weight;
+    return weight * inverse;
 }
 
 #endif  // EST_EQUATION_H_INCLUDED

@@ -1,14 +1,18 @@
 #include "est_factors.h"
 
+void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
+    est_factors_scale(self, config, est_shape_of(config), factor);
+}
+
 void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
-    const est_shape_t shape  = est_shape_of(config);
-    float*            column = self->upper;
-    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
-        self->d[j] = est_factors_prior(config, shape, j);
-        for (uint_fast8_t i = 0U; i < j; i++) {
-            *column++ = 0.0F;  // MISRA D3
-        }
+    self->weight = 1.0F;
+    for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
+        self->d[j] = EST_VARIANCE_MAX;
     }
+    for (uint_fast8_t i = 0U; i < EST_UPPER_N; i++) {
+        self->upper[i] = 0.0F;
+    }
+    est_factors_inflate(self, config, 1.0F);  // no d beyond the prior
 }
 
 /// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
@@ -33,15 +37,7 @@ static void walk_row(est_factors_t* const self, const uint_fast8_t row, const fl
 
 void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
     for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
-        walk_row(self, i, config->random_walk);
-    }
-    est_factors_inflate(self, config, 1.0F);
-}
-
-void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
-    const est_shape_t shape = est_shape_of(config);
-    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
-        self->d[j] = est_limited(self->d[j] * factor, est_factors_prior(config, shape, j));
+        walk_row(self, i, config->random_walk * self->weight);
     }
 }
 
@@ -51,5 +47,5 @@ float est_factors_variance(const est_factors_t* const self, const uint_fast8_t c
         const float u = self->upper[((k * (k - 1U)) / 2U) + index];
         sum += u * u * self->d[k];
     }
-    return sum;
+    return sum / self->weight;
 }

@@ -19,11 +19,26 @@
 #define EST_WITH_WATCH 1  ///< stuck_n, idle_n
 #endif
 
+/// Without, est_init() takes the configuration at its word. For a build whose configuration is a constant that est_config_valid()
+/// has accepted elsewhere, as in a test on the host.
+#ifndef EST_WITH_CHECKS
+#define EST_WITH_CHECKS 1
+#endif
+
 /// gcc would rather call a long function than inline it for each shape.
 #ifdef __GNUC__
 #define EST_INLINE static inline __attribute__((always_inline))
 #else
 #define EST_INLINE static inline
+#endif
+
+/// Inline for each shape; a build for size has it once.
+#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
+#define EST_SHAPED static __attribute__((noinline, unused))
+#define EST_SHAPES_APART 0
+#else
+#define EST_SHAPED EST_INLINE
+#define EST_SHAPES_APART 1
 #endif
 
 /// A build for size would rather call a short function than have it everywhere.
@@ -33,12 +48,37 @@
 #define EST_OUTLINE static inline
 #endif
 
-/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUT_PAST_MAX, which are small.
+/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUTS_KEPT, which are small.
 #if defined(__GNUC__) && (defined(EST_FIXED_NA) || !defined(__OPTIMIZE_SIZE__))
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define EST_UNROLL
 #endif
+
+/// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
+/// faster one. An edge that may have come early or late wants one more.
+#ifdef EST_FIXED_NA
+#define EST_INPUTS_WANTED (EST_FIXED_NB + EST_FIXED_NK)
+#else
+#define EST_INPUTS_WANTED (EST_NB_MAX + EST_NK_MAX)
+#endif
+#if EST_WITH_EDGES
+#define EST_INPUTS_KEPT (EST_INPUTS_WANTED + 1U)
+#else
+#define EST_INPUTS_KEPT EST_INPUTS_WANTED
+#endif
+
+/// Whether anything wants to know of the edges of u.
+#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
+
+/// One instruction where there is one.
+EST_INLINE float est_magnitude(const float x) {
+#ifdef __GNUC__
+    return __builtin_fabsf(x);
+#else
+    return (x > 0.0F) ? x : (0.0F - x);
+#endif
+}
 
 /// The orders of the model.
 typedef struct {
@@ -66,6 +106,11 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
 /// The number of parameters.
 EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
     return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
+}
+
+/// Whether parameter j, one of them, is the offset, the last, which has a prior of its own.
+EST_INLINE bool est_is_offset(const est_shape_t shape, const uint_fast8_t j) {
+    return j >= ((uint32_t)shape.na + shape.nb + shape.nc);
 }
 
 #endif  // EST_SHAPE_H_INCLUDED

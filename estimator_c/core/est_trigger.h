@@ -5,6 +5,7 @@
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
 
+#include "est_edges.h"
 #include "est_shape.h"
 
 /// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
@@ -22,14 +23,14 @@ void est_trigger_restart(est_trigger_t* self, uint16_t quiet_n);
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
 EST_OUTLINE void est_trigger_begin_doubt(est_trigger_t* const self) {
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < (EST_READINGS - 1U); i++) {
+    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
         self->rival[i] = self->statistic;
     }
 }
 
 /// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
-/// had already passed the ceiling, another reading explained them: a slip. Else the statistic goes on from the best reading.
-est_finding_t est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
+/// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best reading.
+bool est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
 
 /// Makes the best of the other readings the statistic; true iff it is the one in which the edges came late.
 bool est_trigger_settle_late(est_trigger_t* self);
@@ -37,12 +38,46 @@ bool est_trigger_settle_late(est_trigger_t* self);
 /// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
 bool est_trigger_in_doubt(const est_trigger_t* self);
 
-/// Enters one innovation [codes] in every reading of the edges in doubt, the first as recorded, and the
-/// reciprocal of its predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and only the first reading counts.
-est_finding_t est_trigger_step(est_trigger_t*              self,
-                               const est_trigger_config_t* config,
-                               const float                 readings[EST_READINGS],
-                               float                       precision,
-                               uint16_t                    doubt_n);
+/// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
+/// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
+/// once in exp(h) samples on average: the ceiling is ln(ARL0) without any asymptotics.
+#define EST_CUSUM_GAIN 0.375F
+#define EST_CUSUM_DRIFT 0.69314718F
+
+/// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
+EST_OUTLINE float est_trigger_sum(const float before, const float innovation, const float weight) {
+    const float sum = before + ((innovation * innovation * weight) - EST_CUSUM_DRIFT);
+    return (sum <= 0.0F) ? 0.0F : sum;
+}
+
+/// In every reading of the edges in doubt, the statistic already being that of the first.
+est_finding_t est_trigger_find_in_doubt(
+    est_trigger_t* self, float ceiling, const float readings[EST_OTHER_READINGS], float weight, bool expires);
+
+/// What is no cumulative sum, or waits.
+float est_trigger_other_statistic(est_trigger_t*              self,
+                                  const est_trigger_config_t* config,
+                                  float                       innovation,
+                                  float                       precision);
+
+/// Enters one innovation [codes] as recorded and in the other readings of the edges in doubt, and the
+/// reciprocal of its predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and the first reading alone counts.
+EST_INLINE est_finding_t est_trigger_step(est_trigger_t* const              self,
+                                          const est_trigger_config_t* const config,
+                                          const float                       innovation,
+                                          const float                       precision,
+                                          const float                       readings[EST_OTHER_READINGS],
+                                          const uint16_t                    doubt_n) {
+    if ((config->kind == EST_TRIGGER_CUSUM) && (self->quiet_n == 0U)) {
+        const float weight = EST_CUSUM_GAIN * precision;
+        self->statistic    = est_trigger_sum(self->statistic, innovation, weight);
+        if (EST_WITH_EDGES && (doubt_n > 0U)) {
+            return est_trigger_find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);  // MISRA D4
+        }
+    } else {
+        self->statistic = est_trigger_other_statistic(self, config, innovation, precision);
+    }
+    return (self->statistic < config->ceiling) ? EST_QUIET : EST_ALARM;
+}
 
 #endif  // EST_TRIGGER_H_INCLUDED

@@ -4,8 +4,10 @@
 #define SETTLED 1.0001F
 
 void est_whitener_restart(est_whitener_t* const self) {
-    self->n       = 0U;
-    self->settled = false;
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+        self->precision[i] = 0.0F;
+    }
     for (uint_fast8_t j = 0U; j <= EST_THETA_MAX; j++) {
         for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
             self->past[j].x[i] = 0.0F;
@@ -35,7 +37,6 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
         }
     }
     self->precision[0] = 1.0F / variance;
-    self->n            = (uint8_t)(self->n + ((self->n < EST_NA_MAX) ? 1U : 0U));
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->gain[0][i] = gain[i];
@@ -43,24 +44,24 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
 }
 
 /// One row of the Cholesky factor of the banded covariance matrix of the noise. c[] is zero beyond its order.
-float est_whitener_advance(est_whitener_t* const self) {
+float est_whitener_advance(est_whitener_t* const self, bool* const settled) {
     float gain[EST_NA_MAX];
     float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
     float variance = autocovariance(self->c, 0U);
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX; i > 0U; i--) {
-        float sum = (i <= self->n) ? autocovariance(self->c, i) : 0.0F;
+        float sum = autocovariance(self->c, i);
         EST_UNROLL
         for (uint_fast8_t m = EST_NA_MAX; m > i; m--) {
             sum -= covariance[m - 1U] * self->gain[i - 1U][m - i - 1U];  // cppcheck F1
         }
         covariance[i - 1U] = sum;
-        gain[i - 1U]       = sum * self->precision[i - 1U];
+        gain[i - 1U]       = sum * self->precision[i - 1U];  // 0 where there was no equation
         variance -= sum * gain[i - 1U];
     }
     if (variance < SETTLED) {
-        self->settled = true;
-        variance      = 1.0F;
+        variance = 1.0F;
+        *settled = true;
         est_whitener_set(self, self->c, EST_NA_MAX);
     } else {
         remember(self, gain, variance);

@@ -49,11 +49,12 @@ EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const
 /// The next equation is the first.
 void est_whitener_restart(est_whitener_t* self);
 
-/// Goes on to the next equation, unless the filter has settled. Returns the variance of its noise once whitened, in variances of e; at least 1.
-float est_whitener_advance(est_whitener_t* self);
+/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1. If that is 1
+/// the gains have settled, which is noted, and stay as they are until the next restart.
+float est_whitener_advance(est_whitener_t* self, bool* settled);
 
 /// One sample of one signal. A loop of fixed length is the faster one; the gains beyond the order of C are zero.
-EST_INLINE float est_filter(const float* const gain, est_past_t* const past, const float x) {
+EST_SHAPED float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {

@@ -61,6 +61,11 @@ class Shape:
     offset: int
 
     @property
+    def count(self) -> int:
+        """Of the parameters."""
+        return self.na + self.nb + self.nc + self.offset
+
+    @property
     def defines(self) -> list[str]:
         """As eva.c wants it."""
         orders = {"NA": self.na, "NB": self.nb, "NC": self.nc, "OFFSET": self.offset}
@@ -69,10 +74,16 @@ class Shape:
 
 DEFAULT = Shape(2, 3, 0, 1)
 SHAPES = tuple(
-    shape
-    for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), range(NC_MAX + 1), (0, 1)))
-    if shape.na + shape.nb + shape.nc + shape.offset <= THETA_MAX
+    sorted(
+        (
+            shape
+            for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), range(NC_MAX + 1), (0, 1)))
+            if shape.count <= THETA_MAX
+        ),
+        key=lambda shape: -shape.count,
+    )
 )
+"""The largest first."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +131,9 @@ def analysed(shape: Shape) -> Analysis:
 
 
 def _digest() -> str:
-    """Of the core, and of how it is called."""
-    texts = (path.read_bytes() for path in (HERE / "eva.c", *sorted(CORE.glob("*.[ch]"))))
-    return hashlib.sha256(b"".join(texts)).hexdigest()
+    """Of the core, and of how it is called; remarks and layout do not count."""
+    texts = (re.sub(r"//.*", "", path.read_text()) for path in (HERE / "eva.c", *sorted(CORE.glob("*.[ch]"))))
+    return hashlib.sha256(" ".join("".join(texts).split()).encode()).hexdigest()
 
 
 def _known() -> dict[Shape, Analysis]:

@@ -429,8 +429,9 @@ bool est_isolation_init(est_isolation_t* const self, const est_config_t* const c
 
 /// The plant is well: this is what it is.
 static void take_theta(est_isolation_t* const self, const est_t* const estimator) {
-    self->quiet = true;
-    for (uint8_t i = 0U; i < est_theta_count(estimator); i++) {
+    const uint8_t count = est_theta_count(estimator);
+    self->quiet         = true;
+    for (uint8_t i = 0U; i < count; i++) {
         self->believed.theta[i] = est_theta(estimator, i);
     }
     self->believed.c[0] = est_prefilter(estimator, 0U);

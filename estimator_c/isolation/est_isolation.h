@@ -122,7 +122,7 @@ typedef struct {
 /// nothing tells when it was last well. The state is then unusable. Cost: constant. May be called from an interrupt.
 bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
-/// To be called after every est_step(), with what went in and came out. Cost: some 180 instructions on a Cortex-M4F, at the
+/// To be called after every est_step(), with what went in and came out. Cost: some 150 instructions on a Cortex-M4F, at the
 /// alarm 2,400 (make cost). May be called from an interrupt. A gap before the diagnosis leaves it undecided.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 

@@ -11,24 +11,17 @@ probabilities of all quantities are adjusted together (Holm 1979), so that the c
 from __future__ import annotations
 
 import itertools
-import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.campaign.difference import differences, named
-from harness.campaign.results import Results
-from harness.campaign.spec import Plan
-from harness.campaign.trial import Row, row
-from harness.errors import ConfigurationError, RecordingError
+from harness.campaign.rows import Row, changes
+from harness.campaign.sides import Observation, valid
 from harness.plant import PARAMETERS
-from harness.run import Run
-from harness.verdict import judge
 
 EXACT_UP_TO = 14
 """With so many differences or fewer all ways to exchange them are gone through."""
@@ -38,9 +31,6 @@ RESAMPLES, _AT_ONCE = 99_999, 1_000
 PAIRED, UNPAIRED = "sign flips, paired by seed", "permutation of seeds"
 
 Word = Literal["worse", "better", "no difference shown"]
-
-Observation = tuple[tuple[object, ...], Row]
-"""What was played, seed included, and what came of it."""
 
 
 @dataclass(frozen=True)
@@ -90,106 +80,11 @@ class Comparison:
         return any(each.word == "worse" for each in self.differences)
 
 
-@dataclass(frozen=True)
-class Side:
-    """What is set against another."""
-
-    trials: tuple[Observation, ...]
-    """Valid or not."""
-    plan: Plan | None = None
-    """None: recordings."""
-
-
-def load(path: Path) -> Side:
-    """The trials of a results file, of a recording, or of all recordings below a folder.
-
-    :raises RecordingError: it cannot be read, or there is nothing valid in it.
-    """
-    if path.is_dir() or path.suffix == ".npz":
-        recordings = sorted(path.rglob("*.npz")) if path.is_dir() else [path]
-        side = Side(tuple(map(_recorded, recordings)))
-    else:
-        results = Results.load(path)
-        cells = zip(results.plan.cells(), results.rows, strict=True)
-        rows = ((cell, each) for cell, its_rows in cells for each in its_rows)
-        side = Side(
-            tuple(((cell.rig, cell.device, *cell.values.items(), each["seed"]), each) for cell, each in rows),
-            results.plan,
-        )
-    if not _valid(side.trials):
-        raise RecordingError(f"{path}: holds no valid trial")
-    return side
-
-
-def matched(a: Side, b: Side) -> tuple[Sequence[Observation], Sequence[Observation]]:
-    """What of both sides played the same; the devices may be others.
-
-    :raises ConfigurationError: they are of different campaigns, or played nothing in common; names what differs.
-    """
-    if a.plan is not None and b.plan is not None:
-        _check_same("A and B are different campaigns", _played(a.plan), _played(b.plan))
-        return a.trials, _in_order(b, _names(a.plan), _names(b.plan))
-    if a.plan is not None or b.plan is not None:
-        raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
-    common = {key[:-1] for key, _ in a.trials} & {key[:-1] for key, _ in b.trials}
-    if not common:
-        _check_same("A and B played nothing in common", *(_recorded_play(side.trials[0]) for side in (a, b)))
-    ours, theirs = ([each for each in side.trials if each[0][:-1] in common] for side in (a, b))
-    return ours, theirs
-
-
-def _check_same(otherwise: str, ours: Any, theirs: Any) -> None:
-    found = list(differences(ours, theirs))
-    if found:
-        raise ConfigurationError(f"{otherwise}: {named(found, ('in A', 'in B'))}")
-
-
-def _names(plan: Plan) -> list[str]:
-    """Of the devices."""
-    return [str(device["name"]) for device in plan.devices]
-
-
-def _in_order(side: Side, wanted: Sequence[str], names: Sequence[str]) -> Sequence[Observation]:
-    """With the devices numbered as on the other side, if they are the same by name; else each is that in its place."""
-    if set(wanted) != set(names):
-        return side.trials
-    return [((key[0], wanted.index(names[int(str(key[1]))]), *key[2:]), each) for key, each in side.trials]
-
-
-def _recorded_play(trial: Observation) -> dict[str, Any]:
-    (scenario, rig, _), _ = trial
-    return {"scenario": json.loads(str(scenario)), "rig": rig}
-
-
-def _played(plan: Plan) -> dict[str, Any]:
-    """What a campaign played, whatever device it had, and whatever it was called."""
-    table = plan.as_table()
-    spec = {key: value for key, value in table["spec"].items() if key not in _NAMES}
-    if "stop" not in spec:
-        del spec["chunk"]  # says who plays what, and then no more
-    return {
-        **spec,
-        "devices": len(plan.devices),
-        "scenario": _unnamed(table["scenario"]),
-        "rigs": [_unnamed(rig) for rig in table["rigs"]],
-    }
-
-
-_NAMES = frozenset({"name", "description", "scenario", "rigs", "devices", "samples"})
-"""In a campaign's file: of no consequence, or what they name is in the plan."""
-
-
-def _unnamed(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Without what it is called, unless it is nothing but a name."""
-    rest = {key: value for key, value in table.items() if key not in {"name", "description"}}
-    return rest or dict(table)
-
-
 def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01) -> Comparison:
     """``b`` against ``a``. The same two sides give the same answer."""
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
-    ours, theirs = _valid(a), _valid(b)
+    ours, theirs = valid(a), valid(b)
     common = ours.keys() & theirs.keys()
     found = [each for quantity in QUANTITIES if (each := _difference(quantity, ours, theirs)) is not None]
     return Comparison(
@@ -201,24 +96,14 @@ def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0
     )
 
 
-def _valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
-    return {key: each for key, each in trials if each["outcome"] != "inconclusive"}
-
-
-def _recorded(path: Path) -> Observation:
-    run = Run.load(path)
-    of = run.conditions
-    played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
-    return (played, str(of.rig["name"]), of.seed), row(run, judge(run))
-
-
 def _latencies(trial: Row, other: Row | None) -> list[float]:
-    others = trial["changes"] if other is None else other["changes"]
-    return [mine[0] for mine, his in zip(trial["changes"], others, strict=False) if None not in (mine[0], his[0])]
+    others = changes(trial if other is None else other)
+    both = [(mine.latency_n, his.latency_n) for mine, his in zip(changes(trial), others, strict=False)]
+    return [mine for mine, his in both if mine is not None and his is not None]
 
 
 def _missed(trial: Row, _: Row | None) -> list[float]:
-    return [float(change[2]) for change in trial["changes"] if change[1] is not None]
+    return [float(change.missed) for change in changes(trial) if change.bound_n is not None]
 
 
 def _false_alarms(trial: Row, _: Row | None) -> list[float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from harness.bench import INTERRUPTED_BY_USER, Bench
-from harness.campaign.spec import Case, device_as_planned, open_table
+from harness.campaign.plan import Case, device_as_planned, open_table
 from harness.devices import DeviceDescription
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError, RigError

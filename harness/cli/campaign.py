@@ -14,7 +14,7 @@ from harness.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, sh
 
 if TYPE_CHECKING:
     from harness.campaign.conduct import Tally
-    from harness.campaign.spec import Plan
+    from harness.campaign.plan import Plan
     from harness.campaign.workers import Workers
 
 
@@ -58,9 +58,10 @@ def begin(arguments: argparse.Namespace) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from harness.campaign.conduct import conduct, journal_of, unreachable
+    from harness.campaign.plan import Plan, one_worker_only
     from harness.campaign.report import page_of, write_page
     from harness.campaign.results import as_json, text
-    from harness.campaign.spec import CampaignSpec, Plan, one_worker_only
+    from harness.campaign.spec import CampaignSpec
     from harness.errors import WorkerError
 
     plan = Plan.of(CampaignSpec.load(arguments.spec))

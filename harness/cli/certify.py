@@ -50,7 +50,7 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
-    from harness.campaign.spec import device_table, one_worker_only, rig_table
+    from harness.campaign.plan import device_table, one_worker_only, rig_table
     from harness.certificate import certify, question_of
     from harness.errors import DeviceError, LinkError, RigError, WorkerError
     from harness.scenario import Scenario

@@ -39,7 +39,8 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from harness.campaign.comparison import compare, load, matched
+    from harness.campaign.comparison import compare
+    from harness.campaign.sides import load, matched
 
     found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
     show(json.dumps(asdict(found)) if arguments.json else _text(found))

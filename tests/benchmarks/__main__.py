@@ -20,6 +20,7 @@ from . import (
     bench_isolation,
     bench_link,
     bench_onset,
+    bench_properties,
     bench_self_test,
     bench_statistics,
     bench_trials,
@@ -38,6 +39,7 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "calibration": bench_calibration.figures,
     "self-test": bench_self_test.figures,
     "onset": bench_onset.figures,
+    "properties": bench_properties.figures,
 }
 
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from harness.rigs.self_test.conduct import self_test
 from harness.run import CHANNELS
-from harness.self_test.conduct import self_test
 from harness.statistics import upper_rate
 
 from .figure import Figure

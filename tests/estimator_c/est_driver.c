@@ -112,12 +112,13 @@ int driver_invariants_hold_if_damaged(int way) {
     switch (way) {
     case 0: self.config = 0; break;
     case 1: self.config = &invalid; break;
-    case 2: self.count++; break;
+    case 2: self.factors.weight = 0.0F; break;
     case 3: self.factors.d[1] = -1.0F; break;
     case 4: self.theta[0] = __builtin_nanf(""); break;
     case 5: self.trigger.statistic = -1.0F; break;
     case 6: self.noise_variance = 0.0F; break;
     case 7: self.factors.d[1] = __builtin_inff(); break;
+    case 9: self.factors.weight = 1.5F; break;
     default: break;
     }
     const int held = est_invariants_hold((way == 8) ? 0 : &self) ? 1 : 0;

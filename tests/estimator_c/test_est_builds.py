@@ -11,6 +11,7 @@ from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator, compile_dr
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 WITHOUT = tuple(f"-DEST_WITH_{part}=0" for part in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH"))
+UNCHECKED = "-DEST_WITH_CHECKS=0"
 MINIMAL = {"refresh_n": 0, "stuck_n": 0, "idle_n": 0, "edge_instants": LOCKED}
 FREE = {"na": 2, "nb": 3, "nk": 0, "nc": 0, "offset": 1}
 CARD = {"na": 2, "nb": 2, "nk": 1, "nc": 0, "offset": 0}
@@ -28,9 +29,10 @@ def fixed(shape: dict[str, int]) -> tuple[str, ...]:
         (("fixed",), {}),
         (("fixed", *WITHOUT), MINIMAL),
         (WITHOUT, MINIMAL),
+        (("-Os", *WITHOUT, UNCHECKED), MINIMAL),
         (("-UEST_NC_MAX", "-DEST_NC_MAX=0U"), {}),
     ],
-    ids=["size", "fixed", "fixed minimal", "minimal", "no extended least squares"],
+    ids=["size", "fixed", "fixed minimal", "minimal", "least", "no extended least squares"],
 )
 def test_builds_agree_to_the_bit(
     estimator: Estimator, tmp_path: Path, options: tuple[str, ...], settings: dict[str, int], shape: dict[str, int]
@@ -69,3 +71,10 @@ def test_build_refuses_what_it_was_made_without(
     base = MINIMAL if options == WITHOUT else CARD
     assert build.init(**base)
     assert not build.init(**settings)
+
+
+@pytest.mark.parametrize(("option", "accepts"), [((), False), ((UNCHECKED,), True)], ids=["checks", "unchecked"])
+def test_build_without_checks_takes_the_configuration_at_its_word(
+    tmp_path: Path, option: tuple[str, ...], *, accepts: bool
+) -> None:
+    assert Estimator(compile_driver(tmp_path, *option)).init(forgetting=2.0) == accepts

@@ -246,3 +246,16 @@ def test_largest_order_fits(estimator: Estimator) -> None:
     assert estimator.init(na=2, nb=2, nk=1, nc=2, offset=0)
     data = record(noise=1.0)
     assert np.isfinite(estimator.run(*data).theta).all()
+
+
+@pytest.mark.parametrize(("every_n", "growth"), [(1000, 2.0), (6, 4.0)], ids=["at rest", "always in doubt"])
+def test_a_variance_grows_without_excitation_and_no_further_than_it_may(
+    estimator: Estimator, every_n: int, growth: float
+) -> None:
+    """Nothing is said of A while y stands still: each variance grows by 1 / forgetting an equation (thesis 3.6) until
+    P is limited, at twice the prior, or at four times where edges in doubt make every step a long one."""
+    forgetting, p0, n = 0.9, 10.0, 60
+    u = np.where(np.arange(n) // every_n % 2, 1000.0, -1000.0)
+    assert estimator.init(nb=1, nk=0, offset=0, forgetting=forgetting, p0=p0, c=(0.0, 0.0), refresh_n=0, stuck_n=0)
+    largest = max(estimator.run(u[k : k + 1], np.zeros(1)).variance[0] for k in range(n))
+    assert p0 * growth < largest <= p0 * growth / forgetting

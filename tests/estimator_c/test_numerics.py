@@ -50,21 +50,24 @@ def test_ten_million_samples_without_excitation_do_no_harm(estimator: Estimator,
 
 
 class WideFactors:
-    """Bierman's measurement update (1977, section V.3), with the limit of each d, in long double."""
+    """Bierman's measurement update (1977, section V.3), in long double; each time the weight halves d is limited."""
 
     def __init__(self, prior: list[np.longdouble]) -> None:
         self.prior = np.array(prior, np.longdouble)
         self.d, self.u = self.prior.copy(), np.eye(len(prior), dtype=np.longdouble)
-        self.theta = np.zeros(len(prior), np.longdouble)
+        self.theta, self.weight = np.zeros(len(prior), np.longdouble), np.longdouble(1.0)
 
     def enter(self, phi: Extended, y: np.longdouble, forgetting: np.longdouble) -> None:
+        if self.weight < 0.5:
+            self.d, self.weight = np.minimum(self.d / self.weight, self.prior), np.longdouble(1.0)
         f = self.u.T @ phi
         v = self.d * f
-        innovation, alpha = y - phi @ self.theta, forgetting
+        self.weight *= forgetting
+        innovation, alpha = y - phi @ self.theta, self.weight
         gain = np.zeros_like(v)
         for j in range(len(v)):
             before, alpha = alpha, alpha + f[j] * v[j]
-            self.d[j] = min(self.d[j] * before / (alpha * forgetting), self.prior[j])
+            self.d[j] *= before / alpha
             column = self.u[:j, j].copy()
             self.u[:j, j] -= gain[:j] * (f[j] / before)
             gain[:j] += column * v[j]

@@ -15,7 +15,8 @@ def main(spec: str, out: str) -> None:
     from distributed import LocalCluster
 
     from harness.campaign.conduct import Tally, conduct
-    from harness.campaign.spec import CampaignSpec, Plan
+    from harness.campaign.plan import Plan
+    from harness.campaign.spec import CampaignSpec
     from harness.campaign.workers import Dask
 
     with LocalCluster(  # type: ignore[no-untyped-call]  # Dask is annotated in part

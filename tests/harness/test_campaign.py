@@ -20,9 +20,11 @@ from harness.bench import Bench
 from harness.campaign import players
 from harness.campaign.conduct import Tally, conduct, journal_of
 from harness.campaign.journal import Journal
+from harness.campaign.plan import Chunk, Plan, one_worker_only, rig_table
 from harness.campaign.results import Results, Summary, text
-from harness.campaign.spec import CampaignSpec, Chunk, Plan, one_worker_only, rig_table
-from harness.campaign.trial import close_devices, play_chunk, row
+from harness.campaign.rows import row
+from harness.campaign.spec import CampaignSpec
+from harness.campaign.trial import close_devices, play_chunk
 from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
 from harness.devices import DeviceDescription, describe
@@ -382,7 +384,7 @@ def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spec", "why"),
-    [("samples = 140", "the warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "the device was not excited")],
+    [("samples = 140", "its warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "in 900 it was not excited")],
 )
 def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Path, spec: str, why: str) -> None:
     still = tmp_path / "still.toml"
@@ -598,6 +600,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     with Journal(journal_of(out), plan) as journal:
         journal.add(Chunk((0, 0)), play_chunk(plan.as_json(), (0, 0)))
     kept = journal_of(out).read_bytes()
+    library.unlink()  # as a linker does: it is still loaded
     library.write_bytes(LIBRARY.read_bytes())
     close_devices()
     with pytest.raises(ConfigurationError, match=r"own\.so is another build than the one that the campaign was begun"):

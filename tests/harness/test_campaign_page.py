@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
+from harness.campaign.plan import Plan
 from harness.campaign.report import render, write_page
 from harness.campaign.results import Results
-from harness.campaign.spec import CampaignSpec, Grid, Plan
-from harness.campaign.trial import Row
+from harness.campaign.rows import Row
+from harness.campaign.spec import CampaignSpec, Grid
 from tests.browser import Watched
 
 

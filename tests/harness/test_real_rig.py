@@ -24,7 +24,8 @@ from harness.errors import ConfigurationError, RecordIncomplete, RecordStale, Ri
 from harness.rigs.description import described as described_rig
 from harness.rigs.description import open_rig
 from harness.rigs.instrument import PotBox, Turn
-from harness.rigs.real import LEAD_N, RealRig, records
+from harness.rigs.plan import LEAD_N, records
+from harness.rigs.real import RealRig
 from harness.rigs.red_pitaya import RedPitaya
 from harness.rigs.rig import Performance
 from harness.rigs.wiring import RealDescription

@@ -20,12 +20,12 @@ from harness.errors import ConfigurationError, RigError, SelfTestError
 from harness.rigs.description import open_rig
 from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from harness.rigs.rig import Block, Performance, Rig
+from harness.rigs.self_test.conduct import self_test
+from harness.rigs.self_test.findings import Check, Findings
+from harness.rigs.self_test.response import SecondOrder
+from harness.rigs.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
 from harness.run import CHANNELS
 from harness.scenario import Scenario
-from harness.self_test.conduct import self_test
-from harness.self_test.findings import Check, Findings
-from harness.self_test.response import SecondOrder
-from harness.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.information import QUANTISATION_VARIANCE_LSB2
-from harness.self_test.timing import Levels, Line, SeenEdges
+from harness.rigs.self_test.timing import Levels, Line, SeenEdges
 
 _UNSETTLED_N = 3
 """So many samples on either side of an edge do not count for the noise of a level."""

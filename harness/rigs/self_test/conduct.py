@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from harness.errors import SelfTestError
 from harness.rigs.rig import Rig
+from harness.rigs.self_test import checks, noise
+from harness.rigs.self_test.findings import Check, Findings
+from harness.rigs.self_test.record import HIGH_V, LOW_V, SelfTestRecord
+from harness.rigs.self_test.response import Answer, Response, SecondOrder
+from harness.rigs.self_test.timing import Levels, SeenEdges, averaged_n, lateness
 from harness.run import MEASURED
-from harness.self_test import checks, noise
-from harness.self_test.findings import Check, Findings
-from harness.self_test.record import HIGH_V, LOW_V, SelfTestRecord
-from harness.self_test.response import Answer, Response, SecondOrder
-from harness.self_test.timing import Levels, SeenEdges, averaged_n, lateness
 
 LEAST_SWING_V = 0.25
 """A channel that moves by less shows no signal."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 from harness.information import QUANTISATION_VARIANCE_LSB2
-from harness.self_test import noise
-from harness.self_test.findings import Check
+from harness.rigs.self_test import noise
+from harness.rigs.self_test.findings import Check
 
 LEAST_SHARPER = 0.3
 MOST_CLIPPED = 1e-3

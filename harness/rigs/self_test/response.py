@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.errors import SelfTestError
-from harness.self_test.timing import Line, SeenEdges
+from harness.rigs.self_test.timing import Line, SeenEdges
 
 _EDGES_FELT = 2
 """So many edges back is the response settled: the rest is below 1e-5 for a half period of 100 samples."""

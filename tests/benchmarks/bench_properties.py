@@ -1,0 +1,121 @@
+"""How often chance fails a sound device in the shipped properties: the figures behind the table of harness/README.md.
+
+python -m tests.benchmarks properties
+
+Plays in this process, of other seeds than those of the properties themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import hypothesis
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, settings
+from numpy.typing import NDArray
+
+from harness.devices import describe
+from harness.information import detectable
+from harness.played import Played
+from harness.properties import TRIES, is_playable
+from harness.properties.test_detection import (
+    ARL0,
+    DOUBTFUL_LATENCY,
+    MOST_INFORMATION,
+    MOST_LATENCY,
+    MOST_PLAYS_N,
+    PATIENT,
+    PLAYS_N,
+)
+from harness.properties.test_estimates import WITHIN
+from harness.rigs.description import open_rig
+from harness.rigs.emulator import EmulatorRig
+from harness.scenario import Scenario
+from harness.statistics import upper_rate
+from harness.strategies import profile, scenarios, seeds
+from harness.trials import Trials
+
+from .figure import Figure
+
+PLAYS, DRAWN, CONFIDENCE = 4000, 2000, 0.999
+EXAMPLES = profile("ci").max_examples
+
+
+def figures() -> Iterator[Figure]:
+    """Chances a run of all tests."""
+    yield from _latency()
+    clipped = _trials("emulator-0-10v")
+    thesis = Scenario.load("thesis")
+    failed = sum(not Played(clipped.run(thesis, seed)).passes() for seed in range(10_000, 10_000 + PLAYS))
+    yield _of_some_seed("missing samples", failed, PLAYS)
+    trials = _trials("emulator")
+    patient = scenarios(expect=PATIENT)
+    found = _failures(patient, trials, Played.passes, lambda each: detectable(each, ARL0**MOST_INFORMATION))
+    yield _of_some_seed("changes are found", *found)
+    healthy = scenarios(most_changes=0)
+    yield _of_some_seed("estimates", *_failures(healthy, trials, lambda each: each.estimates(WITHIN), lambda _: True))
+
+
+def _trials(name: str) -> Trials:
+    rig = open_rig(name)
+    assert isinstance(rig, EmulatorRig)
+    return Trials(rig, describe("inproc"))
+
+
+def _of_some_seed(name: str, failed: int, plays: int) -> Figure:
+    """That of so many examples one fails with every seed, from how many single plays have."""
+    chance = EXAMPLES * upper_rate(failed, plays, CONFIDENCE) ** TRIES
+    return Figure(f"chance to fail a sound device: {name} ({failed} of {plays} plays failed)", chance, "a run")
+
+
+def _failures(
+    drawn: hypothesis.strategies.SearchStrategy[Scenario],
+    trials: Trials,
+    statement: Callable[[Played], object],
+    is_meant: Callable[[Scenario], bool],
+) -> tuple[int, int]:
+    """How many of the scenarios that were drawn fail, and their number."""
+    rig = open_rig("emulator")
+    held: list[bool] = []
+
+    @hypothesis.seed(5)
+    @settings(
+        max_examples=DRAWN,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(scenario=drawn, seed=seeds())
+    def play(scenario: Scenario, seed: int) -> None:
+        if is_playable(rig, scenario) and is_meant(scenario):
+            held.append(bool(statement(Played(trials.run(scenario, seed)))))
+
+    play()
+    return held.count(False), len(held)
+
+
+def _latency() -> Iterator[Figure]:
+    """The mean over many plays, by Chernoff's bound from the distribution of one: its tail is longer than a normal
+    one's."""
+    trials, thesis = _trials("emulator"), Scenario.load("thesis")
+    latency_n, bound_n = np.array([_sums(Played(trials.run(thesis, 1000 + seed))) for seed in range(PLAYS)]).T
+    ratio = latency_n.sum() / bound_n.sum()
+    error = np.std(latency_n - ratio * bound_n) / bound_n.mean() / np.sqrt(PLAYS_N)
+    yield Figure(f"mean latency over mean bound, thesis, {PLAYS} plays", ratio, "")
+    yield Figure(f"its standard error over {PLAYS_N} plays", error, "")
+    at_once = _beyond(latency_n - DOUBTFUL_LATENCY * bound_n, PLAYS_N)
+    later = _beyond(latency_n - MOST_LATENCY * bound_n, MOST_PLAYS_N)
+    yield Figure("chance to fail a sound device: latency over bound", at_once + later, "a run")
+
+
+def _sums(played: Played) -> tuple[float, float]:
+    """Of latencies and bounds, in samples."""
+    tweaks = played.verdict.tweaks
+    return float(sum(each.latency_n or 0 for each in tweaks)), float(sum(each.bound_n or 0 for each in tweaks))
+
+
+def _beyond(values: NDArray[np.float64], count: int) -> float:
+    """A bound of the probability that so many values, drawn from these, add up to more than 0."""
+    logs = [np.log(np.mean(np.exp(theta * values))) for theta in np.linspace(0.001, 2.0, 400)]
+    return float(np.exp(count * min(logs)))
