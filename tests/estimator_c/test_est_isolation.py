@@ -36,7 +36,7 @@ def test_changed_parameter_is_named_in_time_and_its_extent_told(
 
 @pytest.mark.parametrize("change", [{"M": 0.8}, {"M": 1.2}, {"B": 1.2}, {"K": 0.8}], ids=str)
 def test_report_comes_within_twice_the_isolation_bound_on_average(estimator: Estimator, change: Change) -> None:
-    """1.6 to 1.95 times."""
+    """1.6 to 2.0 times; B - 20 % and K + 20 % are below."""
     found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 400, seed=31, against_two=False)
     assert found.bound_n < found.mean_n <= 2.0 * found.bound_n
 
