@@ -21,7 +21,7 @@ from harness.campaign.plan import Case, device_of, open_table
 from harness.campaign.trial import Count, close_devices, count_alarms
 from harness.campaign.workers import Workers
 from harness.errors import ConfigurationError
-from harness.rare import Estimate, false_alarm_rate
+from harness.rare import LEAD_IN_N, Estimate, false_alarm_rate
 from harness.rigs.emulator import EmulatorRig
 from harness.scenario import Scenario
 from harness.statistics import (
@@ -57,7 +57,7 @@ LEAST_ESTIMATES, MOST_ESTIMATES = 64, 10_000
 IN_PROCESS_YEAR_N, BENCH_YEAR_N = 1e14, 3e11
 """About so many samples are played in a year, in this process by one processor, or over a line."""
 
-Outcome = Literal["certified", "refuted", "inconclusive"]
+Answer = Literal["certified", "refuted", "inconclusive"]
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Question:
 class Certificate:
     """The answer."""
 
-    outcome: Outcome
+    outcome: Answer
     reason: str
     alarms: int
     """For a rare rate, branches that came to one."""
@@ -216,7 +216,7 @@ def _of_rare_alarms(question: Question, count: int, workers: Workers) -> Certifi
     rates = [each.rate for each in estimates]
     low, high = mean_bounds(rates, question.confidence)
     said = f"the rate is {math.fsum(rates) / len(rates):.3g}, {low:.3g} to {high:.3g}, from {len(rates)} estimates"
-    return Certificate(_outcome(question.far, low, high), f"{said}, {samples} samples", alarms, samples, (low, high))
+    return Certificate(_answer(question.far, low, high), f"{said}, {samples} samples", alarms, samples, (low, high))
 
 
 def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
@@ -230,7 +230,7 @@ def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
         return rate, alarms, samples
 
 
-def _outcome(far: float, low: float, high: float) -> Outcome:
+def _answer(far: float, low: float, high: float) -> Answer:
     return "certified" if high <= far else "refuted" if low > far else "inconclusive"
 
 
@@ -249,11 +249,7 @@ def _run_n(question: Question, most: int) -> int:
     """Such a length that a whole number of runs makes up a test of fixed length."""
     about = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
     runs = math.ceil(most / about)
-    return math.ceil(most / runs) + device_of(question.device).estimator.warm_up_n + _LEAD_IN_N
-
-
-_LEAD_IN_N = 16
-"""Samples that fill the regressors before the first equation, for any model that a device can have."""
+    return math.ceil(most / runs) + device_of(question.device).estimator.warm_up_n + LEAD_IN_N
 
 
 def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
@@ -263,7 +259,7 @@ def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
     low = lower_rate(alarms, samples, question.confidence)
     high = upper_rate(alarms, samples, question.confidence)
     said = f"{alarms} alarms in {samples} samples: the rate is {low:.3g} to {high:.3g}"
-    return Certificate(_outcome(question.far, low, high), said, alarms, samples, (low, high))
+    return Certificate(_answer(question.far, low, high), said, alarms, samples, (low, high))
 
 
 def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:

@@ -17,9 +17,6 @@ from numpy.typing import NDArray
 from harness.catalogue import SteppedFlag
 from harness.run import CHANNELS, LOST, Run
 
-MOST_UNEXCITED = 0.5
-"""Of the samples: with more it is as if nobody had looked."""
-
 _FORCE = CHANNELS.index("force")
 
 _NOT_HEARD = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
@@ -39,20 +36,19 @@ class Exposure:
 
     @property
     def no_evidence(self) -> str:
-        """Why nothing of this is evidence of anything, in one line; empty if it is."""
-        because = self._because()
-        return because and f"the trigger was armed in {self.armed} of {self.samples} samples: {because}"
+        """Why its silence is no evidence of anything, in one line; empty if it is."""
+        return "" if self.armed else f"no alarm could come in any of {self.samples} samples: {self._because()}"
 
     def _because(self) -> str:
         if self.estimator.get("trigger") == "none":
-            return "the device has none"
-        if self.unexcited > MOST_UNEXCITED * self.samples:
-            edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
-            return (
-                f"in {self.unexcited} the device was not excited (the force had no edge of {edge_codes:g} codes,"
-                f" or none for {idle_n} samples)"
-            )
-        return "" if self.armed else f"the warm-up takes {self.estimator.get('warm_up_n', 0)}"
+            return "the device has no trigger"
+        if 2 * self.unexcited <= self.samples:
+            return f"its warm-up takes {self.estimator.get('warm_up_n', 0)}"
+        edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
+        return (
+            f"in {self.unexcited} it was not excited (the force had no edge of {edge_codes:g} codes, or none for"
+            f" {idle_n} samples)"
+        )
 
 
 def exposure(run: Run) -> Exposure:

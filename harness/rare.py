@@ -48,8 +48,8 @@ LOUDER = np.array([1.6, 2.0, 2.6])
 
 _DISPLACEMENT = CHANNELS.index("displacement")
 
-_LEAD_IN_N = 16
-"""Samples that fill the regressors."""
+LEAD_IN_N = 16
+"""Samples that fill the regressors before the first equation, for any model that a device can have."""
 
 _STRETCH_N = 32
 """Samples that all branches go on at a time."""
@@ -107,7 +107,7 @@ def false_alarm_rate(
     if settings.trigger != "cusum":
         raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
     estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
-    first = settings.warm_up_n + _LEAD_IN_N
+    first = settings.warm_up_n + LEAD_IN_N
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
     (play,) = rig.perform(played, seed, block_samples=played.samples).blocks
     return _Climbs(rig, settings, estimator, play, np.random.default_rng([seed, _BRANCHES])).estimate(first, branches)

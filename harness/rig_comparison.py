@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from harness.bench import Bench
 from harness.campaign.comparison import Comparison, compare
-from harness.campaign.trial import Row, row
+from harness.campaign.rows import Row, changes, row
 from harness.run import CHANNELS, MEASURED, Run
 from harness.scenario import Scenario
 from harness.statistics import mean_interval, rate_interval, upper_rate
@@ -260,14 +260,14 @@ def _size(largest: tuple[float, int]) -> float:
 def _latency(a: Sequence[Row], b: Sequence[Row], confidence: float) -> LatencyDifference | None:
     """Of changes that were noticed on both."""
     both = [
-        [(before[0], after[0]) for before, after in zip(mine["changes"], other["changes"], strict=True)
-         if None not in (before[0], after[0])]
+        [(before.latency_n, after.latency_n) for before, after in zip(changes(mine), changes(other), strict=True)
+         if before.latency_n is not None and after.latency_n is not None]
         for mine, other in zip(a, b, strict=True)
     ]  # fmt: skip
-    by_seed = [float(np.mean([after - before for before, after in changes])) for changes in both if changes]
+    by_seed = [float(np.mean([after - before for before, after in pairs])) for pairs in both if pairs]
     if len(by_seed) < 2:
         return None
-    latencies = np.array([pair for changes in both for pair in changes], dtype=np.float64)
+    latencies = np.array([pair for pairs in both for pair in pairs], dtype=np.float64)
     quantiles = np.quantile(latencies, (0.5, 0.95, 1.0), axis=0).T
     unequal = int((latencies[:, 0] != latencies[:, 1]).sum())
     mean, least, most = mean_interval(by_seed, confidence)

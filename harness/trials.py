@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import exposure
 from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
-from harness.exposure import Exposure
+from harness.exposure import Exposure, exposed
 from harness.links.wire import LIBRARY
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.rig import Block, Performance, Rig
@@ -44,6 +44,17 @@ def are_possible(rig: Rig, device: DeviceDescription) -> bool:
         and not device.wire_faults
         and device.report_interval_n == 1
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Of a trial the alarms, and what their number is worth."""
+
+    alarms: NDArray[np.int64]
+    """(a,) samples."""
+    exposure: Exposure
+    missing: int
+    refused: int
 
 
 class Trials:
@@ -73,8 +84,8 @@ class Trials:
         found = [block.first + self._estimator.alarms(*entered(block)) for block in performance.blocks]
         return np.concatenate(found)
 
-    def exposed(self, scenario: Scenario, seed: int) -> tuple[NDArray[np.int64], NDArray[np.uint8], Exposure]:
-        """As ``alarms``; beside them the flags of all samples, (n,) as of a Run, and in which an alarm could come."""
+    def watched(self, scenario: Scenario, seed: int) -> Watched:
+        """As ``alarms``, with what they are worth."""
         self._estimator.restart()
         force, flags = np.empty(scenario.samples, np.uint16), np.empty(scenario.samples, np.uint8)
         found = []
@@ -84,7 +95,8 @@ class Trials:
             force[its] = u
             found.append(block.first + self._estimator.alarms(u, y, valid, status=flags[its]))
         flags, alarms = flags_of(flags), np.concatenate(found)
-        return alarms, flags, exposure.exposed(force, flags, alarms, self._tables[1]["estimator"])
+        missing, refused = (int(np.count_nonzero(flags & flag)) for flag in (SteppedFlag.MISSING, SteppedFlag.REFUSED))
+        return Watched(alarms, exposed(force, flags, alarms, self._tables[1]["estimator"]), missing, refused)
 
     def run(self, scenario: Scenario, seed: int) -> Run:
         """One trial, for ``judge``; errors as ``alarms``."""

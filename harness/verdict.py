@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from harness import config, information
 from harness.catalogue import Change, SteppedFlag
+from harness.exposure import Exposure, exposure
 from harness.plant import PARAMETERS, physical_parameters
 from harness.run import LOST, Run, Segment
 from harness.scenario import MISSING, Expectations
@@ -390,14 +391,22 @@ def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
-    reasons += refusals(run.conditions.counters.get("refused", 0))
     reasons += _losses(run)
-    return reasons + expect.gaps(run.samples, int(run.missing.sum()), missing_text(run))
+    refused, missing = run.conditions.counters.get("refused", 0), int(run.missing.sum())
+    return reasons + no_evidence(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
 
 
-def refusals(refused: int) -> list[str]:
-    """Why a run in which the device refused so many samples is not valid; empty if it is."""
-    return [f"the device refused {refused} samples"] if refused else []
+def no_evidence(
+    shown: Exposure, expect: Expectations, *, refused: int, missing: int, words: str = MISSING
+) -> list[str]:
+    """Why what a device made of its samples is no evidence, whatever else is known of the run; empty if it is.
+
+    :param refused: so many it refused.
+    :param missing: so many were missing; ``words`` say of what kind these are.
+    """
+    refusals = [f"the device refused {refused} samples"] if refused else []
+    unarmed = [shown.no_evidence] if shown.no_evidence else []
+    return [*refusals, *expect.gaps(shown.samples, missing, words), *unarmed]
 
 
 def _losses(run: Run) -> list[str]:

@@ -286,8 +286,8 @@ bool est_config_valid(const est_config_t* config);
 bool est_init(est_t* self, const est_config_t* config);
 
 /// Enters one sample: filters, regressor, U-D update (Bierman 1977), trigger.
-/// Cost: for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension; up to 1.3 times that when C is taken
-/// from A, or an edge is in doubt.
+/// Cost: for a given order, about 3 n^2 / 2 multiplications and n divisions with n the dimension; up to 1.3 times that where
+/// an edge may have slipped, 1.2 times elsewhere.
 /// RAM: none beyond the state and some 300 bytes of stack. May be called from an interrupt.
 /// Bad data never fails and never enters the estimate: see est_status_t.
 est_step_t est_step(est_t* self, est_sample_t sample);
@@ -311,8 +311,9 @@ float est_prefilter(const est_t* self, uint8_t index);
 
 est_counters_t est_counters(const est_t* self);
 
-/// True iff the state is one that est_init() and est_step() can produce: every d positive and finite, theta finite,
-/// indices in range. For self-tests in the field and for fuzzing. Cost: O(n).
+/// True iff the numbers that the estimate lives on are ones that est_init() and est_step() can produce: the configuration
+/// valid, every d positive and finite, their weight in range, theta finite, statistic and noise variance in range. Counters
+/// and flags are not looked at. For self-tests in the field and for fuzzing. Cost: O(n).
 bool est_invariants_hold(const est_t* self);
 
 #ifdef __cplusplus

@@ -108,9 +108,9 @@ EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
     return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
 }
 
-/// Whether parameter j is the offset, which has a prior of its own.
+/// Whether parameter j, one of them, is the offset, the last, which has a prior of its own.
 EST_INLINE bool est_is_offset(const est_shape_t shape, const uint_fast8_t j) {
-    return shape.offset && ((j + 1U) == est_shape_count(shape));
+    return j >= ((uint32_t)shape.na + shape.nb + shape.nc);
 }
 
 #endif  // EST_SHAPE_H_INCLUDED

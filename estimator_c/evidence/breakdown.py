@@ -53,10 +53,12 @@ def least(orders: Orders) -> dict[str, int]:
     n, na = orders.count, orders.na
     whiten = (n + 1) * na * 2  # a multiplication and a subtraction for each past value of each element
     predict = 2 * n
-    # Bierman's update, column j of n: v, p, alpha, 1 / alpha, d and its limits; with each u above it f, u and the gain
-    update = sum(9 + 6 * j for j in range(n)) + 1 + 2 * n
+    # Bierman's update, column j of n: v, p, alpha, 1 / alpha, d and its least; with each u above it f, u and the gain;
+    # the first has no p, and there are the weight, what it makes of the noise and of the variance, and theta
+    update = sum(8 + 6 * j for j in range(n)) - 1 + 3 + 1 + 2 * n
     trigger = 6
-    moved = 2 * (n + 1) * na + 2 * n + 2 * n + n * (n - 1) + na  # past values, theta, d, u in and out; the gains in
+    # past values, theta, d, u and the weight in and out; the gains in
+    moved = 2 * (n + 1) * na + 2 * n + 2 * n + n * (n - 1) + 2 + na
     return {"arithmetic": whiten + predict + update + trigger, "load, store": moved}
 
 

@@ -19,8 +19,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.campaign.rows import Row, changes
 from harness.campaign.sides import Observation, valid
-from harness.campaign.trial import Row
 from harness.plant import PARAMETERS
 
 EXACT_UP_TO = 14
@@ -97,12 +97,13 @@ def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0
 
 
 def _latencies(trial: Row, other: Row | None) -> list[float]:
-    others = trial["changes"] if other is None else other["changes"]
-    return [mine[0] for mine, his in zip(trial["changes"], others, strict=False) if None not in (mine[0], his[0])]
+    others = changes(trial if other is None else other)
+    both = [(mine.latency_n, his.latency_n) for mine, his in zip(changes(trial), others, strict=False)]
+    return [mine for mine, his in both if mine is not None and his is not None]
 
 
 def _missed(trial: Row, _: Row | None) -> list[float]:
-    return [float(change[2]) for change in trial["changes"] if change[1] is not None]
+    return [float(change.missed) for change in changes(trial) if change.bound_n is not None]
 
 
 def _false_alarms(trial: Row, _: Row | None) -> list[float]:

@@ -15,15 +15,13 @@ from typing import Any
 from harness.campaign.journal import Journal
 from harness.campaign.plan import Chunk, Plan, device_as_planned
 from harness.campaign.results import Results
-from harness.campaign.trial import Row, close_devices, play_chunk, samples_of
+from harness.campaign.rows import RATES, Row, counts
+from harness.campaign.trial import close_devices, play_chunk
 from harness.campaign.workers import Workers
 from harness.devices import InprocDevice
 from harness.dut import connect
 from harness.errors import DeviceError, LinkError
-from harness.statistics import ConfidenceSequence, Decision
-
-_EXPOSURE = {"missed": "visible", "false_alarms": "armed"}
-"""Of what each quantity that can stop a cell is a rate."""
+from harness.statistics import Decision
 
 
 @dataclass
@@ -43,7 +41,7 @@ class Tally:
         self.counted = [[] for _ in range(self.cells)]
         self.rounds = [0] * self.cells
         self.ended = [False] * self.cells
-        self.counts = [dict(samples_of([])) for _ in range(self.cells)]
+        self.counts = [counts([]) for _ in range(self.cells)]
 
     def add(self, chunk: Chunk, rows: list[Row]) -> None:
         """Count it, and what it completes."""
@@ -59,19 +57,16 @@ class Tally:
         self.counted[cell] += rows
         self.rounds[cell] += 1
         self.trials += len(rows)
-        for name, count in samples_of(rows).items():
+        for name, count in counts(rows).items():
             self.counts[cell][name] += count
         stop = self.plan.spec.stop
         if stop is not None:
-            counts = self.counts[cell]
-            known = ConfidenceSequence(
-                stop.confidence, stop.rate, trials=counts[_EXPOSURE[stop.quantity]], events=counts[stop.quantity]
-            )
+            known = RATES[stop.quantity].known(self.counts[cell], stop.confidence, stop.rate)
             self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
 
     def total(self) -> dict[str, int]:
         """The counts of all cells together."""
-        return {name: sum(counts[name] for counts in self.counts) for name in samples_of([])}
+        return {name: sum(each[name] for each in self.counts) for name in counts([])}
 
 
 Progress = Callable[[Tally], None]

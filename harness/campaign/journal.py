@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from harness.campaign.plan import Chunk, Plan
-from harness.campaign.trial import Row
+from harness.campaign.rows import Row
 from harness.errors import ConfigurationError, RecordingError
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign-journal", 2
@@ -45,7 +45,6 @@ class Journal:
 
         :raises RecordingError: it cannot be written.
         """
-        self.rows[chunk] = rows
         with self._on_disk():
             self._write(_line({"chunk": list(chunk), "rows": rows}))
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import html
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from harness.campaign.results import CONFIDENCE, Results, Summary, label
+from harness.campaign.results import COLUMNS, CONFIDENCE, Results, Summary, label
 from harness.errors import ConfigurationError
 from harness.report.page import FOLDER, assembled
 from harness.storage import replacing
@@ -145,12 +145,8 @@ def _words(x: float, y: float, text: str, anchor: str = "middle", colour: str = 
 def _table(results: Results) -> str:
     cells = [(label(results.plan, cell), summary) for cell, summary in results.cells()]
     names = list(cells[0][0])
-    heads = (
-        *("trials", "failed", "inconclusive", "missed", "visible", "miss rate at most", "false alarms"),
-        *("per sample at most", "latency", "95th percentile", "bound"),
-    )
     head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in names)
-    head += "".join(f'<th scope="col" class="number">{name}</th>' for name in heads)
+    head += "".join(f'<th scope="col" class="number">{column.title}</th>' for column in COLUMNS)
     rows = "".join(f"<tr>{_row(list(each.values()), summary)}</tr>" for each, summary in cells)
     caption = f"Bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency and bound in samples from the change"
     return (
@@ -160,14 +156,5 @@ def _table(results: Results) -> str:
 
 
 def _row(names: Sequence[str], summary: Summary) -> str:
-    averages = (summary.latency_n, summary.latency_p95_n, summary.bound_n)
-    values: Iterable[str] = (
-        *(f"{each:,}" for each in (summary.trials, summary.failed, summary.inconclusive)),
-        *(f"{summary.missed:,}", f"{summary.visible:,}"),
-        f"{summary.miss_rate[1]:.2g}" if summary.visible else "–",
-        f"{summary.false_alarms:,}",
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "–",
-        *("–" if each is None else f"{each:.1f}" for each in averages),
-    )
     cells = "".join(f'<th scope="row">{html.escape(name)}</th>' for name in names)
-    return cells + "".join(f'<td class="number">{value}</td>' for value in values)
+    return cells + "".join(f'<td class="number">{column.cell(summary, "–")}</td>' for column in COLUMNS)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from harness import config
 from harness.campaign.plan import Cell, Plan
-from harness.campaign.trial import Row, samples_of
+from harness.campaign.rows import RATES, Change, Row, changes, counts, is_valid, valid
 from harness.errors import ConfigurationError, RecordingError
 from harness.plant import PARAMETERS
 from harness.scenario import MAX_SAMPLES
-from harness.statistics import ConfidenceSequence
 from harness.storage import replacing
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
@@ -25,9 +24,6 @@ MAX_FILE_BYTES = 4_000_000_000
 
 CONFIDENCE = 0.95
 """Of the bounds in the tables, which hold whenever a campaign was ended."""
-
-_EXPECTED_MISS_RATE, _EXPECTED_FALSE_ALARM_RATE = 0.05, 1e-6
-"""Where those bounds are tightest."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +103,10 @@ def _check_row(row: Any) -> None:
     """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``trial.row``."""
     if row["outcome"] not in ("passed", "failed", "inconclusive"):
         raise ValueError("a row without an outcome")
-    counts = [row[name] for name in ("false_alarms", "armed", "samples")]
-    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in counts) or counts != sorted(counts):
+    rising = [row[name] for name in ("false_alarms", "armed", "samples")]
+    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
         raise ValueError("a row whose counts cannot be")
-    if not all(_is_change(*change) for change in row["changes"]):
+    if not all(map(_is_change, changes(row))):
         raise ValueError("a change that is none")
     if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
         raise ValueError("errors that are none")
@@ -124,9 +120,10 @@ def _is_number(value: object) -> bool:
     return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
-def _is_change(latency_n: object, bound_n: object, missed: object, late: object) -> bool:
-    counts = all(value is None or type(value) is int for value in (latency_n, bound_n))
-    return counts and isinstance(missed, bool) and isinstance(late, bool)
+def _is_change(change: Change) -> bool:
+    latency_n, bound_n, *flags = change
+    times = all(value is None or type(value) is int for value in (latency_n, bound_n))
+    return times and all(type(flag) is bool for flag in flags)
 
 
 @dataclass(frozen=True)
@@ -159,29 +156,22 @@ class Summary:
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
-        counts = samples_of(list(rows))
-        valid = [row for row in rows if row["outcome"] != "inconclusive"]
-        changes = [change for row in valid for change in row["changes"]]
-        latencies = sorted(change[0] for change in changes if change[0] is not None)
-        bounds = [change[1] for change in changes if change[0] is not None and change[1] is not None]
-        errors = [row["errors"] for row in valid if row["errors"]]
+        counted, sound = counts(rows), valid(rows)
+        found = [change for each in sound for change in changes(each)]
+        noticed = [change for change in found if change.latency_n is not None]
+        latencies = sorted(change.latency_n for change in noticed if change.latency_n is not None)
+        bounds = [change.bound_n for change in noticed if change.bound_n is not None]
+        errors = [each["errors"] for each in sound if each["errors"]]
+        rates = {name: rate.known(counted, CONFIDENCE).bounds for name, rate in RATES.items()}
         return cls(
+            **counted,
             trials=len(rows),
-            passed=sum(row["outcome"] == "passed" for row in rows),
-            failed=sum(row["outcome"] == "failed" for row in rows),
-            inconclusive=len(rows) - len(valid),
-            samples=counts["samples"],
-            armed=counts["armed"],
-            false_alarms=counts["false_alarms"],
-            false_alarm_rate=ConfidenceSequence(
-                CONFIDENCE, _EXPECTED_FALSE_ALARM_RATE, trials=counts["armed"], events=counts["false_alarms"]
-            ).bounds,
-            visible=counts["visible"],
-            missed=counts["missed"],
-            late=sum(change[3] for change in changes),
-            miss_rate=ConfidenceSequence(
-                CONFIDENCE, _EXPECTED_MISS_RATE, trials=counts["visible"], events=counts["missed"]
-            ).bounds,
+            passed=sum(each["outcome"] == "passed" for each in rows),
+            failed=sum(each["outcome"] == "failed" for each in rows),
+            inconclusive=len(rows) - len(sound),
+            false_alarm_rate=rates["false_alarms"],
+            late=sum(change.late for change in found),
+            miss_rate=rates["missed"],
             latency_n=statistics.fmean(latencies) if latencies else None,
             latency_p95_n=float(latencies[-(-95 * len(latencies) // 100) - 1]) if latencies else None,
             bound_n=statistics.fmean(bounds) if bounds else None,
@@ -190,9 +180,7 @@ class Summary:
                 for i, name in enumerate(PARAMETERS)
                 if errors
             },
-            doubt=next(
-                (f"seed {row['seed']}: {row.get('why', '')}" for row in rows if row["outcome"] == "inconclusive"), ""
-            ),
+            doubt=next((f"seed {each['seed']}: {each.get('why', '')}" for each in rows if not is_valid(each)), ""),
         )
 
 
@@ -206,32 +194,48 @@ def label(plan: Plan, cell: Cell) -> dict[str, str]:
     return out | {axis: f"{value:g}" for axis, value in cell.values.items()}
 
 
-def anytime_text(counts: Mapping[str, int]) -> str:
-    """What ``samples_of`` has counted, with bounds, in one line."""
+def anytime_text(counted: Mapping[str, int]) -> str:
+    """What ``rows.counts`` has counted, with bounds, in one line."""
     parts = []
-    for name, exposure, expected, unit in (
-        ("missed", "visible", _EXPECTED_MISS_RATE, "changes"),
-        ("false_alarms", "armed", _EXPECTED_FALSE_ALARM_RATE, "samples"),
-    ):
-        if counts[exposure]:
-            known = ConfidenceSequence(CONFIDENCE, expected, trials=counts[exposure], events=counts[name])
-            what = name.replace("_", " ")
-            parts.append(f"{counts[name]} {what} in {counts[exposure]} {unit} (rate below {known.bounds[1]:.2g})")
+    for name, rate in RATES.items():
+        if counted[rate.exposure]:
+            what, below = name.replace("_", " "), rate.known(counted, CONFIDENCE).bounds[1]
+            parts.append(f"{counted[name]} {what} in {counted[rate.exposure]} {rate.unit} (rate below {below:.2g})")
     return ", ".join(parts)
 
 
-_COLUMNS = (
-    "trials",
-    "failed",
-    "inconcl.",
-    "missed",
-    "of",
-    "at most",
-    "false al.",
-    "rate below",
-    "latency",
-    "p95",
-    "bound",
+@dataclass(frozen=True)
+class Column:
+    """Of the tables."""
+
+    title: str
+    short: str
+    """The same where there is little room."""
+    form: str
+    of: Callable[[Summary], float | None]
+
+    def cell(self, summary: Summary, absent: str) -> str:
+        value = self.of(summary)
+        return absent if value is None else format(value, self.form)
+
+
+COLUMNS = (
+    Column("trials", "trials", ",", lambda summary: summary.trials),
+    Column("failed", "failed", ",", lambda summary: summary.failed),
+    Column("inconclusive", "inconcl.", ",", lambda summary: summary.inconclusive),
+    Column("missed", "missed", ",", lambda summary: summary.missed),
+    Column("visible", "of", ",", lambda summary: summary.visible),
+    Column("miss rate at most", "at most", ".2g", lambda summary: summary.miss_rate[1] if summary.visible else None),
+    Column("false alarms", "false al.", ",", lambda summary: summary.false_alarms),
+    Column(
+        "per sample at most",
+        "rate below",
+        ".2g",
+        lambda summary: summary.false_alarm_rate[1] if summary.armed else None,
+    ),
+    Column("latency", "latency", ".1f", lambda summary: summary.latency_n),
+    Column("95th percentile", "p95", ".1f", lambda summary: summary.latency_p95_n),
+    Column("bound", "bound", ".1f", lambda summary: summary.bound_n),
 )
 
 
@@ -242,7 +246,7 @@ def text(results: Results) -> str:
     labels = [label(results.plan, cell) for cell, _ in cells]
     names = list(labels[0]) if len(cells) > 1 else []
     head = f"campaign {spec.name}: {len(cells)} cells, {total.trials} trials, {total.samples} samples: "
-    rows = [[*names, *_COLUMNS]]
+    rows = [[*names, *(column.short for column in COLUMNS)]]
     rows += [
         [*(each[name] for name in names), *_numbers(summary)] for each, (_, summary) in zip(labels, cells, strict=True)
     ]
@@ -269,14 +273,4 @@ def as_json(results: Results) -> dict[str, Any]:
 
 
 def _numbers(summary: Summary) -> list[str]:
-    averages = (summary.latency_n, summary.latency_p95_n, summary.bound_n)
-    return [
-        *(
-            str(each)
-            for each in (summary.trials, summary.failed, summary.inconclusive, summary.missed, summary.visible)
-        ),
-        f"{summary.miss_rate[1]:.2g}" if summary.visible else "-",
-        str(summary.false_alarms),
-        f"{summary.false_alarm_rate[1]:.2g}" if summary.armed else "-",
-        *("-" if each is None else f"{each:.1f}" for each in averages),
-    ]
+    return [column.cell(summary, "-") for column in COLUMNS]

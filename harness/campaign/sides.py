@@ -11,7 +11,7 @@ from typing import Any
 from harness.campaign.difference import differences, named
 from harness.campaign.plan import Plan
 from harness.campaign.results import Results
-from harness.campaign.trial import Row, row
+from harness.campaign.rows import Row, is_valid, row
 from harness.errors import ConfigurationError, RecordingError
 from harness.run import Run
 from harness.verdict import judge
@@ -34,10 +34,10 @@ def load(path: Path) -> Side:
     """The trials of a results file, of a recording, or of all recordings below a folder.
 
     :raises RecordingError: it cannot be read, or there is nothing valid in it.
+    :raises ConfigurationError: two recordings are of one play; names them.
     """
     if path.is_dir() or path.suffix == ".npz":
-        recordings = sorted(path.rglob("*.npz")) if path.is_dir() else [path]
-        side = Side(tuple(map(_recorded, recordings)))
+        side = Side(_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
     else:
         results = Results.load(path)
         cells = zip(results.plan.cells(), results.rows, strict=True)
@@ -117,7 +117,17 @@ def _unnamed(table: Mapping[str, Any]) -> dict[str, Any]:
 
 def valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
     """By what was played; without those of which nothing is said."""
-    return {key: each for key, each in trials if each["outcome"] != "inconclusive"}
+    return {key: each for key, each in trials if is_valid(each)}
+
+
+def _recordings(paths: Sequence[Path]) -> tuple[Observation, ...]:
+    found: dict[tuple[object, ...], tuple[Path, Row]] = {}
+    for path in paths:
+        key, trial = _recorded(path)
+        if key in found:
+            raise ConfigurationError(f"{found[key][0]} and {path} are of one scenario, rig and seed: which is meant?")
+        found[key] = path, trial
+    return tuple((key, trial) for key, (_, trial) in found.items())
 
 
 def _recorded(path: Path) -> Observation:

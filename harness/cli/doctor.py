@@ -30,13 +30,12 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from harness.errors import RigError
     from harness.rigs.description import open_rig
-    from harness.rigs.real import RealRig
     from harness.rigs.self_test.conduct import self_test
 
-    with open_rig(arguments.rig) as rig:
+    with open_rig(arguments.rig, self_test=False) as rig:
         program = arguments.program or str(rig.description().get("plant", "front"))
         try:
-            findings = self_test(rig.bare() if isinstance(rig, RealRig) else rig, arguments.seed, program)
+            findings = self_test(rig, arguments.seed, program)
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
     show(json.dumps(_as_json(findings, arguments.seed)) if arguments.json else _text(findings))

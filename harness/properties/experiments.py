@@ -87,11 +87,14 @@ def false_alarms_at_most(
     alarms: list[NDArray[np.int64]] = []
     armed = 0
     while armed < samples:
-        found, _, exposure = trials.exposed(scenario, seed + len(alarms))
-        alarms.append(found)
-        armed += exposure.armed
-        if exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
-            why = exposure.no_evidence or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
+        watched = trials.watched(scenario, seed + len(alarms))
+        alarms.append(watched.alarms)
+        armed += watched.exposure.armed
+        if watched.exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+            why = (
+                watched.exposure.no_evidence
+                or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
+            )
             return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
     count = sum(map(len, alarms))
     why = f"{count} false alarms in {armed} samples, allowed {allowed}"
@@ -111,11 +114,11 @@ def false_alarms_of_plants_rarer(
     trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
-    played = [trials.exposed(each, seed) for each in drawn]
-    if nothing := next((exposure.no_evidence for *_, exposure in played if exposure.no_evidence), ""):
+    played = [trials.watched(each, seed) for each in drawn]
+    if nothing := next((each.exposure.no_evidence for each in played if each.exposure.no_evidence), ""):
         return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
-    alarms = [found for found, *_ in played]
-    count, samples = sum(map(len, alarms)), sum(exposure.armed for *_, exposure in played)
+    alarms = [each.alarms for each in played]
+    count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
     low = lower_rate(count, samples, confidence)
     why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
     if _MOST_UNARMED * samples < plants * samples_each:

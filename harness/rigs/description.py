@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,12 +23,13 @@ RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
 """The rigs of a laboratory: the file that the variable names, else that of the folder one is in."""
 
 
-def open_rig(name: str) -> Rig:
+def open_rig(name: str, *, self_test: bool = True) -> Rig:
     """The rig of a shipped or own description, of a table ``[rig.NAME]`` of a rigs file, or ``recording:FILE``.
 
     A name stands for a table of the file that ANALOGRIG_RIGS names, of rigs.toml in this folder, or for a shipped rig,
     in this order; FILE.toml for a rig that is described there, and FILE.toml:NAME for one of several.
 
+    :param self_test: False: no rig tests itself before it plays, whatever its description says.
     :raises ConfigurationError: there is none, or its description is wrong.
     :raises RecordingError: the recording cannot be read.
     """
@@ -38,7 +40,7 @@ def open_rig(name: str) -> Rig:
     if table.get("kind", "emulator") == "real":
         description = config.build(RealDescription, table, where)
         try:
-            return RealRig(description)
+            return RealRig(dataclasses.replace(description, self_test=description.self_test and self_test))
         except ConfigurationError as error:
             raise ConfigurationError(f"{where}: {error}") from error
     emulated = config.build(EmulatorDescription, table, where)

@@ -1,7 +1,8 @@
 """What a rig is to everything behind it: it performs a scenario and yields blocks of samples.
 
 A rig is opened by name, performs scenarios, and is closed. The emulated computer, a recording and a real one are
-classes with these methods; nothing behind this module asks which one it has.
+classes with these methods. Whoever plays on a rig needs no more, and asks not which one it has; who wants what only one
+of them has, the circuit of the emulated computer or the file of a recording, asks for that class.
 """
 
 from __future__ import annotations

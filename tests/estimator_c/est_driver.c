@@ -118,6 +118,7 @@ int driver_invariants_hold_if_damaged(int way) {
     case 5: self.trigger.statistic = -1.0F; break;
     case 6: self.noise_variance = 0.0F; break;
     case 7: self.factors.d[1] = __builtin_inff(); break;
+    case 9: self.factors.weight = 1.5F; break;
     default: break;
     }
     const int held = est_invariants_hold((way == 8) ? 0 : &self) ? 1 : 0;

@@ -159,7 +159,7 @@ class Estimator:
         self._c.driver_age_counters()
 
     def invariants_hold_if_damaged(self, way: int) -> bool:
-        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 8; 9: not at all."""
+        """What est_invariants_hold() says of a state damaged in one of the ways 0 .. 9; 10: not at all."""
         return bool(self._c.driver_invariants_hold_if_damaged(way))
 
     def watch(self, u: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:

@@ -70,6 +70,17 @@ def test_the_doubt_about_an_edge_lasts_twelve_samples(estimator: Estimator, refr
     assert refreshes == [0, 1]
 
 
+@pytest.mark.parametrize("refresh_n", [1, 2, 3])
+def test_c_is_not_taken_while_an_edge_is_in_doubt(estimator: Estimator, refresh_n: int) -> None:
+    u, y = front()
+    assert estimator.init(refresh_n=refresh_n)
+    refreshes = [estimator.run(u[k : k + 1], y[k : k + 1]).counters["refreshes"] for k in range(N)]
+    taken, edges = (np.flatnonzero(np.abs(np.diff(x)) > limit) + 1 for x, limit in ((refreshes, 0), (u, 64.0)))
+    taken = taken[taken >= edges[0]]
+    assert len(taken) >= 5
+    assert (taken - edges[np.searchsorted(edges, taken, "right") - 1] >= 12).all()
+
+
 def test_c_that_is_to_stay_as_it_is_does_so_for_more_equations_than_can_be_counted(estimator: Estimator) -> None:
     u, y = (np.tile(x, 90) for x in front())
     assert estimator.init(kind=NONE, refresh_n=0)
@@ -187,6 +198,20 @@ def test_walking_parameters_are_followed_where_forgetting_nothing_is_stuck(estim
     assert gains[0.0] < true * 0.93
 
 
+def test_variance_of_walking_parameters_grows_without_excitation_up_to_the_prior(estimator: Estimator) -> None:
+    """By 1 / forgetting (thesis Equ 3.21) and the walk (3.23) an equation."""
+    p0, walk = 1e4, 1.0
+    settings = {"na": 1, "nb": 1, "offset": 0, "p0": p0, "forgetting": 0.5, "random_walk": walk, "kind": NONE}
+    assert estimator.init(**settings, c=(0.0, 0.0), refresh_n=0, stuck_n=0)
+    rng = np.random.default_rng(1)
+    estimator.run(rng.normal(0.0, 1000.0, 50), rng.normal(0.0, 1000.0, 50))
+    estimator.run(np.zeros(3), np.zeros(3))
+    variances = np.array([estimator.run([0.0], [0.0]).variance for _ in range(20)])
+    assert variances[0].max() < 100.0
+    assert variances[1:] == pytest.approx(np.minimum(variances[:-1] / 0.5 + walk, p0), rel=1e-4)
+    assert (variances[-1] == p0).all()
+
+
 def test_excitation_is_never_lost_where_it_is_not_watched(estimator: Estimator) -> None:
     assert estimator.init(idle_n=0)
     assert not estimator.run(np.zeros(300), np.full(300, 410.0)).idle.any()
@@ -222,4 +247,4 @@ def test_damaged_state_is_noticed(estimator: Estimator) -> None:
     assert estimator.init()
     u, y = front()
     estimator.run(u, y)
-    assert [estimator.invariants_hold_if_damaged(way) for way in range(10)] == [False] * 9 + [True]
+    assert [estimator.invariants_hold_if_damaged(way) for way in range(11)] == [False] * 10 + [True]

@@ -22,8 +22,9 @@ from harness.campaign.conduct import Tally, conduct, journal_of
 from harness.campaign.journal import Journal
 from harness.campaign.plan import Chunk, Plan, one_worker_only, rig_table
 from harness.campaign.results import Results, Summary, text
+from harness.campaign.rows import row
 from harness.campaign.spec import CampaignSpec
-from harness.campaign.trial import close_devices, play_chunk, row
+from harness.campaign.trial import close_devices, play_chunk
 from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
 from harness.cli import main
 from harness.devices import DeviceDescription, describe
@@ -383,7 +384,7 @@ def test_samples_of_the_warm_up_do_not_end_a_cell(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("spec", "why"),
-    [("samples = 140", "the warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "the device was not excited")],
+    [("samples = 140", "its warm-up takes 150"), ("samples = 900\nscenario = '{still}'", "in 900 it was not excited")],
 )
 def test_trial_in_which_the_trigger_was_never_armed_is_inconclusive(tmp_path: Path, spec: str, why: str) -> None:
     still = tmp_path / "still.toml"

@@ -12,8 +12,8 @@ from playwright.sync_api import Browser
 from harness.campaign.plan import Plan
 from harness.campaign.report import render, write_page
 from harness.campaign.results import Results
+from harness.campaign.rows import Row
 from harness.campaign.spec import CampaignSpec, Grid
-from harness.campaign.trial import Row
 from tests.browser import Watched
 
 

@@ -17,8 +17,9 @@ from scipy import stats
 from harness.bench import Bench
 from harness.campaign.comparison import Difference, _worded, compare, permutation_p, sign_flip_p
 from harness.campaign.plan import rig_table
+from harness.campaign.rows import Row
 from harness.campaign.sides import load, matched
-from harness.campaign.trial import Count, Row
+from harness.campaign.trial import Count
 from harness.campaign.workers import Processes, ThisProcess
 from harness.certificate import Certificate, Question, certify, question_of
 from harness.cli import main
@@ -150,7 +151,7 @@ def test_device_that_is_not_excited_is_not_certified_by_its_silence(
     still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
     options = ["--far", "0.03", "--confidence", "0.9", "--allowed", "0", "--scenario", str(still), "--workers", "1"]
     assert main(["certify", "--dut", "inproc", *options, *way]) == 3
-    assert "INCONCLUSIVE\n  seed 0: the trigger was armed in 0 of" in capsys.readouterr().out
+    assert "INCONCLUSIVE\n  seed 0: no alarm could come in any of" in capsys.readouterr().out
 
 
 def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_elsewhere() -> None:
@@ -409,6 +410,17 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
     found = compare(*matched(load(Path(a)), load(Path(b))))
     assert found.identical == (12, 12)
     assert not any(each.shown for each in found.differences)
+
+
+def test_two_recordings_of_one_play_on_one_side_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
+    with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
+        run = Bench(rig, dut).play(scenario, 0)
+    for name in ("one", "two"):
+        run.save(tmp_path / "a" / name / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "one")]) == 2
+    named = " and ".join(str(tmp_path / "a" / name / "run.npz") for name in ("one", "two"))
+    assert f"{named} are of one scenario, rig and seed" in capsys.readouterr().err
 
 
 def test_recordings_that_have_no_play_in_common_are_not_compared(

@@ -19,6 +19,7 @@ from harness.rigs.emulator import EmulatorRig
 from harness.run import CHANNELS, Run
 from harness.scenario import Scenario
 from harness.trials import Trials
+from harness.verdict import judge
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(294.0, 3021.0, 24500.0)
@@ -36,7 +37,7 @@ def test_before_the_first_edge_and_in_the_warm_up_no_alarm_can_come() -> None:
     assert exposure(made()).armed == 550
     assert exposure(made(warm_up_n=150)).armed == 450
     assert exposure(made(warm_up_n=600)).armed == 0
-    assert "the warm-up takes 600" in exposure(made(warm_up_n=600)).no_evidence
+    assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).no_evidence
 
 
 def test_after_an_alarm_none_can_come_while_it_is_held_off() -> None:
@@ -67,7 +68,7 @@ def test_force_that_never_moves_is_no_evidence_even_where_the_device_does_not_sa
     run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
     found = exposure(run)
     assert (found.armed, found.unexcited) == (0, 600)
-    assert "armed in 0 of 600 samples: in 600 the device was not excited" in found.no_evidence
+    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.no_evidence
     assert not rate_below(0.5, [Played(run)], confidence=0.9)
 
 
@@ -89,5 +90,16 @@ def test_samples_that_the_device_calls_idle_are_not_exposed_within_this_process_
     moved = np.maximum.accumulate(np.abs(force - force[0])) >= 64
     expected = int((innovations & warm & moved & ~idle).sum())
     assert exposure(run).armed == expected
-    _, _, within = Trials(rig, describe("inproc")).exposed(scenario, 1)
+    within = Trials(rig, describe("inproc")).watched(scenario, 1).exposure
     assert (within.armed, within.unexcited) == (expected, exposure(run).unexcited)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "why"),
+    [({"warm_up_n": 600}, "its warm-up takes 600"), ({"trigger": "none"}, "the device has no trigger")],
+)
+def test_run_in_which_no_alarm_could_come_is_inconclusive(estimator: dict[str, object], why: str) -> None:
+    verdict = judge(made(**estimator))
+    assert verdict.outcome == "inconclusive"
+    assert verdict.reasons == (f"no alarm could come in any of 600 samples: {why}",)
+    assert judge(made()).outcome == "passed"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.campaign.trial import row
+from harness.campaign.rows import row
 from harness.catalogue import Change
 from harness.errors import RecordingError
 from harness.plant import Plant
