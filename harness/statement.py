@@ -190,6 +190,9 @@ def judged(statement: Statement, play: Play, scenario: Scenario, seed: int, wher
         )
     built: Any = config.build(found.limits, statement.limits, f"{where}: statement: limits")
     limits = {each.name: getattr(built, each.name) for each in dataclasses.fields(found.limits)}
-    if found.is_experiment:
-        return found.judge(play, scenario, seed, **limits)
-    return with_some_seed(play, scenario, seed, lambda played: found.judge(played, **limits), statement.tries)
+    try:
+        if found.is_experiment:
+            return found.judge(play, scenario, seed, **limits)
+        return with_some_seed(play, scenario, seed, lambda played: found.judge(played, **limits), statement.tries)
+    except ValueError as error:
+        raise ConfigurationError(f"{where}: statement: limits: {error}") from error
