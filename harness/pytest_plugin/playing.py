@@ -167,10 +167,12 @@ def _is_from_elsewhere(error: BaseException) -> bool:
 
 
 def _keep(record: Record, item: pytest.Item) -> None:
-    record.shown = record.counterexample(item)
-    if record.shown is not None:
-        with contextlib.suppress(*_unwritten()):  # which is said when the test has ended
-            record.shown.write(_folder(item), page=False)
+    shown = record.counterexample(item)
+    if shown is None:
+        return  # the device did not even begin: what is there says more
+    record.shown = shown
+    with contextlib.suppress(*_unwritten()):  # which is said when the test has ended
+        shown.write(_folder(item), page=False)
 
 
 def left_by(item: pytest.Item) -> str:
