@@ -41,6 +41,9 @@ _WITNESS_N = 2000
 _AFTER_N = 100
 """Samples of it after that alarm."""
 
+_MOST_UNARMED = 2
+"""Trials may take so many times the samples in which the trigger was armed; else silence is no evidence."""
+
 _EVER = 1e9
 """Of the bound: an alarm before the next change."""
 
@@ -77,14 +80,23 @@ def rate_of_plays_below(
 def false_alarms_at_most(
     play: Play, scenario: Scenario, seed: int, allowed: int, samples: int, samples_each: int
 ) -> Finding:
-    """No more than so many in trials of ``samples_each`` that are, once warm, ``samples`` altogether."""
+    """No more than so many in trials of ``samples_each``, in which the trigger was armed in ``samples`` altogether."""
     trials = _trials(play, f"takes {samples} samples: analogrig certify")
     scenario = dataclasses.replace(scenario, samples=samples_each)
-    warm_n = samples_each - described(play.bench.dut).estimator.warm_up_n
-    runs = -(-samples // warm_n)
-    alarms = [trials.alarms(scenario, seed + number) for number in range(runs)]
+    alarms: list[NDArray[np.int64]] = []
+    armed = 0
+    while armed < samples:
+        watched = trials.watched(scenario, seed + len(alarms))
+        alarms.append(watched.alarms)
+        armed += watched.exposure.armed
+        if watched.exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+            why = (
+                watched.exposure.no_evidence
+                or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
+            )
+            return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
     count = sum(map(len, alarms))
-    why = f"{count} false alarms in {runs * warm_n} samples, allowed {allowed}"
+    why = f"{count} false alarms in {armed} samples, allowed {allowed}"
     if count <= allowed:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
@@ -101,10 +113,16 @@ def false_alarms_of_plants_rarer(
     trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
-    alarms = [trials.alarms(each, seed) for each in drawn]
-    count, samples = sum(map(len, alarms)), plants * samples_each
+    played = [trials.watched(each, seed) for each in drawn]
+    if nothing := next((each.exposure.no_evidence for each in played if each.exposure.no_evidence), ""):
+        return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
+    alarms = [each.alarms for each in played]
+    count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
     low = lower_rate(count, samples, confidence)
     why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
+    if _MOST_UNARMED * samples < plants * samples_each:
+        why = f"the trigger was armed in {samples} of {plants * samples_each} samples"
+        return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
     if low <= rate:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
@@ -116,12 +134,9 @@ def rare_false_alarms_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
 ) -> Finding:
     """The same of a rate that is too low to be waited for, by ``harness.rare``."""
-    _trials(play, "needs the estimator in this process")
-    rig, device = play.bench.rig, described(play.bench.dut)
+    rig, device = _in_this_process(play, "needs the estimator in this process")
     if device.estimator.trigger != "cusum":
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
-    if not isinstance(rig, EmulatorRig):
-        raise TypeError(type(rig))
     rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
     low, high = mean_bounds(rates, confidence)
     why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
@@ -131,11 +146,15 @@ def rare_false_alarms_rarer(
 
 
 def _trials(play: Play, otherwise: str) -> Trials:
-    """Skips where they are not what the bench would give."""
+    return Trials(*_in_this_process(play, otherwise))
+
+
+def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
+    """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
     rig, device = play.bench.rig, described(play.bench.dut)
     if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --dut inproc, not {play.bench.dut.name}")
-    return Trials(rig, device)
+    return rig, device
 
 
 def _with_most(alarms: list[NDArray[np.int64]]) -> int:
