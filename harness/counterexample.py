@@ -43,7 +43,7 @@ class Counterexample:
     def suite_command(self, folder: Path) -> str:
         """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
         place = recorded(self.run.conditions.dut).elsewhere
-        return shlex.join(["pytest", "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
+        return shlex.join(["pytest", str(folder), "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
