@@ -96,8 +96,12 @@ class Trials:
             u, y, valid = entered(block)
             its = slice(block.first, block.first + len(u))
             force[its] = u
-            filled = {"status": status[its], "innovation": innovation[its], "statistic": statistic[its]}
-            found.append(block.first + self._estimator.alarms(u, y, valid, **filled))
+            found.append(
+                block.first
+                + self._estimator.alarms(
+                    u, y, valid, status=status[its], innovation=innovation[its], statistic=statistic[its]
+                )
+            )
         flags, alarms = flags_of(status), np.concatenate(found)
         shown = exposed(
             Heard(force, flags, np.isfinite(innovation) & np.isfinite(statistic), alarms),

@@ -11,6 +11,7 @@ probabilities of all quantities are adjusted together (Holm 1979), so that the c
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -76,6 +77,17 @@ class Comparison:
     """Of so many trials that both sides played, so many (first) have the same estimates to the bit."""
 
     @property
+    def is_same(self) -> bool:
+        """Both sides played the same, and estimated the same to the bit."""
+        same, both = self.identical
+        return same == both > 0
+
+    @property
+    def least_seeds(self) -> int:
+        """With fewer that both sides have, nothing could be called worse, however much it was."""
+        return 1 + math.ceil(math.log2(max(1, len(self.differences)) / self.alpha))
+
+    @property
     def worse(self) -> bool:
         return any(each.word == "worse" for each in self.differences)
 
@@ -110,6 +122,10 @@ def _false_alarms(trial: Row, _: Row | None) -> list[float]:
     return [trial["false_alarms"] / trial["armed"]] if trial["armed"] else []
 
 
+def _without_estimate(trial: Row, _: Row | None) -> list[float]:
+    return [float(not trial["errors"])]
+
+
 def _error(i: int) -> Callable[[Row, Row | None], list[float]]:
     def errors(trial: Row, other: Row | None) -> list[float]:
         both = len(trial["errors"]) > i and (other is None or len(other["errors"]) > i)
@@ -122,6 +138,7 @@ QUANTITIES = (
     Quantity("latency", "samples", _latencies),
     Quantity("missed", "of the visible changes", _missed),
     Quantity("false alarms", "per sample", _false_alarms),
+    Quantity("no estimate", "of the trials, at their end", _without_estimate),
     *(Quantity(f"error of {name}", "relative", _error(i)) for i, name in enumerate(PARAMETERS)),
 )
 
