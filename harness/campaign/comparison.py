@@ -27,6 +27,9 @@ from harness.plant import PARAMETERS
 EXACT_UP_TO = 14
 """With so many differences or fewer all ways to exchange them are gone through."""
 
+LOST_ESTIMATE = 1.0
+"""The relative error of a trial that ended without an estimate of M, B, K where the other side's has one."""
+
 RESAMPLES, _AT_ONCE = 99_999, 1_000
 
 PAIRED, UNPAIRED = "sign flips, paired by seed", "permutation of seeds"
@@ -122,14 +125,11 @@ def _false_alarms(trial: Row, _: Row | None) -> list[float]:
     return [trial["false_alarms"] / trial["armed"]] if trial["armed"] else []
 
 
-def _without_estimate(trial: Row, _: Row | None) -> list[float]:
-    return [float(not trial["errors"])]
-
-
 def _error(i: int) -> Callable[[Row, Row | None], list[float]]:
     def errors(trial: Row, other: Row | None) -> list[float]:
-        both = len(trial["errors"]) > i and (other is None or len(other["errors"]) > i)
-        return [abs(trial["errors"][i])] if both else []
+        if trial["errors"]:
+            return [abs(trial["errors"][i])]
+        return [LOST_ESTIMATE] if other is not None and other["errors"] else []
 
     return errors
 
@@ -138,7 +138,6 @@ QUANTITIES = (
     Quantity("latency", "samples", _latencies),
     Quantity("missed", "of the visible changes", _missed),
     Quantity("false alarms", "per sample", _false_alarms),
-    Quantity("no estimate", "of the trials, at their end", _without_estimate),
     *(Quantity(f"error of {name}", "relative", _error(i)) for i, name in enumerate(PARAMETERS)),
 )
 

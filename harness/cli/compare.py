@@ -65,7 +65,7 @@ def _text(found: Comparison) -> str:
     same, both = found.identical
     ours, theirs = found.inconclusive
     lines = [
-        f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; theta of {same} of {both} in common identical to the bit",
+        f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; theta is the same to the bit in {same} of {both}",
         *([f"inconclusive: {ours} of A, {theirs} of B"] if ours or theirs else []),
         "",
         differences_text(found),
