@@ -13,7 +13,7 @@ from typing import Any
 from harness import config
 from harness.devices import recorded
 from harness.run import Run
-from harness.statement import Statement
+from harness.scenario import Statement
 
 SCENARIO_FILE, RIG_FILE, DEVICE_FILE = "scenario.toml", "rig.toml", "dut.toml"
 RUN_FILE, REPORT_FILE = "run.npz", "report.html"

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 
 from harness.exposure import exposure
 from harness.run import Run
-from harness.statement import Finding, Statement, make_known, said
+from harness.scenario import Statement
+from harness.statement import Finding, make_known, said
 from harness.statistics import Design, upper_rate
 from harness.summary import latency_text
 from harness.verdict import TweakVerdict, Verdict, judge

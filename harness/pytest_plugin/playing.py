@@ -80,7 +80,7 @@ def record_of(item: pytest.Item) -> Record:
 
 
 class Player:
-    """Plays for one test, and keeps what it has played: ``harness.statement.Play``."""
+    """Plays for one test, and keeps what it has played: ``harness.experiment.Play``."""
 
     def __init__(self, item: pytest.Item, bench: Bench) -> None:
         self.item = item

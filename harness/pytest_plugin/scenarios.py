@@ -98,8 +98,10 @@ class ScenarioItem(pytest.Item):
             raise ScenarioFailed(finding.why)
 
     def _found(self, play: Player, scenario: Scenario) -> Finding:
+        import harness.played
+        import harness.properties.experiments  # noqa: F401 - each makes known what a file can state
+        from harness.experiment import judged
         from harness.scenario import DEFAULT_SEED
-        from harness.statement import judged
 
         if scenario.statement is None:
             return play(scenario).passes()

@@ -23,9 +23,9 @@ from harness.bench import Bench
 from harness.devices import host_child, of_scenario
 from harness.dut import open_dut
 from harness.errors import ConfigurationError
+from harness.experiment import Play, judged
 from harness.rigs.description import open_rig
-from harness.scenario import Scenario
-from harness.statement import Play, Statement, judged
+from harness.scenario import Scenario, Statement
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 

@@ -13,10 +13,11 @@ from harness.bench import Bench
 from harness.devices import InprocDevice
 from harness.dut import connect
 from harness.estimator_config import EstimatorConfig
+from harness.experiment import Play
 from harness.properties.experiments import false_alarms_at_most, false_alarms_of_plants_rarer
 from harness.rigs.description import open_rig
 from harness.scenario import Scenario
-from harness.statement import Finding, Play
+from harness.statement import Finding
 
 
 @dataclasses.dataclass
