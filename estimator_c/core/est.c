@@ -385,8 +385,8 @@ static void compare_prefilter(est_t* const self) {
     }
 }
 
-/// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so that no
-/// step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
+/// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so
+/// that no step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
 static void consider_refresh(est_t* const self) {
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
         self->renewal = EST_RENEWAL_NONE;

@@ -311,8 +311,9 @@ float est_prefilter(const est_t* self, uint8_t index);
 
 est_counters_t est_counters(const est_t* self);
 
-/// True iff the state is one that est_init() and est_step() can produce: every d positive and finite, theta finite,
-/// indices in range. For self-tests in the field and for fuzzing. Cost: O(n).
+/// True iff the numbers that the estimate lives on are ones that est_init() and est_step() can produce: the configuration
+/// valid, every d positive and finite, their weight in range, theta finite, statistic and noise variance in range. Counters
+/// and flags are not looked at. For self-tests in the field and for fuzzing. Cost: O(n).
 bool est_invariants_hold(const est_t* self);
 
 #ifdef __cplusplus

@@ -29,7 +29,9 @@ EST_OUTLINE void est_trigger_begin_doubt(est_trigger_t* const self) {
 }
 
 /// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
-/// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best reading.
+/// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best
+/// reading, since none can be followed any further; at its term a doubt has seen all there is of an edge, and the recorded one
+/// goes on.
 bool est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
 
 /// Makes the best of the other readings the statistic; true iff it is the one in which the edges came late.
@@ -60,8 +62,8 @@ float est_trigger_other_statistic(est_trigger_t*              self,
                                   float                       innovation,
                                   float                       precision);
 
-/// Enters one innovation [codes] as recorded and in the other readings of the edges in doubt, and the
-/// reciprocal of its predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and the first reading alone counts.
+/// Enters one innovation [codes] as recorded and in the other readings of the edges in doubt, and the reciprocal of its
+/// predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and the first reading alone counts.
 EST_INLINE est_finding_t est_trigger_step(est_trigger_t* const              self,
                                           const est_trigger_config_t* const config,
                                           const float                       innovation,

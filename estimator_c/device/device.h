@@ -42,8 +42,8 @@ extern "C" {
 #define DEVICE_LATE_MAX 32U
 
 /// Slices of work on a diagnosis with each sample. A sample takes EST_ISOLATION_SLICES_N of them, and at the alarm up to 20,
-/// which take less, are waiting: the diagnosis comes 0.4 samples later than with all of them at once.
-#define DEVICE_ISOLATION_SLICES 20U
+/// which take less, are waiting: the diagnosis comes 0.6 samples later than with all of them at once.
+#define DEVICE_ISOLATION_SLICES 18U
 
 /// What a port knows about itself.
 typedef struct {

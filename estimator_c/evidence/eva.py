@@ -35,6 +35,7 @@ THETA_MAX, NC_MAX = 6, 2
 OPTIONS = (
     "-eva",
     "-main=main",
+    "-machdep=x86_32",
     "-eva-auto-loop-unroll=12",
     "-eva-slevel=60",
     "-eva-slevel-function=main:2",
@@ -45,7 +46,8 @@ OPTIONS = (
 )
 """Within a function as many paths are told apart as it has (with an edge in doubt or not, each turn of a loop), but a
 call has one outcome, or there would be their product. Only of these three functions what they return is told apart:
-est_init() == true then means a valid configuration. The loop of main() is one of any samples."""
+est_init() == true then means a valid configuration. The loop of main() is one of any samples. On 32 bits, as on the
+targets, est_t has no padding at its end that would hide a read beyond its last array."""
 
 SIZES = re.compile(r"^(\s*(?:const )?(?:float|est_past_t)\s+\w+)((?:\[[^]]*\])+)", re.MULTILINE)
 """Of the arrays that are declared."""
@@ -80,10 +82,10 @@ SHAPES = tuple(
             for shape in itertools.starmap(Shape, itertools.product((1, 2), (1, 2, 3), range(NC_MAX + 1), (0, 1)))
             if shape.count <= THETA_MAX
         ),
-        key=lambda shape: -shape.count,
+        key=lambda shape: (shape != DEFAULT, -shape.count),
     )
 )
-"""The largest first."""
+"""The default and the largest first."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def _literal(sizes: re.Match[str]) -> str:
 
 def _preprocessed(source: Path, folder: Path, shape: Shape) -> Path:
     share = subprocess.run(["frama-c", "-print-share-path"], check=True, capture_output=True, text=True).stdout.strip()
-    options = ["-E", "-nostdinc", f"-I{share}/libc", f"-I{CORE}", "-D__FC_MACHDEP_X86_64", "-U__GNUC__", "-DNDEBUG"]
+    options = ["-E", "-nostdinc", f"-I{share}/libc", f"-I{CORE}", "-D__FC_MACHDEP_X86_32", "-U__GNUC__", "-DNDEBUG"]
     done = subprocess.run(["gcc", *options, *shape.defines, source], check=True, capture_output=True, text=True)
     out = folder / f"{source.stem}.i"
     out.write_text(SIZES.sub(_literal, done.stdout))

@@ -323,30 +323,34 @@ static uint8_t best(const est_fit_t* const fit) {
     return (fit->any_alone[2] > fit->any_alone[first]) ? 2U : first;
 }
 
+/// From 1 - old/new of M, new/old - 1 of B and K; 0.01 at least, and of M 100 at most.
+static float extent_of(const est_change_t change, const float x) {
+    const bool  of_mass = change == EST_CHANGE_MASS;
+    const float parts   = greater(1.0F + (of_mass ? -x : x), 0.01F);
+    const float inverse = 1.0F / parts;
+    return of_mass ? inverse : parts;
+}
+
+/// What a change by that factor has against it, in nats: near 1 it is ln(extent)^2 / 2, as if factors of e were usual. Where the
+/// mass hardly matters, one a hundred times as heavy would explain anything, y itself being among what drives its effect.
+static float unlikely(const float extent) { return 0.5F * ((extent + (1.0F / extent)) - 2.0F); }
+
 /// What can be said so far.
 static est_change_t verdict(const est_fit_t* const fit) {
     static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
     const uint8_t one    = best(fit);
-    const float   likely = fit->any_alone[one];
+    const float   likely = fit->any_alone[one] - unlikely(extent_of(alone[one], fit->change[one]));
     bool          sure   = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
                 ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
     for (uint8_t other = 0U; other < 3U; other++) {
         if (other != one) {
-            if ((fit->any_pair[one + other - 1U] - likely) > NOT_BY_CHANCE) {
+            if ((fit->any_pair[one + other - 1U] - fit->any_alone[one]) > NOT_BY_CHANCE) {
                 return EST_CHANGE_SEVERAL;  // MISRA D4
             }
             sure = sure && ((likely - fit->any_alone[other]) >= SURE);
         }
     }
     return sure ? alone[one] : EST_CHANGE_UNDECIDED;
-}
-
-/// 1 - old/new of M; new/old - 1 of B and K.
-static float extent_of(const est_change_t change, const float x) {
-    if (change == EST_CHANGE_MASS) {
-        return (x < 0.99F) ? (1.0F / (1.0F - x)) : 100.0F;  // MISRA D4
-    }
-    return 1.0F + x;
 }
 
 /// The sample that is worked on comes after the alarm.

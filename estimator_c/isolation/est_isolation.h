@@ -122,13 +122,13 @@ typedef struct {
 /// nothing tells when it was last well. The state is then unusable. Cost: constant. May be called from an interrupt.
 bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
-/// To be called after every est_step(), with what went in and came out. Cost: some 180 instructions on a Cortex-M4F, at the
+/// To be called after every est_step(), with what went in and came out. Cost: some 150 instructions on a Cortex-M4F, at the
 /// alarm 2,400 (make cost). May be called from an interrupt. A gap before the diagnosis leaves it undecided.
 void est_isolation_enter(est_isolation_t* self, const est_t* estimator, est_sample_t sample, est_step_t step);
 
 /// One slice of what is to be done after an alarm: one sample with one onset. True iff more is waiting. A sample waits for
 /// up to EST_ISOLATION_SLICES_N calls; if more than EST_ISOLATION_KEPT_N - 4 samples wait, the diagnosis remains undecided.
-/// Cost: some 680 instructions on a Cortex-M4F, at most 810; nothing before an alarm.
+/// Cost: some 680 instructions on a Cortex-M4F, at most 830; nothing before an alarm.
 bool est_isolation_work(est_isolation_t* self);
 
 /// The diagnosis of the last alarm: the change is stated once it is 95 % sure and then stays; the extent is refined until

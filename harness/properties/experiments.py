@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from harness.played import Played, rate_below
 from harness.rare import false_alarm_rate
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.recording import RecordingRig
+from harness.run import Run
 from harness.scenario import Scenario
 from harness.statement import Finding, Play, experiment
 from harness.statistics import Decision, SequentialTest, lower_rate, mean_bounds
@@ -40,6 +41,9 @@ _WITNESS_N = 2000
 
 _AFTER_N = 100
 """Samples of it after that alarm."""
+
+_MOST_UNARMED = 2
+"""Trials may take so many times the samples in which the trigger was armed; else silence is no evidence."""
 
 _EVER = 1e9
 """Of the bound: an alarm before the next change."""
@@ -77,14 +81,23 @@ def rate_of_plays_below(
 def false_alarms_at_most(
     play: Play, scenario: Scenario, seed: int, allowed: int, samples: int, samples_each: int
 ) -> Finding:
-    """No more than so many in trials of ``samples_each`` that are, once warm, ``samples`` altogether."""
+    """No more than so many in trials of ``samples_each``, in which the trigger was armed in ``samples`` altogether."""
     trials = _trials(play, f"takes {samples} samples: analogrig certify")
     scenario = dataclasses.replace(scenario, samples=samples_each)
-    warm_n = samples_each - described(play.bench.dut).estimator.warm_up_n
-    runs = -(-samples // warm_n)
-    alarms = [trials.alarms(scenario, seed + number) for number in range(runs)]
+    alarms: list[NDArray[np.int64]] = []
+    armed = 0
+    while armed < samples:
+        watched = trials.watched(scenario, seed + len(alarms))
+        alarms.append(watched.alarms)
+        armed += watched.exposure.armed
+        if watched.exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+            why = (
+                watched.exposure.no_evidence
+                or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
+            )
+            return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
     count = sum(map(len, alarms))
-    why = f"{count} false alarms in {runs * warm_n} samples, allowed {allowed}"
+    why = f"{count} false alarms in {armed} samples, allowed {allowed}"
     if count <= allowed:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
@@ -101,10 +114,16 @@ def false_alarms_of_plants_rarer(
     trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
-    alarms = [trials.alarms(each, seed) for each in drawn]
-    count, samples = sum(map(len, alarms)), plants * samples_each
+    played = [trials.watched(each, seed) for each in drawn]
+    if nothing := next((each.exposure.no_evidence for each in played if each.exposure.no_evidence), ""):
+        return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
+    alarms = [each.alarms for each in played]
+    count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
     low = lower_rate(count, samples, confidence)
     why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
+    if _MOST_UNARMED * samples < plants * samples_each:
+        why = f"the trigger was armed in {samples} of {plants * samples_each} samples"
+        return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
     if low <= rate:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
@@ -116,12 +135,9 @@ def rare_false_alarms_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
 ) -> Finding:
     """The same of a rate that is too low to be waited for, by ``harness.rare``."""
-    _trials(play, "needs the estimator in this process")
-    rig, device = play.bench.rig, described(play.bench.dut)
+    rig, device = _in_this_process(play, "needs the estimator in this process")
     if device.estimator.trigger != "cusum":
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
-    if not isinstance(rig, EmulatorRig):
-        raise TypeError(type(rig))
     rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
     low, high = mean_bounds(rates, confidence)
     why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
@@ -131,11 +147,15 @@ def rare_false_alarms_rarer(
 
 
 def _trials(play: Play, otherwise: str) -> Trials:
-    """Skips where they are not what the bench would give."""
+    return Trials(*_in_this_process(play, otherwise))
+
+
+def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
+    """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
     rig, device = play.bench.rig, described(play.bench.dut)
     if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --dut inproc, not {play.bench.dut.name}")
-    return Trials(rig, device)
+    return rig, device
 
 
 def _with_most(alarms: list[NDArray[np.int64]]) -> int:
@@ -336,3 +356,99 @@ def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, fau
     why = f"with {faults or 'no fault'} on the line the run is {verdict.outcome}"
     why += " and the estimate as without" if is_same else ", and the estimate is another than without"
     return Finding(is_same or not verdict.valid, why, run=run)
+
+
+@experiment
+def faults_among_the_samples_cost_no_more_than_samples(
+    play: Play, scenario: Scenario, seed: int, each: int, least_valid: int
+) -> Finding:
+    """Of each kind of fault that passes, ``each`` at messages with samples: what is lost is as if it had been declared
+    missing, to the bit, and nothing else changes. At least so many of the kinds must have left a valid run."""
+    device = dataclasses.replace(described(play.bench.dut), wire_faults="")
+    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+    kinds = sorted(PASSING.intersection(device.fault_kinds()))
+    valid: set[str] = set()
+    with connect(device) as alone:
+        play = play.on(play.bench.rig, alone)
+        without = play(scenario, seed, allow_inconclusive=True)
+        if (invalid := _invalid(without)) is not None:
+            return invalid
+        for kind, faults in _cases(kinds, alone, without.run, each):
+            run = _spoiled(without.run, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples))
+            if not judge(run).valid or not _took_effect(run):
+                continue
+            valid.add(kind)
+            if harm := _harm(run, Bench(_missing(without.run, run.lost), alone).play(_replayed(without.run), seed)):
+                return Finding(holds=False, why=f"with {faults} on the line {harm}", run=run)
+    if "repeat" in kinds and _START not in valid:
+        return Finding(holds=False, why=f"{_START} is never passed over: no run with one is valid", run=run)
+    valid.discard(_START)
+    why = f"{len(valid)} of {len(kinds)} kinds of faults left a valid run and took effect ({', '.join(sorted(valid))})"
+    if len(valid) < min(least_valid, len(kinds)):
+        return Finding(holds=False, why=f"INCONCLUSIVE: {why}, at least {least_valid} are needed")
+    return Finding(holds=True, why=why)
+
+
+PASSING = frozenset({"drop", "duplicate", "repeat", "reorder", "flip", "lose", "insert", "truncate"})
+"""Kinds of faults after which the line is as it was, and of which none goes on for long."""
+
+_BEFORE_SAMPLES_N = 5
+"""Messages to the device before the first with samples, beside two for each of its settings."""
+
+
+_START, _LATE_STARTS = "an order to start that comes again", 4
+"""Orders to start that come again, each in a run of its own: some come too late to be known for what they are."""
+
+
+def _cases(kinds: Sequence[str], dut: Dut, run: Run, each: int) -> Iterator[tuple[str, str]]:
+    """Kinds and faults: of each kind so many, evenly over a run on a connection of its own; and orders to start that
+    come again among the samples."""
+    first = 2 * len(list(dut.estimator.settings())) + _BEFORE_SAMPLES_N
+    messages = run.samples // dut.line["samples_per_message"]
+    for kind in kinds:
+        places = (first + (number + 1) * messages // (each + 1) for number in range(each))
+        yield kind, ",".join([*(f"{kind}@to:{place}" for place in places), f"seed={run.conditions.seed}"])
+    if "repeat" in kinds:
+        yield from ((_START, f"repeat@to:{first - 1},seed={seed}") for seed in range(_LATE_STARTS))
+
+
+def _replayed(run: Run) -> Scenario:
+    return RecordingRig.of(run, Path("without")).scenario()
+
+
+def _spoiled(without: Run, device: DeviceDescription) -> Run:
+    """The same samples, which a real rig would not take twice, over a line with faults."""
+    with connect(device) as dut:
+        return Bench(RecordingRig.of(without, Path("without")), dut).play(_replayed(without), without.conditions.seed)
+
+
+def _missing(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
+    """The same samples, some of them declared missing."""
+    return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | lost[:, np.newaxis]), Path("missing"))
+
+
+def _took_effect(run: Run) -> bool:
+    return bool(run.lost.any()) or any(run.conditions.counters.get(name, 0) for name in _EFFECTS)
+
+
+_EFFECTS = (
+    "frames_dropped",
+    "sequence_gaps",
+    "messages_repeated",
+    "messages_refused",
+    "samples_lost",
+    "samples_ignored",
+)
+"""Counters of the device that tell of a fault."""
+
+
+def _harm(run: Run, declared: Run) -> str:
+    """How a run differs from one in which the samples that it has lost were declared missing; empty: not at all."""
+    heard = ~run.lost
+    for name in ("theta", "innovation", "statistic"):
+        ours, theirs = (getattr(each, name)[heard].view(np.uint32) for each in (run, declared))
+        if not np.array_equal(ours, theirs):
+            at = int(np.flatnonzero(heard)[np.argmax((ours != theirs).reshape(len(ours), -1).any(axis=1))])
+            return f"{name} at sample {at} is another than with {int(run.lost.sum())} samples declared missing"
+    return "" if np.array_equal(run.alarm_index, declared.alarm_index) else "there are other alarms"

@@ -15,6 +15,7 @@ from harness.properties.experiments import (
     described,
     false_alarms_at_most,
     false_alarms_of_plants_rarer,
+    faults_among_the_samples_cost_no_more_than_samples,
     faults_of_the_line_do_no_harm,
     rare_false_alarms_rarer,
 )
@@ -24,6 +25,7 @@ from harness.statistics import Design
 from harness.strategies import link_faults, profile, seeds
 
 SHORT = Scenario(samples=300, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
+FAULTS_EACH, LEAST_VALID_KINDS = 4, 4
 CERTIFIED = Design(rate=1e-5, confidence=0.999, allowed=5)
 CERTIFIED_RUN_N = 20_000
 PLANTS_N = 40
@@ -59,6 +61,13 @@ def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
 ) -> None:
     faults = drawn.draw(link_faults(sorted(described(play.bench.dut).fault_kinds())), "faults of the line")
     found = faults_of_the_line_do_no_harm(play, SHORT, seed, faults)
+    assert found
+
+
+def test_faults_of_the_line_among_the_samples_cost_no_more_than_those_samples(play: Play) -> None:
+    found = faults_among_the_samples_cost_no_more_than_samples(
+        play, SHORT, 1, each=FAULTS_EACH, least_valid=LEAST_VALID_KINDS
+    )
     assert found
 
 

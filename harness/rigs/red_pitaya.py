@@ -88,9 +88,11 @@ class RedPitaya(Instrument):
         if excitation.shape == "prbs":
             raise ConfigurationError("the generator of a Red Pitaya has no prbs: say square or pulse")
         period_n = cls.datasheet.rate_hz / excitation.frequency_hz
-        if excitation.clock == "card" and not math.isclose(period_n, round(period_n), rel_tol=1e-12):
+        high_n = period_n * (0.5 if excitation.shape == "square" else excitation.duty)
+        if excitation.clock == "card" and not (_is_whole(high_n) and _is_whole(period_n)):
             raise ConfigurationError(
-                f'{excitation.frequency_hz:g} Hz on the clock "card" need a period of whole samples, not {period_n:g}:'
+                f'{excitation.frequency_hz:g} Hz on the clock "card" need edges that are whole samples apart, not'
+                f" {high_n:g} and {period_n - high_n:g}:"
                 ' the generator\'s edges come when they come; say clock = "free"'
             )
 
@@ -263,6 +265,10 @@ class _PotBox:
 
     def _number(self, pot: str) -> int:
         return self.names.index(pot) + 1
+
+
+def _is_whole(samples: float) -> bool:
+    return math.isclose(samples, round(samples), rel_tol=1e-12)
 
 
 def _is_close(answer: str, wanted: float) -> bool:

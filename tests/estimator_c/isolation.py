@@ -109,15 +109,20 @@ def measure(
     seed: int,
     *,
     bounded: bool = True,
+    against_two: bool = True,
 ) -> Isolation:
-    """Play the change in so many trials; ``bounded``: with the bounds of these trials, which take a while."""
+    """Play the change in so many trials.
+
+    :param bounded: with the bounds of these trials, which take a while.
+    :param against_two: with those against two changes at once too, which take longer.
+    """
     played = play(plant, change, excitation, trials, seed)
     assert estimator.init(**settings)
     found = estimator.isolate(played.u, played.y, played.onset)
     bound_n = bound_of_pairs_n = np.full(trials, np.nan)
     if bounded:
         bound_n = bounds(plant, change, excitation, played.onset, seed)
-    if bounded and len(change) == 1:
+    if bounded and against_two and len(change) == 1:
         bound_of_pairs_n = bounds_of_pairs(plant, change, excitation, played.onset, seed)
     return judged(found, played, change, bound_n, bound_of_pairs_n)
 

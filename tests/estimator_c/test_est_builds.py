@@ -31,8 +31,9 @@ def fixed(shape: dict[str, int]) -> tuple[str, ...]:
         (WITHOUT, MINIMAL),
         (("-Os", *WITHOUT, UNCHECKED), MINIMAL),
         (("-UEST_NC_MAX", "-DEST_NC_MAX=0U"), {}),
+        (("-U__GNUC__",), {}),
     ],
-    ids=["size", "fixed", "fixed minimal", "minimal", "least", "no extended least squares"],
+    ids=["size", "fixed", "fixed minimal", "minimal", "least", "no extended least squares", "another compiler"],
 )
 def test_builds_agree_to_the_bit(
     estimator: Estimator, tmp_path: Path, options: tuple[str, ...], settings: dict[str, int], shape: dict[str, int]

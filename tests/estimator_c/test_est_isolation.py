@@ -13,7 +13,7 @@ from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import GATHERING, PREDICTION_ERROR, REFUSED, SLICES_N, Estimator
 from tests.estimator_c.isolation import Change
 from tests.estimator_c.performance import FULL, FULL_FREE, OWN_CLOCK, SHARED_CLOCK, Settings
-from tests.estimator_c.plants import FRONT, Excitation, random_plants, simulate
+from tests.estimator_c.plants import FRONT, SHOCK, Excitation, random_plants, simulate
 
 CLOCKS = {"one clock": (SHARED_CLOCK, FULL), "edges anywhere": (OWN_CLOCK, FULL_FREE)}
 SINGLE = [{name: factor} for name in "MBK" for factor in (0.8, 1.2)]
@@ -34,14 +34,21 @@ def test_changed_parameter_is_named_in_time_and_its_extent_told(
     assert found.error_refined < 0.01
 
 
-@pytest.mark.parametrize("change", [{"M": 1.2}, {"K": 1.2}], ids=str)
+@pytest.mark.parametrize("change", [{"M": 0.8}, {"M": 1.2}, {"B": 1.2}, {"K": 0.8}], ids=str)
 def test_report_comes_within_twice_the_isolation_bound_on_average(estimator: Estimator, change: Change) -> None:
-    """The bound against all rivals, the two other parameters at once being one: 1.4 times, standard error 0.1.
+    """1.6 to 2.0 times; B - 20 % and K + 20 % are below."""
+    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 400, seed=31, against_two=False)
+    assert found.bound_n < found.mean_n <= 2.0 * found.bound_n
 
-    Of the six single changes those two are the earliest; the latest, of B - 20 %, comes after 2.1 of these bounds.
-    """
-    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 100, seed=31)
-    assert found.bound_n <= found.bound_of_pairs_n < found.mean_n < 2.0 * found.bound_of_pairs_n
+
+@pytest.mark.parametrize("change", [{"B": 0.8}, {"K": 1.2}], ids=str)
+def test_change_that_two_others_at_once_look_like_for_long_is_reported_soon_after_they_do_not(
+    estimator: Estimator, change: Change
+) -> None:
+    """As long as no force acts nothing tells them apart: twice the bound against single rivals is not to be had."""
+    found = isolation.measure(estimator, SHARED_CLOCK, FRONT, change, FULL, 60, seed=31)
+    assert found.bound_of_pairs_n > 1.9 * found.bound_n
+    assert found.bound_of_pairs_n < found.mean_n < 1.3 * found.bound_of_pairs_n
 
 
 @pytest.mark.parametrize("change", TWO, ids=str)
@@ -61,6 +68,15 @@ def test_random_plants_are_isolated_as_well(estimator: Estimator, change: Change
     ]
     assert np.mean([each.reported for each in found]) > 0.95
     assert np.mean([each.right for each in found]) > 0.94
+
+
+def test_mass_that_hardly_matters_is_not_named_for_what_damping_did(estimator: Estimator) -> None:
+    """Of the shock absorber a mass a hundred times as heavy explains any change: 19 of 100 were named so."""
+    played = isolation.play(SHOCK, {"B": 1.2}, FULL, 100, seed=31)
+    assert estimator.init(**SHARED_CLOCK)
+    named = estimator.isolate(played.u, played.y, played.onset).change
+    assert (named == "M").mean() <= 0.02
+    assert (named == "B").mean() > 0.7
 
 
 def test_verdict_does_not_depend_on_when_the_work_is_done(estimator: Estimator) -> None:

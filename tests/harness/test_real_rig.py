@@ -391,6 +391,11 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
     [
         (dataclasses.replace(SHORT, excitation=Excitation("prbs", 0.1, 9.9)), "no prbs"),
         (dataclasses.replace(SHORT, excitation=Excitation(frequency_hz=123.0)), "whole samples"),
+        (
+            dataclasses.replace(SHORT, excitation=Excitation(frequency_hz=160.0)),
+            "whole samples apart, not 62.5 and 62.5",
+        ),
+        (dataclasses.replace(SHORT, excitation=Excitation("pulse", 0.1, 9.0, 100.0, duty=0.123)), "24.6 and 175.4"),
         (dataclasses.replace(SHORT, plant=PlantChoice(set="shock")), "program 'shock'"),
         (dataclasses.replace(SHORT, tweaks=(Tweak(100, mass_kg=50.0, ramp_n=20),)), "ramp_n"),
         (dataclasses.replace(SHORT, excitation=Excitation(low_v=0.1, high_v=10.5)), "1.05 V"),
@@ -477,7 +482,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
             check=False,
         )
     assert result.returncode == 0, result.stdout[-3000:]
-    assert "12 passed, 3 skipped" in result.stdout  # what takes a million samples, and faults of a line that is none
+    assert "13 passed, 3 skipped" in result.stdout  # what takes a million samples, and faults of a line that is none
 
 
 def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Path) -> None:

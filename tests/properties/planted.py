@@ -54,12 +54,9 @@ class Found:
 
     @property
     def why(self) -> str:
-        """What the property said last."""
-        said = re.findall(r"^E +(?:AssertionError: |Failed: )?(?:assert )?(.*)$", self.output, re.MULTILINE)
-        finding = [re.sub(r"^<no: (.*)>$", r"\1", line) for line in said if line.strip()]
-        finding = finding or re.findall(r"(INCONCLUSIVE: .*|^device .*)$", self.output, re.MULTILINE)
-        finding = [re.sub(r"device \S+: ", "", line) for line in finding]
-        return finding[0][:110] if finding else ""
+        """What the property found, as the plugin tells it; empty if it has found nothing."""
+        found = re.findall(r"^found: (.*)$", self.output, re.MULTILINE)
+        return re.sub(r"device \S+: ", "", found[0])[:110] if found else ""
 
 
 def defects() -> list[Defect]:

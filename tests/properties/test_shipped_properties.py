@@ -58,7 +58,7 @@ def test_device_program_has_every_property_that_a_line_has_time_for(tmp_path: Pa
 
 
 def test_faults_of_the_line_to_the_device_program_do_no_harm(tmp_path: Path) -> None:
-    assert "1 passed" in run(tmp_path, "host?exchange=block&timeout_s=0.5", "-k", "faults_of_the_line")
+    assert "2 passed" in run(tmp_path, "host?exchange=block&timeout_s=0.5", "-k", "faults_of_the_line")
 
 
 @pytest.mark.parametrize("core", [pytest.param("m4", marks=needs_firmware)])
