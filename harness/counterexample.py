@@ -13,7 +13,7 @@ from typing import Any
 from harness import config
 from harness.devices import recorded
 from harness.run import Run
-from harness.statement import Statement
+from harness.scenario import Statement
 
 SCENARIO_FILE, RIG_FILE, DEVICE_FILE = "scenario.toml", "rig.toml", "dut.toml"
 RUN_FILE, REPORT_FILE = "run.npz", "report.html"
@@ -43,7 +43,7 @@ class Counterexample:
     def suite_command(self, folder: Path) -> str:
         """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
         place = recorded(self.run.conditions.dut).elsewhere
-        return shlex.join(["pytest", "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
+        return shlex.join(["pytest", str(folder), "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Into ``folder``, at once or not at all: what stood there before is there until all of this is.

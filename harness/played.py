@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Concatenate, ParamSpec
@@ -17,8 +19,9 @@ from numpy.typing import ArrayLike
 
 from harness.exposure import exposure
 from harness.run import Run
-from harness.statement import Finding, Statement, make_known, said
-from harness.statistics import upper_rate
+from harness.scenario import Statement
+from harness.statement import Finding, make_known, said
+from harness.statistics import Design, upper_rate
 from harness.summary import latency_text
 from harness.verdict import TweakVerdict, Verdict, judge
 
@@ -32,6 +35,9 @@ def _of_a_valid_play(
 
     @functools.wraps(statement)
     def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
+        for limit in (*args, *kwargs.values()):
+            if isinstance(limit, float) and not math.isfinite(limit):
+                raise ValueError(f"{statement.__name__}: a limit must be a finite number, not {limit}")
         if played.verdict.valid:
             finding = statement(played, *args, **kwargs)
         else:
@@ -120,7 +126,7 @@ class Played:
             off += [
                 f"{name} is off by {error:+.2%} at sample {segment.end}"
                 for name, error in segment.error.items()
-                if abs(error) > within
+                if not abs(error) <= within
             ]
         return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
 
@@ -136,11 +142,13 @@ class Played:
         wanted = np.asarray(reference, dtype=np.float64)
         if wanted.shape != theta.shape:
             raise ValueError(f"reference has the shape {wanted.shape}, theta {theta.shape}")
+        if np.isnan(tolerance).any():
+            raise ValueError("tolerance must be a number, not nan")
         allowed = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), theta.shape)
         inside = np.zeros(theta.shape, dtype=bool)
         for shift in range(-time_tolerance, time_tolerance + 1):
             at = np.clip(np.arange(len(theta)) + shift, 0, len(theta) - 1)
-            inside |= ~(np.abs(theta - wanted[at]) > allowed[at])
+            inside |= (np.abs(theta - wanted[at]) <= allowed[at]) | np.isnan(wanted[at])
         outside = np.argwhere(~inside)
         if not len(outside):
             return Finding(holds=True, why=f"{len(theta)} samples within the tolerance")
@@ -181,7 +189,7 @@ def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> F
     It does not hold if one of them is not valid. A play counts once, with the samples in which its trigger was armed
     (``harness.exposure``).
     """
-    plays = list({id(each.run): each for each in played}.values())
+    plays = list({_samples_of(each.run): each for each in played}.values())
     finding = _rate_below(rate, plays, confidence)
     if plays:
         finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence), run=plays[0].run)
@@ -200,7 +208,15 @@ def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Find
         return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: {why}")
     bound = upper_rate(events, samples, confidence)
     why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
+    if bound > rate:
+        needed = Design(rate=rate, confidence=confidence, allowed=events).trials
+        why += f", allowed {rate:g}: with so many alarms that takes {needed} samples"
     return Finding(bound <= rate, why)
+
+
+def _samples_of(run: Run) -> tuple[str, bytes]:
+    """What makes it a play of its own: the device, and the samples that it was given."""
+    return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
 
 
 def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statement | None:

@@ -29,10 +29,10 @@ from harness.devices import DeviceDescription, InprocDevice
 from harness.errors import ConfigurationError, DeviceError
 from harness.estimator import Estimator
 from harness.estimator_config import EstimatorConfig
-from harness.exposure import exposed
+from harness.exposure import Heard, exposed
 from harness.links.wire import LIBRARY
 from harness.rigs.emulator import EmulatorRig
-from harness.rigs.rig import Block
+from harness.rigs.rig import Block, Performance
 from harness.run import CHANNELS
 from harness.scenario import Scenario
 from harness.trials import entered, flags_of
@@ -109,20 +109,28 @@ def false_alarm_rate(
     estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
     first = settings.warm_up_n + LEAD_IN_N
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
-    (play,) = rig.perform(played, seed, block_samples=played.samples).blocks
-    return _Climbs(rig, settings, estimator, play, np.random.default_rng([seed, _BRANCHES])).estimate(first, branches)
+    performance = rig.perform(played, seed, block_samples=played.samples)
+    return _Climbs(rig, settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])).estimate(
+        first, branches
+    )
 
 
 class _Climbs:
     """From the ground of one play."""
 
     def __init__(
-        self, rig: EmulatorRig, settings: EstimatorConfig, estimator: Estimator, play: Block, rng: np.random.Generator
+        self,
+        rig: EmulatorRig,
+        settings: EstimatorConfig,
+        estimator: Estimator,
+        performance: Performance,
+        rng: np.random.Generator,
     ) -> None:
         self._rig = rig
         self._settings = settings
         self._estimator = estimator
-        self._play = play
+        (self._play,) = performance.blocks
+        self._noise_lsb = performance.channels["force"].noise_lsb
         self._rng = rng
         self._samples = 0
 
@@ -146,8 +154,10 @@ class _Climbs:
         self._estimator.restart()
         steps = self._estimator.run(*(signal[:end] for signal in entered(self._play)))
         self._samples += end
+        numbers = np.isfinite(steps.innovation) & np.isfinite(steps.statistic)
         force = self._play.codes[:end, CHANNELS.index("force")]
-        if fault := exposed(force, flags_of(steps.status), steps.alarms, self._settings.as_table()).no_evidence:
+        heard = Heard(force, flags_of(steps.status), numbers, steps.alarms)
+        if fault := exposed(heard, self._settings.as_table(), self._noise_lsb).no_evidence:
             raise DeviceError(fault)
         alarms = steps.alarms[steps.alarms >= first]
         end = int(alarms[0]) + 1 if len(alarms) else end

@@ -15,7 +15,6 @@ from emulator.suspension import PROGRAMS
 from harness import config
 from harness.plant import Plant
 from harness.run import Segment
-from harness.statement import Statement
 
 MAX_RAMP_N = 100_000
 
@@ -32,6 +31,9 @@ MOST_SEED = 2**63
 
 MAX_SAMPLES = 10_000_000
 """A run is kept in memory, some 70 bytes a sample."""
+
+Limit = bool | int | float | str
+"""Of a statement."""
 
 MISSING = "clipped and missing for the device"
 """What the samples are that count as missing."""
@@ -118,6 +120,23 @@ class Expectations:
             return []
         allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
         return [f"{missing} of {samples} samples were {words}, {allowed}"]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The ``[statement]`` table of a scenario: what a test asserted of it, and did not find."""
+
+    name: str
+    limits: Mapping[str, Limit] = field(default_factory=dict)
+    """By which it judged."""
+    tries: int = 1
+    """Seeds, one after the other, with one of which it must hold; an experiment has its own."""
+    test: str = ""
+    """That asserted it; for people."""
+
+    def __post_init__(self) -> None:
+        if self.tries < 1:
+            raise ValueError(f"tries must be at least 1, not {self.tries}")
 
 
 @dataclass(frozen=True)

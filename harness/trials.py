@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from harness.catalogue import SteppedFlag, Trigger
 from harness.devices import DeviceDescription, InprocDevice
 from harness.estimator import Estimator, Steps, StepStatus
-from harness.exposure import Exposure, exposed
+from harness.exposure import Exposure, Heard, exposed
 from harness.links.wire import LIBRARY
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.rig import Block, Performance, Rig
@@ -87,16 +87,29 @@ class Trials:
     def watched(self, scenario: Scenario, seed: int) -> Watched:
         """As ``alarms``, with what they are worth."""
         self._estimator.restart()
-        force, flags = np.empty(scenario.samples, np.uint16), np.empty(scenario.samples, np.uint8)
+        n = scenario.samples
+        force, status = np.empty(n, np.uint16), np.empty(n, np.uint8)
+        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
         found = []
-        for block in self._rig.perform(scenario, seed, BLOCK_SAMPLES).blocks:
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        for block in performance.blocks:
             u, y, valid = entered(block)
             its = slice(block.first, block.first + len(u))
             force[its] = u
-            found.append(block.first + self._estimator.alarms(u, y, valid, status=flags[its]))
-        flags, alarms = flags_of(flags), np.concatenate(found)
+            found.append(
+                block.first
+                + self._estimator.alarms(
+                    u, y, valid, status=status[its], innovation=innovation[its], statistic=statistic[its]
+                )
+            )
+        flags, alarms = flags_of(status), np.concatenate(found)
+        shown = exposed(
+            Heard(force, flags, np.isfinite(innovation) & np.isfinite(statistic), alarms),
+            self._tables[1]["estimator"],
+            performance.channels["force"].noise_lsb,
+        )
         missing, refused = (int(np.count_nonzero(flags & flag)) for flag in (SteppedFlag.MISSING, SteppedFlag.REFUSED))
-        return Watched(alarms, exposed(force, flags, alarms, self._tables[1]["estimator"]), missing, refused)
+        return Watched(alarms, shown, missing, refused)
 
     def run(self, scenario: Scenario, seed: int) -> Run:
         """One trial, for ``judge``; errors as ``alarms``."""

@@ -11,6 +11,7 @@ probabilities of all quantities are adjusted together (Holm 1979), so that the c
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,9 @@ from harness.plant import PARAMETERS
 
 EXACT_UP_TO = 14
 """With so many differences or fewer all ways to exchange them are gone through."""
+
+LOST_ESTIMATE = 1.0
+"""The relative error of a trial that ended without an estimate of M, B, K where the other side's has one."""
 
 RESAMPLES, _AT_ONCE = 99_999, 1_000
 
@@ -76,6 +80,17 @@ class Comparison:
     """Of so many trials that both sides played, so many (first) have the same estimates to the bit."""
 
     @property
+    def is_same(self) -> bool:
+        """Both sides played the same, and estimated the same to the bit."""
+        same, both = self.identical
+        return same == both > 0
+
+    @property
+    def least_seeds(self) -> int:
+        """With fewer that both sides have, nothing could be called worse, however much it was."""
+        return 1 + math.ceil(math.log2(max(1, len(self.differences)) / self.alpha))
+
+    @property
     def worse(self) -> bool:
         return any(each.word == "worse" for each in self.differences)
 
@@ -112,8 +127,9 @@ def _false_alarms(trial: Row, _: Row | None) -> list[float]:
 
 def _error(i: int) -> Callable[[Row, Row | None], list[float]]:
     def errors(trial: Row, other: Row | None) -> list[float]:
-        both = len(trial["errors"]) > i and (other is None or len(other["errors"]) > i)
-        return [abs(trial["errors"][i])] if both else []
+        if trial["errors"]:
+            return [abs(trial["errors"][i])]
+        return [LOST_ESTIMATE] if other is not None and other["errors"] else []
 
     return errors
 

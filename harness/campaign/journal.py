@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from harness.campaign.plan import Chunk, Plan
-from harness.campaign.rows import Row
+from harness.campaign.rows import Row, check_row
 from harness.errors import ConfigurationError, RecordingError
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign-journal", 2
@@ -112,7 +112,13 @@ class Journal:
             entry = _entry(line)
             if entry is None:
                 break
-            self.rows[Chunk(entry["chunk"])] = entry["rows"]
+            try:
+                chunk, rows = Chunk(entry["chunk"]), list(entry["rows"])
+                for row in rows:
+                    check_row(row)
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                raise RecordingError(f"{self.path}: a line that no campaign writes ({error}): remove it") from error
+            self.rows[chunk] = rows
             whole += len(line)
         return whole
 

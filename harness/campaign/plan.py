@@ -64,6 +64,9 @@ class Chunk(tuple[int, int]):
 
     __slots__ = ()
 
+    def __str__(self) -> str:
+        return f"cell {self.cell}, round {self.round}"
+
     @property
     def round(self) -> int:
         return self[0]

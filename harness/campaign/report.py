@@ -45,6 +45,8 @@ def page_of(out: Path) -> Path:
 
     :raises ConfigurationError: something else stands there, or the results themselves would.
     """
+    if not out.name or (out.exists() and not out.is_file()):
+        raise ConfigurationError(f"--out {out}: is no file that results could be written to")
     page = out.with_suffix(".html")
     if page == out:
         raise ConfigurationError(f"--out {out}: the page of the results is to be called so: choose another name")

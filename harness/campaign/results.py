@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,9 @@ from typing import Any
 
 from harness import config
 from harness.campaign.plan import Cell, Plan
-from harness.campaign.rows import RATES, Change, Row, changes, counts, is_valid, valid
+from harness.campaign.rows import RATES, Row, changes, check_row, counts, is_valid, valid
 from harness.errors import ConfigurationError, RecordingError
 from harness.plant import PARAMETERS
-from harness.scenario import MAX_SAMPLES
 from harness.storage import replacing
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
@@ -92,38 +90,11 @@ class Results:
         spec = self.plan.spec
         for rows in self.rows:
             for row in rows:
-                _check_row(row)
+                check_row(row)
             if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
                 raise ValueError("rows of other seeds than the plan has")
             if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
                 raise ValueError(f"a cell of {len(rows)} trials")
-
-
-def _check_row(row: Any) -> None:
-    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``trial.row``."""
-    if row["outcome"] not in ("passed", "failed", "inconclusive"):
-        raise ValueError("a row without an outcome")
-    rising = [row[name] for name in ("false_alarms", "armed", "samples")]
-    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
-        raise ValueError("a row whose counts cannot be")
-    if not all(map(_is_change, changes(row))):
-        raise ValueError("a change that is none")
-    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
-        raise ValueError("errors that are none")
-    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
-        raise ValueError("a text that is none")
-    if not all(map(_is_number, row.get("drawn", {}).values())):
-        raise ValueError("a drawn value that is none")
-
-
-def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
-
-
-def _is_change(change: Change) -> bool:
-    latency_n, bound_n, *flags = change
-    times = all(value is None or type(value) is int for value in (latency_n, bound_n))
-    return times and all(type(flag) is bool for flag in flags)
 
 
 @dataclass(frozen=True)

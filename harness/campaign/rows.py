@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from harness.exposure import exposure
+from harness.plant import PARAMETERS
 from harness.run import Run
+from harness.scenario import MAX_SAMPLES
 from harness.statistics import ConfidenceSequence
 from harness.verdict import TweakVerdict, Verdict
 
@@ -76,6 +78,33 @@ def _errors(verdict: Verdict) -> list[float]:
     """Of the last estimate; one of numbers beyond all measure is none."""
     found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
     return found if all(map(math.isfinite, found)) else []
+
+
+def check_row(row: Any) -> None:
+    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``row``."""
+    if row["outcome"] not in ("passed", "failed", "inconclusive"):
+        raise ValueError("a row without an outcome")
+    rising = [row[name] for name in ("false_alarms", "armed", "samples")]
+    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
+        raise ValueError("a row whose counts cannot be")
+    if not all(map(_is_change, changes(row))):
+        raise ValueError("a change that is none")
+    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
+        raise ValueError("errors that are none")
+    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
+        raise ValueError("a text that is none")
+    if not all(map(_is_number, row.get("drawn", {}).values())):
+        raise ValueError("a drawn value that is none")
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def _is_change(change: Change) -> bool:
+    latency_n, bound_n, *flags = change
+    times = all(value is None or type(value) is int for value in (latency_n, bound_n))
+    return times and all(type(flag) is bool for flag in flags)
 
 
 # ------------------------------------------------------------------------------------------------------------- of many

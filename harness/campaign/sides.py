@@ -88,7 +88,7 @@ def _in_order(side: Side, wanted: Sequence[str], names: Sequence[str]) -> Sequen
 
 def _recorded_play(trial: Observation) -> dict[str, Any]:
     (scenario, rig, _), _ = trial
-    return {"scenario": json.loads(str(scenario)), "rig": rig}
+    return {"scenario": json.loads(str(scenario)), "rig": json.loads(str(rig))}
 
 
 def _played(plan: Plan) -> dict[str, Any]:
@@ -134,4 +134,5 @@ def _recorded(path: Path) -> Observation:
     run = Run.load(path)
     of = run.conditions
     played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
-    return (played, str(of.rig["name"]), of.seed), row(run, judge(run))
+    machine = json.dumps(_unnamed(of.rig), sort_keys=True)
+    return (played, machine, of.seed), row(run, judge(run))

@@ -115,6 +115,7 @@ class Dask:
             self._dask: Any = importlib.import_module("distributed")  # it ships no complete annotations
         except ImportError as error:
             raise ConfigurationError("--cluster needs Dask: pip install 'analogrig[cluster]'") from error
+        self._address = address
         try:
             self._client = self._dask.Client(address, timeout=_ANSWER_S)
         except (OSError, ValueError) as error:
@@ -131,7 +132,9 @@ class Dask:
             sent[future] = task
             return future
 
-        hands = max(1, sum(self._client.nthreads().values())) * _IN_HAND
+        hands = sum(self._client.nthreads().values()) * _IN_HAND
+        if not hands:
+            raise WorkerError(f"--cluster {self._address}: the scheduler has no workers")
         completed = self._dask.as_completed([future for future in (send() for _ in range(hands)) if future is not None])
         try:
             for future in completed:

@@ -39,7 +39,7 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from harness.campaign.comparison import compare
+    from harness.campaign.comparison import PAIRED, compare
     from harness.campaign.sides import load, matched
 
     found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
@@ -51,6 +51,13 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(
             f"INCONCLUSIVE: {theirs} trials of B were inconclusive, {ours} of A: nothing is said of them", INCONCLUSIVE
         )
+    seeds = max(each.seeds for each in found.differences)
+    if not (found.worse or found.is_same) and found.differences[0].test == PAIRED and seeds < found.least_seeds:
+        return complain(
+            f"INCONCLUSIVE: too few seeds ({seeds}) to show anything at alpha {found.alpha:g}:"
+            f" at least {found.least_seeds}",
+            INCONCLUSIVE,
+        )
     return FAILED if found.worse else PASSED
 
 
@@ -58,7 +65,7 @@ def _text(found: Comparison) -> str:
     same, both = found.identical
     ours, theirs = found.inconclusive
     lines = [
-        f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; {same} of {both} in common identical to the bit",
+        f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; theta is the same to the bit in {same} of {both}",
         *([f"inconclusive: {ours} of A, {theirs} of B"] if ours or theirs else []),
         "",
         differences_text(found),

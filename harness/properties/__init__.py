@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from harness import statement
+from harness import experiment
 from harness.errors import ConfigurationError
+from harness.experiment import Play
 from harness.played import Played
 from harness.rigs.rig import Rig
 from harness.scenario import Scenario
-from harness.statement import Finding, Play
+from harness.statement import Finding
 
 __all__ = ["TRIES", "Play", "is_playable", "with_some_seed"]
 
@@ -35,5 +36,5 @@ def is_playable(rig: Rig, scenario: Scenario) -> bool:
 def with_some_seed(
     play: Play, scenario: str | Scenario, seed: int, judge: Callable[[Played], Finding], tries: int = TRIES
 ) -> Finding:
-    """As ``harness.statement.with_some_seed``, with as many tries as the shipped properties have."""
-    return statement.with_some_seed(play, scenario, seed, judge, tries)
+    """As ``harness.experiment.with_some_seed``, with as many tries as the shipped properties have."""
+    return experiment.with_some_seed(play, scenario, seed, judge, tries)

@@ -22,13 +22,14 @@ from harness.bench import Bench
 from harness.devices import DeviceDescription, InprocDevice, recorded
 from harness.dut import Dut, connect
 from harness.errors import AnalogrigError
+from harness.experiment import Play, experiment
 from harness.played import Played, rate_below
 from harness.rare import false_alarm_rate
 from harness.rigs.emulator import EmulatorRig
 from harness.rigs.recording import RecordingRig
 from harness.run import Run
 from harness.scenario import Scenario
-from harness.statement import Finding, Play, experiment
+from harness.statement import Finding
 from harness.statistics import Decision, SequentialTest, lower_rate, mean_bounds
 from harness.trials import Trials, are_possible
 from harness.verdict import judge

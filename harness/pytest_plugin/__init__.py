@@ -21,8 +21,8 @@ from harness.rigs import CAPABILITIES
 if TYPE_CHECKING:
     from harness.bench import Bench
     from harness.dut import Dut
+    from harness.experiment import Play
     from harness.rigs.rig import Rig
-    from harness.statement import Play
 
 # -------------------------------------------------------------------------------------------------------------- session
 

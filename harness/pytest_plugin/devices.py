@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import pytest
 
@@ -24,6 +24,14 @@ _TOLD = "analogrig_owned"
 
 _SPREADING = ("load", "worksteal")
 """Those --dist of pytest-xdist that give any test to any worker."""
+
+
+@runtime_checkable
+class Equipped(Protocol):
+    """A test that says itself on what it plays."""
+
+    def equipment(self) -> tuple[str, str]:
+        """The names of rig and device; empty: unknown."""
 
 
 @dataclass
@@ -146,6 +154,8 @@ def check_owner(item: pytest.Item) -> None:
 
 def single_of(item: pytest.Item) -> str:
     """What a test needs of which there is one, and that one worker owns it; empty: nothing."""
+    if isinstance(item, Equipped):
+        return _single(*item.equipment())
     wanted = getattr(item, "fixturenames", ())
     rig, dut = (option.of(item) if option.name in wanted else "" for option in (RIG, DUT))
     return _single(rig, dut)

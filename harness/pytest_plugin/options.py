@@ -49,6 +49,8 @@ class Option:
     def given(self, config: pytest.Config) -> Said | None:
         """By the command line, or the environment."""
         on_command_line = config.getoption(self.flag)
+        if on_command_line is not None and not str(on_command_line):
+            raise pytest.UsageError(f"{self.flag}: is empty")
         if on_command_line is not None:
             return Said(str(on_command_line), self.flag)
         in_environment = os.environ.get(self.variable)

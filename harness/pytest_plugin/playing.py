@@ -80,7 +80,7 @@ def record_of(item: pytest.Item) -> Record:
 
 
 class Player:
-    """Plays for one test, and keeps what it has played: ``harness.statement.Play``."""
+    """Plays for one test, and keeps what it has played: ``harness.experiment.Play``."""
 
     def __init__(self, item: pytest.Item, bench: Bench) -> None:
         self.item = item
@@ -186,8 +186,7 @@ def left_by(item: pytest.Item) -> str:
     if shown is None:
         return ""
     lines = [f"found: {shown.why}"] if shown.why else []
-    suite = SCENARIO_DIR.of(item)
-    if suite and all(each.resolve().is_relative_to(Path(suite).resolve()) for each in (item.path, folder)):
+    if _is_left_already(item, folder):
         return "\n".join([*lines, f"repeat it with: {shown.command(item.path)}"])
     try:
         shown.write(folder)
@@ -197,6 +196,15 @@ def left_by(item: pytest.Item) -> str:
     if shown.statement is not None:
         lines.append(f"judge it again with: {shown.suite_command(folder)}")
     return "\n".join(lines)
+
+
+def _is_left_already(item: pytest.Item, folder: Path) -> bool:
+    """Whether it is a scenario of --scenario-dir that a test has left, or what it leaves would be one more of them."""
+    suite = SCENARIO_DIR.of(item)
+    if not suite or not item.path.resolve().is_relative_to(Path(suite).resolve()):
+        return False
+    left = item.path.resolve().is_relative_to(Path(RUNS_DIR.of(item)).resolve())
+    return left or folder.resolve().is_relative_to(Path(suite).resolve())
 
 
 def _folder(item: pytest.Item) -> Path:

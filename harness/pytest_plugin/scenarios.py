@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fnmatch
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,21 +18,35 @@ if TYPE_CHECKING:
     from harness.scenario import Scenario
     from harness.statement import Finding
 
+RIG_KINDS = ("emulator", "real")
+
 DEVICES = pytest.StashKey[Devices]()
 """Of the session."""
 
 
 def add_folder(config: pytest.Config) -> None:
-    """The scenarios are what was asked for if the command line names their folder and nothing else; they come on top
-    of all tests if the environment or the ini file does."""
+    """The scenarios come on top of all tests; of those that are named if the command line asks for them.
+
+    :raises pytest.UsageError: pytest does not look into that folder of itself.
+    """
     folder = SCENARIO_DIR.said(config)
-    if not folder.value:
+    named = config.args_source is pytest.Config.ArgsSource.ARGS
+    if not folder.value or (named and folder.by != SCENARIO_DIR.flag):
         return
-    is_asked_for, named = folder.by == SCENARIO_DIR.flag, config.args_source is pytest.Config.ArgsSource.ARGS
-    if is_asked_for and not named:
-        config.args[:] = [folder.value]
-    elif is_asked_for or not named:
+    path = Path(folder.value).resolve()
+    passed_over = config.getini("norecursedirs")
+    if not named and any(fnmatch.fnmatch(each, pattern) for each in _below(path, config) for pattern in passed_over):
+        raise pytest.UsageError(
+            f"{folder.by}: pytest does not look into {folder.value} of itself: say pytest {folder.value}"
+            f" {SCENARIO_DIR.flag} {folder.value}"
+        )
+    if all(Path(each).resolve() != path for each in config.args):
         config.args.append(folder.value)
+
+
+def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
+    root = config.rootpath.resolve()
+    return path.relative_to(root).parts if path.is_relative_to(root) else ()
 
 
 def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
@@ -44,10 +59,11 @@ def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
 def _is_scenario(path: Path) -> bool:
     """A rig or a device beside it is none."""
     from harness import config
+    from harness.devices import KINDS
     from harness.errors import AnalogrigError
 
     with contextlib.suppress(AnalogrigError):
-        return "kind" not in config.read_toml(path)
+        return config.read_toml(path).get("kind", "scenario") not in {*KINDS, *RIG_KINDS}
     return True
 
 
@@ -82,13 +98,25 @@ class ScenarioItem(pytest.Item):
             raise ScenarioFailed(finding.why)
 
     def _found(self, play: Player, scenario: Scenario) -> Finding:
+        import harness.played
+        import harness.properties.experiments  # noqa: F401 - each makes known what a file can state
+        from harness.experiment import judged
         from harness.scenario import DEFAULT_SEED
-        from harness.statement import judged
 
         if scenario.statement is None:
             return play(scenario).passes()
         seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
         return judged(scenario.statement, play, scenario, seed, str(self.path))
+
+    def equipment(self) -> tuple[str, str]:
+        """Names of rig and device; empty where the file cannot be read."""
+        from harness.errors import AnalogrigError
+        from harness.scenario import Scenario
+
+        with contextlib.suppress(AnalogrigError):
+            scenario = Scenario.load(str(self.path))
+            return self._rig(scenario), self._device(scenario)
+        return "", ""
 
     def _rig(self, scenario: Scenario) -> str:
         given = RIG.given(self.config)

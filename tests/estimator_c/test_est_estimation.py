@@ -208,6 +208,7 @@ def test_configuration_out_of_range_is_refused(estimator: Estimator, changes: di
     "changes",
     [
         {"na": 1, "c": (-0.9, 0.0)},
+        {"na": 1, "c": (-0.9, 9.0)},
         {"nb": 1},
         {"nk": 1},
         {"nb": 2, "nc": 1},

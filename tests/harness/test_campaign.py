@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -650,6 +651,8 @@ def test_file_of_somebody_else_in_the_place_of_the_journal_is_left_alone(tmp_pat
         ("out.json", "out.html", "out.html: is no page of a campaign"),
         ("out.html", "other", "the page of the results is to be called so"),
         ("out.json", "out.json", "out.json: not the results of a campaign"),
+        ("", "other", "is no file that results could be written to"),
+        ("/dev/full", "other", "--out /dev/full: is no file that results could be written to"),
     ],
 )
 def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
@@ -661,6 +664,17 @@ def test_file_of_somebody_else_in_the_place_of_results_or_page_is_left_alone(
     assert said in capsys.readouterr().err
     assert (tmp_path / standing).read_text() == "my own"
     assert not journal_of(tmp_path / out).exists()
+
+
+@pytest.mark.parametrize("entry", [{"chunk": [0, 0]}, {"rows": []}, {"chunk": [0, 0], "rows": [{"seed": 0}]}])
+def test_line_of_a_journal_that_no_campaign_writes_is_one_line(tmp_path: Path, entry: dict[str, object]) -> None:
+    plan, path = planned(tmp_path), journal_of(tmp_path / "out.json")
+    with Journal(path, plan):
+        pass
+    text = json.dumps(entry).encode()
+    path.write_bytes(path.read_bytes() + b"%08x %s\n" % (zlib.crc32(text), text))
+    with pytest.raises(RecordingError, match=r"out\.json\.journal: a line that no campaign writes"):
+        Journal(path, plan)
 
 
 def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Path) -> None:

@@ -266,6 +266,22 @@ def test_cells_of_one_seed_are_one_observation() -> None:
     assert (latency.seeds, latency.p, latency.word) == (3, 0.25, "no difference shown")
 
 
+def test_build_that_loses_its_estimates_is_worse() -> None:
+    good, bad = ([observed(seed, 5) for seed in range(20)] for _ in "ab")
+    for _, trial in bad:
+        trial["errors"] = []
+    words = {each.quantity: each.word for each in compare(good, bad).differences}
+    assert {words[f"error of {name}"] for name in "MBK"} == {"worse"}
+
+
+def test_fewest_seeds_are_those_with_which_something_could_be_called_worse() -> None:
+    """Every seed worse in latency, in nothing else: 2 of 2^k ways, times the number of quantities."""
+    for seeds, worse in ((10, False), (11, True)):
+        found = compare([observed(seed, 4) for seed in range(seeds)], [observed(seed, 9) for seed in range(seeds)])
+        assert len(found.differences) == 6
+        assert (found.least_seeds, found.worse) == (11, worse)
+
+
 def test_one_in_many_quantities_is_not_called_different_by_chance() -> None:
     """Two equal sides, 200 times: a wrong word at most as often as alpha says, with all six quantities asked at once.
 
@@ -322,7 +338,9 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for seed in range(2):
             Bench(rig, dut).play(scenario, seed).save(tmp_path / "a" / str(seed) / "run.npz")
-    assert [(key[1], key[2]) for key, _ in load(tmp_path / "a").trials] == [("emulator", 0), ("emulator", 1)]
+    played = [key for key, _ in load(tmp_path / "a").trials]
+    assert [key[2] for key in played] == [0, 1]
+    assert played[0][:2] == played[1][:2]
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "a" / "0" / "run.npz"), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["identical"] == [1, 1]
@@ -334,7 +352,7 @@ def test_folders_of_recordings_are_compared(tmp_path: Path, capsys: pytest.Captu
 
 CAMPAIGN = """
 name = "mine"
-trials = 3
+trials = 12
 samples = 700
 change_at = 500
 devices = [DEVICES]
@@ -367,11 +385,11 @@ def own_devices(tmp_path: Path) -> list[str]:
     ("change", "named"),
     [
         (("[0.8, 0.9]", "[0.7, 0.9]"), "grid.stiffness_factor[0] is 0.8 in A and 0.7 in B"),
-        (("trials = 3", "trials = 4"), "trials is 3 in A and 4 in B"),
-        (("trials = 3", "trials = 3\nfirst_seed = 9"), "first_seed is 0 in A and 9 in B"),
+        (("trials = 12", "trials = 13"), "trials is 12 in A and 13 in B"),
+        (("trials = 12", "trials = 12\nfirst_seed = 9"), "first_seed is 0 in A and 9 in B"),
         (("samples = 700", "samples = 701"), "scenario.samples is 700 in A and 701 in B"),
         (
-            ("trials = 3", "trials = 3\nrigs = ['emulator-skewed']"),
+            ("trials = 12", "trials = 12\nrigs = ['emulator-skewed']"),
             "rigs[0].card.model is 'ideal' in A and 'skewed' in B",
         ),
         (("stiffness_factor", "noise_lsb = [1.5]\nstiffness_factor"), "grid.noise_lsb is [] in A and [1.5] in B"),
@@ -394,13 +412,13 @@ def test_campaigns_that_differ_in_device_name_and_chunk_are_compared(
 ) -> None:
     a = campaign(tmp_path, "a", ("DEVICES", repr(own_devices[0])))
     b = campaign(
-        tmp_path, "b", ("DEVICES", repr(own_devices[1])), ("mine", "other"), ("trials = 3", "trials = 3\nchunk = 1")
+        tmp_path, "b", ("DEVICES", repr(own_devices[1])), ("mine", "other"), ("trials = 12", "trials = 12\nchunk = 1")
     )
     capsys.readouterr()
     assert main(["compare", a, b, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said["trials"] == [6, 6]
-    assert said["identical"][1] == 6
+    assert said["trials"] == [24, 24]
+    assert said["identical"][1] == 24
 
 
 def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own_devices: list[str]) -> None:
@@ -408,8 +426,32 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
     a = campaign(tmp_path, "a", ("DEVICES", f"{keen!r}, {calm!r}"))
     b = campaign(tmp_path, "b", ("DEVICES", f"{calm!r}, {keen!r}"))
     found = compare(*matched(load(Path(a)), load(Path(b))))
-    assert found.identical == (12, 12)
+    assert found.identical == (48, 48)
     assert not any(each.shown for each in found.differences)
+
+
+def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    healthy = Scenario.load("healthy")
+    scenario = dataclasses.replace(healthy, samples=700, tweaks=(Tweak(400, stiffness_n_per_m=20000.0),))
+    with open_rig("emulator") as rig:
+        for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
+            with open_dut(dut, exchange="block") as device:
+                Bench(rig, device).play(scenario, 0).save(tmp_path / name / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 3
+    assert "INCONCLUSIVE: too few seeds (1) to show anything at alpha 0.01: at least" in capsys.readouterr().err
+
+
+def test_rigs_of_one_name_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=700)
+    for folder, noise_lsb in (("a", 0.2), ("b", 6.0)):
+        (tmp_path / folder).mkdir()
+        rig_file = tmp_path / folder / "bench.toml"
+        shipped = Path("fixtures/rigs/emulator.toml").read_text()
+        rig_file.write_text(shipped.replace("noise_lsb = 1.0", f"noise_lsb = {noise_lsb}"))
+        with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:
+            Bench(rig, dut).play(scenario, 0).save(tmp_path / folder / "run.npz")
+    assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    assert "played nothing in common: rig.card.noise_lsb is 0.2 in A and 6.0 in B" in capsys.readouterr().err
 
 
 def test_two_recordings_of_one_play_on_one_side_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,3 +103,21 @@ def test_run_in_which_no_alarm_could_come_is_inconclusive(estimator: dict[str, o
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons == (f"no alarm could come in any of 600 samples: {why}",)
     assert judge(made()).outcome == "passed"
+
+
+@pytest.mark.parametrize("lost", ["theta", "innovation", "statistic"])
+def test_estimate_that_is_no_number_is_no_evidence(lost: str) -> None:
+    run = made()
+    array = getattr(run, lost).copy()
+    array[400:] = np.nan
+    broken = dataclasses.replace(run, **{lost: array})
+    assert exposure(broken).armed == exposure(run).armed - 200
+    assert judge(broken).reasons == ("in 200 of 600 samples what the device estimated was no number",)
+    assert judge(broken).outcome == "inconclusive"
+
+
+def test_noise_of_the_card_is_no_edge_whatever_the_device_takes_for_one() -> None:
+    """2000 samples of a force that stands still but for noise of 1 LSB, to a device for which 1 code is an edge."""
+    force_n = 1400.0 + np.random.default_rng(4).normal(0.0, 2940.0 / 4096, 2000)
+    run = made_run(force_n, [(0, FRONT)], estimator={**ESTIMATOR, "edge_codes": 1.0, "idle_n": 1000})
+    assert exposure(run).armed == 0

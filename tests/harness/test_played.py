@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -26,3 +28,24 @@ def test_nothing_holds_of_a_play_that_is_not_valid(samples: int) -> None:
     ]
     assert not any(findings)
     assert all(finding.why.startswith("INCONCLUSIVE: ") and "the device died" in finding.why for finding in findings)
+
+
+def test_estimates_that_are_no_numbers_follow_nothing() -> None:
+    run = made_run(np.zeros(4), [(0, FRONT)], theta=np.full((4, 6), np.nan))
+    assert not Played(run).follows(np.zeros((4, 6)), 1.0)
+    assert Played(run).follows(np.full((4, 6), np.nan), 1.0), "a reference that says nothing"
+
+
+@pytest.mark.parametrize("within", [math.nan, math.inf])
+def test_limit_that_is_no_finite_number_is_refused(within: float) -> None:
+    played = Played(made_run(np.zeros(400), [(0, FRONT)]))
+    with pytest.raises(ValueError, match="estimates: a limit must be a finite number"):
+        played.estimates(within)
+
+
+def test_rate_counts_the_same_play_once_and_says_how_many_samples_it_takes() -> None:
+    once = Played(made_run(np.zeros(1000), [(0, FRONT)]))
+    again = Played(made_run(np.zeros(1000), [(0, FRONT)]))
+    finding = rate_below(1e-5, [once, again], confidence=0.999)
+    assert finding.why.startswith(rate_below(1e-5, [once], confidence=0.999).why)
+    assert finding.why.endswith("allowed 1e-05: with so many alarms that takes 690773 samples")

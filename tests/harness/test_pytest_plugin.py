@@ -23,9 +23,9 @@ from harness.bench import Bench
 from harness.devices import host_child, of_scenario
 from harness.dut import open_dut
 from harness.errors import ConfigurationError
+from harness.experiment import Play, judged
 from harness.rigs.description import open_rig
-from harness.scenario import Scenario
-from harness.statement import Play, Statement, judged
+from harness.scenario import Scenario, Statement
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 
@@ -294,6 +294,18 @@ def test_folder_of_scenarios_is_a_suite(user: pytest.Pytester) -> None:
     assert list(user.path.glob("build/runs/*impatient*/scenario.toml"))
 
 
+def test_folder_of_scenarios_comes_on_top_of_the_tests_and_a_stray_kind_is_told(user: pytest.Pytester) -> None:
+    folder = user.mkdir("suite")
+    (folder / "stray.toml").write_text('kind = "scenario"\n' + SHORT.format(head="", expect=""))
+    user.makepyfile("def test_own():\n    pass\n")
+    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*stray.toml: unknown key 'kind' *"])
+    refused(user, "--scenario-dir", "").stderr.fnmatch_lines(["ERROR: --scenario-dir: is empty"])
+    user.mkdir("build")
+    refused(user, "--scenario-dir", "build").stderr.fnmatch_lines(["*pytest does not look into build of itself: *"])
+
+
 def test_inconclusive_play_fails_the_test_with_its_reason(user: pytest.Pytester) -> None:
     user.path.joinpath("deaf.toml").write_text('kind = "inproc"\nwire_faults = "hang@from:150"\n')
     user.makepyfile(PLAYS.format(assertion="pass"))
@@ -352,6 +364,16 @@ def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pyteste
     assert len({line for line in result.outlines if re.fullmatch(r"<gw\d>", line)}) == 1
 
 
+def test_scenario_files_for_a_device_of_which_there_is_one_go_to_one_worker(user: pytest.Pytester) -> None:
+    folder = user.mkdir("suite")
+    for name in "abcd":
+        (folder / f"{name}.toml").write_text(SHORT.format(head="", expect=""))
+    with board() as port:
+        result = user.runpytest_subprocess("-n", "2", "--scenario-dir", "suite", "--dut", f"serial:{port}", "-v")
+    result.assert_outcomes(passed=4)
+    assert len(set(re.findall(r"\[(gw[01])\].* PASSED", result.stdout.str()))) == 1
+
+
 def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
     user.makepyfile(SHARED)
     result = refused(user, "-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
@@ -387,15 +409,15 @@ DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
 
 def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     """What an earlier session has left, as a suite."""
-    return run(user, "--scenario-dir", "build/runs", *arguments)
+    return run(user, "build/runs", "--scenario-dir", "build/runs", *arguments)
 
 
 def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(user: pytest.Pytester) -> None:
-    user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 40.0\n')
+    user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 400.0\n')
     user.makepyfile(DETECTS_SOON.format(within=1.5))
     first = run(user, "--dut", "deafer.toml")
     first.assert_outcomes(failed=1)
-    first.stdout.fnmatch_lines(["judge it again with: pytest --scenario-dir *"])
+    first.stdout.fnmatch_lines(["judge it again with: pytest build/runs/* --scenario-dir build/runs/*"])
     (left,) = user.path.glob("build/runs/*/scenario.toml")
     statement = tomllib.loads(left.read_text())["statement"]
     assert statement["name"] == "detects"
