@@ -16,8 +16,7 @@ from emulator.excitation import Excitation
 from harness import config
 from harness.errors import ConfigurationError
 from harness.rigs.description import open_rig
-from harness.scenario import Expectations, PlantChoice, Scenario, Tweak
-from harness.statement import Statement
+from harness.scenario import Expectations, PlantChoice, Scenario, Statement, Tweak
 
 SCENARIO = """
 samples = 100
