@@ -63,8 +63,10 @@ __all__ = [
     "Trigger",
     "brief",
     "index_up_to",
+    "is_number",
     "pack",
     "unpack",
+    "unpack_any",
 ]
 
 BLOCK_SAMPLES = 14
@@ -243,8 +245,6 @@ class _Packing(NamedTuple):
     pack: Callable[..., bytes]
     unpack: Callable[[bytes, int], tuple[Any, ...]]
     make: Callable[[tuple[Any, ...]], Message]
-    has_float: bool = False
-    """It is the last field."""
 
 
 def pack(message: Message) -> bytes:
@@ -257,13 +257,23 @@ def pack(message: Message) -> bytes:
 
 
 def unpack(packet: bytes) -> Message | None:
-    """The message in a packet; None if the catalogue has no such message of that length, or of no such numbers: what no
-    device computes is damaged."""
+    """As ``unpack_any``, but None also if its value is no number: what no device should compute is damaged."""
+    message = unpack_any(packet)
+    return message if message is not None and is_number(message) else None
+
+
+def unpack_any(packet: bytes) -> Message | None:
+    """The message in a packet, whatever its value; None if the catalogue has no such message of that length."""
     packing = _BY_IDENTIFIER.get(packet[0]) if packet else None
     if packing is None or len(packet) != packing.length:
         return None
-    values = packing.unpack(packet, 1)
-    return packing.make(values) if not packing.has_float or isfinite(values[-1]) else None
+    return packing.make(packing.unpack(packet, 1))
+
+
+def is_number(message: Message) -> bool:
+    """Whether its value is a number, neither NaN nor infinite; also true of a message without such a value."""
+    value = message[-1]
+    return not isinstance(value, float) or isfinite(value)
 
 
 def brief(message: Message) -> str:
@@ -292,12 +302,9 @@ def _packing(message_type: Any) -> _Packing:
     if message_type._fields != layout.fields:
         raise TypeError(f"{message_type.__name__} has the fields {message_type._fields}, the catalogue {layout.fields}")
     struct = Struct(layout.format)
-    has_float = "f" in layout.format
-    if has_float and not layout.format.endswith("f"):
+    if "f" in layout.format[:-1]:
         raise TypeError(f"{message_type.__name__} has a float that is not its last field")
-    return _Packing(
-        bytes([layout.id]), 1 + layout.length, struct.pack, struct.unpack_from, message_type._make, has_float
-    )
+    return _Packing(bytes([layout.id]), 1 + layout.length, struct.pack, struct.unpack_from, message_type._make)
 
 
 def _block_packing(layout: Layout) -> _Packing:

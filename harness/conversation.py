@@ -32,6 +32,8 @@ class Conversation:
         self._heard: dict[int, Message] = {}
         """The last message with each number."""
         self._last: Message | None = None
+        self._damaged_before_n = 0
+        """Frames, until the last run began."""
 
     @property
     def last(self) -> str:
@@ -48,6 +50,10 @@ class Conversation:
         """Whatever number the device's next message has, it is the right one."""
         self._expected = None
         self._heard.clear()
+
+    def begin_run(self) -> None:
+        """What was damaged before does not explain what is lost from now on."""
+        self._damaged_before_n = self.link.counters["frames_dropped"]
 
     def next_seq(self) -> int:
         """The number of the next message to the device."""
@@ -81,9 +87,10 @@ class Conversation:
                 return message
             if (self._expected - message.seq) % SEQS > LATEST:
                 lost = (message.seq - self._expected) % SEQS
+                damaged = self.link.counters["frames_dropped"] - self._damaged_before_n
                 raise LinkError(
                     f"device {self.name}: {lost} messages were lost between {self.last} and {brief(message)}, or"
-                    f" somebody else speaks as the device ({self.link.counters['frames_dropped']} frames were damaged)"
+                    f" somebody else speaks as the device ({damaged} frames were damaged in this run)"
                 )
             before = self._heard.get(message.seq)
             if before is not None and pack(before) != pack(message):

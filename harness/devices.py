@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import os
 import re
 import secrets
@@ -36,6 +37,9 @@ FIRMWARE = Path(__file__).parents[1] / "build" / "firmware"
 
 QEMU = "qemu-system-arm"
 _NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
+
+_ELF = b"\x7fELF"
+"""So begin libraries, programs and firmware."""
 
 DEFAULT_TIMEOUT_S = 2.0
 DEFAULT_WINDOW = 255
@@ -599,8 +603,24 @@ def describe(name: str) -> DeviceDescription:
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
         return KINDS[kind].named(name, name[len(kind) :].removeprefix(":"))
+    _check_not_compiled(name)
     path = config.locate("devices", name)
     return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
+
+
+def _check_not_compiled(name: str) -> None:
+    """:raises ConfigurationError: it is what a device runs, and no description of one."""
+    path = Path(name)
+    try:
+        with path.open("rb") if path.is_file() else io.BytesIO() as file:
+            is_compiled = file.read(len(_ELF)) == _ELF
+    except (OSError, ValueError):  # it is for those who read it to say
+        is_compiled = False
+    if is_compiled or path.suffix == ".so":
+        raise ConfigurationError(
+            f"{name}: is compiled, and describes no device: say inproc:{name} if it is a library of your own,"
+            f" qemu-m4:{name} if it is firmware"
+        )
 
 
 def of_scenario(filed: str, given: str, otherwise: str) -> str:

@@ -205,6 +205,7 @@ class Dut:
         """
         if pace is not None:
             pace.restart()
+        self._talk.begin_run()
         self._counted = self.status()
         self._run = (self._run + 1) % RUNS
         self._control(Command.START, self._run)

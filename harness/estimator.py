@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from harness.errors import ConfigurationError, LinkError
+from harness.errors import ConfigurationError
 from harness.estimator_config import EstimatorConfig
-from harness.links.wire import LIBRARY
+from harness.links.wire import LIBRARY, load_library
 
 
 class StepStatus(enum.IntEnum):
@@ -56,11 +56,12 @@ class _Counters(ctypes.Structure):
     _fields_ = list(_COUNTERS.items())
 
 
+_FUNCTIONS = ("size", "init", "set", "start", "run", "theta_count", "counters")
+"""Of estimator_c/ports/library/library.h."""
+
+
 def _loaded(library: Path) -> ctypes.CDLL:
-    try:
-        c = ctypes.CDLL(str(library))
-    except OSError as error:
-        raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
+    c = load_library(library, (f"library_{does}" for does in _FUNCTIONS))
     c.library_size.restype = c.library_run.restype = ctypes.c_size_t
     c.library_run.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *(ctypes.c_void_p,) * 3, ctypes.POINTER(_Out)]
     c.library_start.restype = ctypes.c_bool
@@ -75,7 +76,7 @@ class Estimator:
     def __init__(self, config: EstimatorConfig | None = None, *, library: Path = LIBRARY) -> None:
         """Ready for the first sample.
 
-        :raises ConfigurationError: the estimator refuses the configuration.
+        :raises ConfigurationError: the estimator refuses the configuration, or a user's own library is none.
         :raises LinkError: the library was not built.
         """
         self._c = _loaded(library)

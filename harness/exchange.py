@@ -34,6 +34,7 @@ from harness.catalogue import (
     Stepped,
     SteppedFlag,
     index_up_to,
+    is_number,
 )
 from harness.conversation import Conversation
 from harness.errors import DeviceError, LinkClosed, LinkError, LinkTimeout
@@ -284,6 +285,8 @@ class Exchange:
 
     def _accept(self, message: Message) -> None:
         """An answer about the oldest sample, or about one whose predecessors were lost."""
+        if not is_number(message):
+            raise self._no_number(message)
         if (
             isinstance(message, Estimate)
             and message.sample_index == self._wire_index
@@ -373,6 +376,17 @@ class Exchange:
         if self._silences > MOST_SILENCES:
             raise LinkTimeout(f"{heard}; it is alive, but messages to it were lost {self._silences} times in this run")
         self._lose(len(self._pending))
+
+    def _no_number(self, message: Message) -> DeviceError:
+        """What the device has computed, and of which sample."""
+        wire_index = getattr(message, "sample_index", self._answered % INDICES)
+        index = index_up_to(sum(self._pending[-1]) - 1 if self._pending else self._answered, wire_index)
+        names = {int(element): element.name for element in Element}
+        what = names.get(message.element) if isinstance(message, Estimate) else message._fields[-1]
+        return DeviceError(
+            f"device {self._talk.name}: its {type(message).__name__} holds {what} = {message[-1]} for sample {index},"
+            " which is no number"
+        )
 
     def _wrong(self, message: Message) -> DeviceError:
         due = self._elements[self._at]

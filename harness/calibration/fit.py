@@ -37,6 +37,9 @@ _UNMEASURED_RANGE_V = (-12.5, 12.5)
 
 _ALIKE, _UNSEEN = 0.95, 0.8
 
+_MOST_DEVIATIONS = 5.0
+"""Of a chi-square that is left to chance, in its standard deviations."""
+
 _FINE_SKEW = 1e-3
 """Of a sample period: closer than this the twin's skew need not be."""
 
@@ -78,6 +81,16 @@ class Calibration:
     def chi_square(self) -> float:
         """Of the kind that the twin is of."""
         return self.chi_squares[self.twin.computer.components, self.twin.computer.pots]
+
+    @property
+    def is_least(self) -> bool:
+        """Whether no other kind has a smaller chi-square; see ``_likeliest``."""
+        return self.chi_square <= min(self.chi_squares.values())
+
+    @property
+    def explains_all(self) -> bool:
+        """Whether what is left of the recordings is no more than their noise."""
+        return self.chi_square <= self.freedom + _MOST_DEVIATIONS * math.sqrt(2.0 * self.freedom)
 
     @property
     def alike(self) -> list[tuple[str, str, float]]:
@@ -160,10 +173,10 @@ def _likeliest(fits: Mapping[tuple[Stock, Pots], _Fit]) -> _Fit:
     least = fits[kinds[0]]
     simple = next((fits[kind] for kind in kinds if kind[1] == "coefficient"), least)
     excess = (simple.chi_square - least.chi_square) / max(1.0, least.chi_square / least.freedom)
-    return least if excess > _OUT_OF_THE_QUESTION else simple
+    return least if excess > OUT_OF_THE_QUESTION else simple
 
 
-_OUT_OF_THE_QUESTION = 30.0
+OUT_OF_THE_QUESTION = 30.0
 """Three unknowns more gain this by chance with a probability of 1e-6."""
 
 

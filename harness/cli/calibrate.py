@@ -39,10 +39,12 @@ def add(commands: Any) -> None:
     command.add_argument(
         "--components",
         choices=("nominal", "polyester", "polypropylene"),
-        help="its capacitors (default: the likeliest)",
+        help="its capacitors (default: those that fit best)",
     )
     command.add_argument(
-        "--pots", choices=("coefficient", "dial"), help="what its pots are set by (default: the likelier)"
+        "--pots",
+        choices=("coefficient", "dial"),
+        help="what its pots are set by (default: coefficient, unless dial fits better)",
     )
     command.add_argument(
         "--seed", type=seed, default=0, metavar="N", help="of what is drawn of an emulated rig (%(default)d)"
@@ -117,15 +119,37 @@ def _said(found: Calibration, check_lsb: float) -> list[str]:
         for (stock, pots), chi_square in found.chi_squares.items()
         if (stock, pots) != (computer.components, computer.pots)
     ]
-    lines = [f"likeliest: {computer.components} capacitors, pots set by {computer.pots}"]
+    lines = [f"kept: {computer.components} capacitors, pots set by {computer.pots}: {_why_kept(found)}"]
     lines += [f"chi-square of others: {'; '.join(others)}"] if others else []
     lines += [f"hardly told apart: {a} and {b} (correlation {c:+.2f})" for a, b, c in found.alike]
     lines += [f"known no better than by the datasheet: {', '.join(found.unseen)}"] if found.unseen else []
     return [
         *lines,
         f"recordings: within {found.residual_lsb:.2f} LSB rms, chi-square {found.chi_square:.0f} of {found.freedom}",
+        *_caveats(found),
         f"on a scenario that was not fitted: within {check_lsb:.2f} LSB rms",
     ]
+
+
+def _why_kept(found: Calibration) -> str:
+    from harness.calibration.fit import OUT_OF_THE_QUESTION
+
+    if found.is_least:
+        return "of those tried the least chi-square"
+    return (
+        "the least chi-square but for dials, which have three unknowns more and gain less than"
+        f" {OUT_OF_THE_QUESTION:g} times what is left per degree of freedom"
+    )
+
+
+def _caveats(found: Calibration) -> list[str]:
+    """Why the twin may not be all that the rig is; a line each."""
+    if found.explains_all:
+        return []
+    deviation, wider = (2.0 * found.freedom) ** 0.5, (found.chi_square / found.freedom) ** 0.5
+    left = f"chi-square {found.chi_square:.0f} where noise leaves {found.freedom} +- {deviation:.0f}"
+    why = f"what no such machine does (nonlinearity, drift); the standard errors are {wider:.1f} times as wide for it"
+    return [f"caveat: {left}: the rig does {why}"]
 
 
 def _toml(found: Calibration, rig: str, program: str, check_lsb: float) -> str:
@@ -159,6 +183,7 @@ def _as_json(found: Calibration, check_lsb: float, arguments: argparse.Namespace
         ],
         "chi_square": found.chi_square,
         "freedom": found.freedom,
+        "caveats": _caveats(found),
         "tried": [
             {"components": stock, "pots": pots, "chi_square": value}
             for (stock, pots), value in found.chi_squares.items()

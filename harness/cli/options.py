@@ -77,7 +77,7 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
         "--dut",
         default=default,
         metavar="NAME",
-        help="shipped name, .toml file, inproc, qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
+        help="shipped name, .toml file, inproc[:LIBRARY], qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
         f" can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
     )
     command.add_argument(

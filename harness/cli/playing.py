@@ -110,7 +110,7 @@ def play(
 
 
 def conclude(run: Run, arguments: argparse.Namespace) -> int:
-    """Judge a run, show the verdict, keep both, and return the exit status."""
+    """Judge a run, keep it and its report, show the verdict to whoever listens, and return the exit status."""
     from harness.bench import INTERRUPTED_BY_USER
     from harness.errors import RecordingError
     from harness.report import write_report
@@ -118,15 +118,18 @@ def conclude(run: Run, arguments: argparse.Namespace) -> int:
     from harness.verdict import judge
 
     verdict = judge(run)
+    try:
+        run.save(arguments.out / RUN_FILE)
+        write_report(run, verdict, arguments.out / REPORT_FILE)
+        unkept = None
+    except RecordingError as error:
+        unkept = error
     if arguments.json:
         show(json.dumps(_as_json(run, verdict, arguments.out), allow_nan=False))
     else:
         show(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
-    try:
-        run.save(arguments.out / RUN_FILE)
-        write_report(run, verdict, arguments.out / REPORT_FILE)
-    except RecordingError as error:
-        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+    if unkept is not None:
+        return complain(f"INCONCLUSIVE: {unkept}", INCONCLUSIVE)
     if not verdict.valid:
         complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
     return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else STATUS[verdict.outcome]

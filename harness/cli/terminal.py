@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
     from harness.bench import Progress
@@ -22,17 +22,27 @@ _PROGRESS_S = 1.0
 
 
 def complain(message: str, status: int) -> int:
-    print(f"analogrig: {message}", file=sys.stderr)
+    """One line on standard error; returns ``status``."""
+    _print(f"analogrig: {message}\n", sys.stderr, 2)
     return status
 
 
 def show(text: str) -> None:
     """To standard output. If nobody listens any more, that is no reason to change what the command has found."""
+    error = _print(f"{text}\n", sys.stdout, 1)
+    if error is not None:
+        _print(f"analogrig: standard output: {error.strerror}\n", sys.stderr, 2)
+
+
+def _print(text: str, stream: TextIO, number: int) -> OSError | None:
+    """Returns why it could not be; from then on the stream swallows what it is given, also what it still holds."""
     try:
-        print(text, flush=True)
+        stream.write(text)
+        stream.flush()
     except OSError as error:
-        print(f"analogrig: standard output: {error.strerror}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        return error
+    return None
 
 
 def open_standard_streams() -> None:
@@ -58,7 +68,7 @@ class ProgressLine:
             return
         self._next_s = self._clock() + _PROGRESS_S
         end = "\n" if is_last else ""
-        print(f"\r{text:<{self._width}}", end=end, file=sys.stderr, flush=True)
+        _print(f"\r{text:<{self._width}}{end}", sys.stderr, 2)
         self._width = 0 if is_last else len(text)
 
 

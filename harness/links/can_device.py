@@ -69,7 +69,7 @@ class LibraryCanDevice:
 
         :raises LinkError: the device library was not built.
         """
-        c = load_library(library)
+        c = load_library(library, ("can_device_size", "can_device_init", "can_device_run"))
         c.can_device_run.restype = Progress
         c.can_device_size.restype = ctypes.c_size_t
         self._run, self._init = c.can_device_run, c.can_device_init

@@ -10,7 +10,7 @@ import copy
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-from harness.catalogue import LAYOUTS, Message, pack, unpack
+from harness.catalogue import LAYOUTS, Message, pack, unpack_any
 from harness.errors import LinkError
 from harness.links.bus_load import CLASSIC_BYTES
 from harness.links.can_bus import CanBus
@@ -122,7 +122,7 @@ class CanLink:
             self._note_echo(frame)
         else:
             packet = bytes((frame.arbitration_id,)) + frame.data
-            message = unpack(packet) if self.carries_blocks or not frame.is_fd else None
+            message = unpack_any(packet) if self.carries_blocks or not frame.is_fd else None
             self._counted["frames_dropped"] += message is None
             return message
         return None

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
-from harness.catalogue import Message, pack, unpack
+from harness.catalogue import Message, pack, unpack_any
 from harness.links import frame
 from harness.links.line import Line, SerialLine
 from harness.links.wire import Clock, Wire
@@ -120,7 +120,7 @@ class FramedLink:
     def _enter(self, received: bytes) -> None:
         self._time(received)
         for packet in self._decoder.feed(received):
-            message = unpack(packet)
+            message = unpack_any(packet)
             if message is not None:
                 self._messages.append(message)
             self._no_messages_n += message is None

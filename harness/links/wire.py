@@ -8,7 +8,7 @@ import math
 import os
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -208,12 +208,26 @@ class Identity(ctypes.Structure):
     )
 
 
-def load_library(library: Path) -> ctypes.CDLL:
-    """:raises LinkError: it was not built."""
+def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
+    """The project's library of the device, or a user's own, with these functions in it.
+
+    :raises LinkError: the project's was not built.
+    :raises ConfigurationError: the user's cannot be loaded, or lacks one of them.
+    """
     try:
-        return ctypes.CDLL(str(library))
+        c = ctypes.CDLL(str(library))
     except OSError as error:
-        raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
+        if library == LIBRARY:
+            raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
+        reason = str(error).removeprefix(f"{library}: ")
+        raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
+    lacking = [function for function in functions if not hasattr(c, function)]
+    if lacking:
+        raise ConfigurationError(
+            f"{library}: is no library of a device: it lacks {', '.join(lacking)}"
+            ' (harness/README.md, "Your own estimator", says what to compile)'
+        )
+    return c
 
 
 class MemoryWire:
@@ -233,8 +247,9 @@ class MemoryWire:
         """Boot a device; another ``catalogue_hash`` makes it a stranger.
 
         :raises LinkError: the device library was not built.
+        :raises ConfigurationError: that of a user is none.
         """
-        c = load_library(library)
+        c = load_library(library, ("serial_device_size", "serial_device_init", "serial_device_run"))
         c.serial_device_run.restype = Progress
         c.serial_device_size.restype = ctypes.c_size_t
         self._run = c.serial_device_run

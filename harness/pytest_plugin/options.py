@@ -108,7 +108,9 @@ def _no_profile(value: str) -> str:
 
 
 RIG = Option("rig", "emulator", "what plays the scenarios: a shipped name, a .toml file, recording:FILE")
-DUT = Option("dut", "host", "the device under test: host, inproc, qemu-m4[:ELF], serial:URL, can:..., a .toml file")
+DUT = Option(
+    "dut", "host", "the device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml"
+)
 SCENARIO_DIR = Option("scenario_dir", "", "a folder of scenario files, each of which is a test", _no_folder)
 RUNS_DIR = Option("runs_dir", "build/runs", "where the recordings of tests that fail go", _not_to_be_a_folder)
 HIL_PROFILE = Option("hil_profile", "ci", f"how much the properties try: {', '.join(PROFILES)}", _no_profile)

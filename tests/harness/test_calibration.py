@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 from emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
 from harness import config
-from harness.calibration.fit import Stock, calibrate
+from harness.calibration.fit import Calibration, Pots, Stock, calibrate
 from harness.calibration.model import Model, _taken_late
 from harness.calibration.plan import check_scenario, scenarios
 from harness.calibration.recordings import (
@@ -28,11 +29,12 @@ from harness.calibration.recordings import (
     rounding,
 )
 from harness.cli import main
+from harness.cli.calibrate import _said
 from harness.errors import ConfigurationError, RigError
 from harness.rigs.description import open_rig
-from harness.rigs.emulator import ComputerDescription, EmulatorRig
+from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from harness.rigs.rig import Block, Hindsight, Performance
-from harness.run import MEASURED, Channel
+from harness.run import CHANNELS, MEASURED, Channel
 from harness.scenario import PlantChoice
 from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
 
@@ -258,6 +260,7 @@ def test_the_command_keeps_a_twin_that_opens_as_a_rig(
     assert said.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
     told = json.loads(said.out)
     assert told["check_lsb"] < 0.5
+    assert told["caveats"] == []
     gain = next(each for each in told["estimates"] if each["name"] == "force gain")
     assert abs(gain["value"] - 1e-3) < 4.5 * gain["standard_error"]
     with open_rig(str(out)) as twin:
@@ -266,13 +269,25 @@ def test_the_command_keeps_a_twin_that_opens_as_a_rig(
     assert "# force gain " in out.read_text()
 
 
+@pytest.mark.parametrize(
+    ("dial", "why"), [(400.0, "the least chi-square but for dials"), (600.0, "of those tried the least chi-square")]
+)
+def test_the_kind_that_is_kept_is_kept_with_its_reason(dial: float, why: str) -> None:
+    chi_squares: dict[tuple[Stock, Pots], float] = {("nominal", "coefficient"): 420.0, ("nominal", "dial"): dial}
+    card = CardDescription(range_v=dict.fromkeys(CHANNELS, (-10.0, 10.0)))
+    found = Calibration(EmulatorDescription(card=card), (), np.eye(0), 0.1, chi_squares, 514)
+    assert _said(found, 0.1)[0].startswith(f"kept: nominal capacitors, pots set by coefficient: {why}")
+
+
 def test_a_rig_that_is_not_like_its_twin_fails_and_nothing_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A stuck bit of 4 codes, which is an error of 0 to 4 LSB from level to level."""
     out = tmp_path / "twin.toml"
     assert ran(described(tmp_path, stuck_low=4), out) == 1
-    assert "no twin: more than 1 LSB" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "no twin: more than 1 LSB" in said
+    assert re.search(r"^caveat: chi-square \d+ where noise leaves \d+ \+- \d+: ", said, re.MULTILINE)
     assert not out.exists()
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,10 +12,11 @@ from typing import Literal
 
 import pytest
 
+from emulator.excitation import Excitation
 from harness import config
 from harness.errors import ConfigurationError
 from harness.rigs.description import open_rig
-from harness.scenario import Scenario
+from harness.scenario import Expectations, PlantChoice, Scenario, Statement, Tweak
 
 SCENARIO = """
 samples = 100
@@ -137,3 +141,13 @@ def test_rig_without_a_channel_is_refused(tmp_path: Path) -> None:
     path.write_text("[card.range_v]\nforce = [0.0, 10.0]\n")
     with pytest.raises(ConfigurationError, match="card: range_v must give the channels force, displ"):
         open_rig(str(path))
+
+
+def test_readme_has_every_key_of_a_scenario_file() -> None:
+    readme = (Path(__file__).parents[2] / "harness" / "README.md").read_text(encoding="utf-8")
+    shown = re.search(r"^## Scenario files\n\n```toml\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
+    assert shown is not None
+    Scenario.from_table(tomllib.loads(shown[1]), "README")
+    tables = (Scenario, Excitation, PlantChoice, Tweak, Expectations, Statement)
+    keys = {(table.__name__, each.name) for table in tables for each in dataclasses.fields(table)}
+    assert [key for key in sorted(keys) if not re.search(rf"\b{key[1]}\b", shown[1])] == []

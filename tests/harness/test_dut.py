@@ -6,10 +6,12 @@ import dataclasses
 import itertools
 import os
 import signal
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
+import can
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -34,8 +36,18 @@ from harness.catalogue import (
     SampleBlock,
     Stepped,
     SteppedFlag,
+    pack,
+    unpack_any,
 )
-from harness.devices import DeviceDescription, HostDevice, InprocDevice, SerialDevice, from_table, host_wire
+from harness.devices import (
+    DeviceDescription,
+    HostDevice,
+    InprocDevice,
+    SerialDevice,
+    describe,
+    from_table,
+    host_wire,
+)
 from harness.dut import Dut, Replies, connect, open_dut, reopen_dut
 from harness.errors import (
     CatalogueMismatch,
@@ -46,7 +58,11 @@ from harness.errors import (
     LinkError,
     LinkTimeout,
 )
+from harness.estimator import Estimator
 from harness.estimator_config import EstimatorConfig
+from harness.links import frame
+from harness.links.can_device import MemoryBus
+from harness.links.can_link import CanLink
 from harness.links.child import ChildWire
 from harness.links.link import CanListener, FramedLink, Link
 from harness.links.wire import MemoryWire, VirtualClock
@@ -285,7 +301,6 @@ class FaultyLink:
     """Passes messages through two functions, each of which may lose, change or repeat them."""
 
     name = "faulty"
-    counters: ClassVar[Mapping[str, int]] = {"frames_dropped": 0}
     trouble = ""
     line = None
     line_s = 0.0
@@ -298,6 +313,7 @@ class FaultyLink:
         self.to_device: Fault = lambda message: [message]
         self.from_device: Fault = lambda message: [message]
         self._waiting: list[Message] = []
+        self.counters: Mapping[str, int] = {"frames_dropped": 0}
 
     def write(self, sent: bytes) -> None:
         self.inner.wire.write(sent)
@@ -381,6 +397,50 @@ def test_first_and_last_samples_may_be_lost_too(line: FaultyLink, exchange: str)
     dut = started(line, exchange=exchange)
     line.to_device = lambda message: [] if getattr(message, "sample_index", None) in (0, last) else [message]
     assert_same_but_for_the_loss(feed(dut, 0, N), [*range(len(samples)), *range(last, N)])
+
+
+class NotANumber(MemoryWire):
+    """The wire of a device that computes NaN at one sample, in every run."""
+
+    def __init__(self, kind: type[Message], sample: int) -> None:
+        super().__init__(1)
+        self._kind, self._sample = kind, sample
+
+    def read(self, timeout_s: float) -> bytes:
+        packets = frame.FrameDecoder().feed(super().read(timeout_s))
+        return b"".join(frame.encode(pack(self._computed(unpack_any(packet)))) for packet in packets)
+
+    def _computed(self, message: Message | None) -> Message:
+        assert message is not None
+        is_it = isinstance(message, self._kind) and getattr(message, "sample_index", None) == self._sample
+        return type(message)._make((*message[:-1], np.nan)) if is_it else message
+
+
+@pytest.mark.parametrize(("kind", "what"), [(Estimate, "THETA_0"), (Stepped, "statistic")])
+@pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
+def test_number_that_is_none_is_said_to_be_the_devices(kind: type[Message], what: str, exchange: str) -> None:
+    dut = started(FramedLink(NotANumber(kind, 84)), exchange=exchange)
+    said = f"^device bob: its {kind.__name__} holds {what} = nan for sample 84, which is no number$"
+    for _ in range(2):
+        with pytest.raises(DeviceError, match=said):
+            feed(dut, 0, N)
+        dut.handshake()
+        dut.start()
+
+
+def test_number_that_is_none_is_seen_on_a_can_bus_too() -> None:
+    link = CanLink(MemoryBus(1))
+    packet = pack(Estimate(0, 1, 84, np.inf))
+    can_frame = can.Message(arbitration_id=packet[0], data=packet[1:], is_extended_id=False)
+    assert link._message(can_frame) == Estimate(0, 1, 84, np.inf)
+
+
+def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> None:
+    line.counters = {"frames_dropped": 6}
+    dut = started(line)
+    line.from_device = about(Estimate, 84, lose)
+    with pytest.raises(LinkError, match=r"1 messages were lost .*\(0 frames were damaged in this run\)$"):
+        feed(dut, 0, N)
 
 
 def test_loss_in_a_stream_costs_no_time(line: FaultyLink) -> None:
@@ -717,3 +777,39 @@ def test_description_is_plain_and_frozen() -> None:
     description = InprocDevice(name="bob")
     with pytest.raises(dataclasses.FrozenInstanceError):
         description.name = "eve"  # type: ignore[misc]
+
+
+# ---- a library of one's own
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shared library without anything of a device."""
+    library = tmp_path_factory.mktemp("library") / "stranger.so"
+    subprocess.run([os.environ.get("CC", "cc"), "-shared", "-x", "c", "/dev/null", "-o", library], check=True)
+    return library
+
+
+def test_own_library_without_a_device_is_refused_with_what_it_lacks(stranger: Path) -> None:
+    lacks = f"^{stranger}: is no library of a device: it lacks .*"
+    with pytest.raises(ConfigurationError, match=f"{lacks} serial_device_run "):
+        open_dut(f"inproc:{stranger}")
+    with pytest.raises(ConfigurationError, match=f"{lacks} library_run,"):
+        Estimator(library=stranger)
+
+
+def test_own_library_that_cannot_be_loaded_is_not_the_projects(tmp_path: Path) -> None:
+    for library in (tmp_path / "absent.so", Path(__file__)):
+        cannot = f"^{library}: cannot be loaded as a library of a device: "
+        with pytest.raises(ConfigurationError, match=cannot):
+            open_dut(f"inproc:{library}")
+        with pytest.raises(ConfigurationError, match=cannot):
+            Estimator(library=library)
+
+
+def test_library_is_not_read_as_a_description(stranger: Path) -> None:
+    unnamed = stranger.rename(stranger.with_suffix(""))
+    for name in (str(unnamed), "absent.so"):
+        with pytest.raises(ConfigurationError, match=f"^{name}: is compiled, .* say inproc:{name} if"):
+            describe(name)
+    unnamed.rename(stranger)

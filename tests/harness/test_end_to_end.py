@@ -348,6 +348,21 @@ def test_closed_pipe_does_not_turn_a_failed_verdict_into_success(tmp_path: Path)
     assert b"Traceback" not in done.stderr
 
 
+def test_run_whose_output_nobody_hears_is_kept_and_judged(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "harness.cli", "run", "--dut", "inproc", "--out", "kept"]
+    environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stdout=writer, stderr=writer, timeout=TIMEOUT_S, check=False
+    )
+    os.close(writer)
+    assert done.returncode == 0
+    run = Run.load(tmp_path / "kept" / "run.npz")
+    assert run.samples == run.conditions.samples_asked
+    assert (tmp_path / "kept" / "report.html").is_file()
+
+
 def test_recording_without_a_sample_is_named(tmp_path: Path) -> None:
     made_run(np.zeros(0), [(0, Plant(115.0, 3021.0, 24500.0))], samples_asked=10).save(tmp_path / "none.npz")
     assert "holds no samples" in refusal("replay", "none.npz", cwd=tmp_path)
