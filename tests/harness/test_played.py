@@ -33,7 +33,12 @@ def test_nothing_holds_of_a_play_that_is_not_valid(samples: int) -> None:
 def test_estimates_that_are_no_numbers_follow_nothing() -> None:
     run = made_run(np.zeros(4), [(0, FRONT)], theta=np.full((4, 6), np.nan))
     assert not Played(run).follows(np.zeros((4, 6)), 1.0)
-    assert Played(run).follows(np.full((4, 6), np.nan), 1.0), "a reference that says nothing"
+
+
+def test_reference_that_is_no_number_allows_any_estimate() -> None:
+    run = made_run(np.zeros(4), [(0, FRONT)], theta=np.full((4, 6), 7.0))
+    assert Played(run).follows(np.full((4, 6), np.nan), 1.0)
+    assert not Played(run).follows(np.zeros((4, 6)), 1.0)
 
 
 @pytest.mark.parametrize("within", [math.nan, math.inf])
