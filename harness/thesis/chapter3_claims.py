@@ -125,7 +125,7 @@ def _diagonals(config: EstimatorConfig, u: Signal, y: Signal) -> Signal:
     for pair in zip(u.tolist(), y.tolist(), strict=True):
         twin.step(*pair)
         upper = np.array(twin.covariance.u)
-        out.append((upper**2 * twin.covariance.d).sum(axis=1))
+        out.append((upper**2 * twin.covariance.d).sum(axis=1) / twin.covariance.weight)
     return np.array(out)
 
 

@@ -180,9 +180,13 @@ def test_any_url_of_pyserial_will_do_socket() -> None:
 # ---- the device in this process
 
 
-def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path) -> None:
+def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    absent = tmp_path / "absent.so"
+    with pytest.raises(ConfigurationError, match=r"absent\.so: cannot be loaded as a library of a device"):
+        MemoryWire(1, library=absent)
+    monkeypatch.setattr("harness.links.wire.LIBRARY", absent)
     with pytest.raises(LinkError, match="make setup"):
-        MemoryWire(1, library=tmp_path / "absent.so")
+        MemoryWire(1, library=absent)
 
 
 # ---- the program by itself
