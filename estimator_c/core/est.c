@@ -32,11 +32,11 @@
 
 /// C is left as it is while every coefficient of A is as near to it as this: the innovations are then white enough, their
 /// variance at most 1 % too large with poles up to 0.95. 0.02 may put a zero of C on the unit circle.
-#define REFRESH_STEP 0.002F
+#define REFRESH_STEP 8.0e-6F
 
 /// A coefficient that moves by more than this makes another filter: what the old one left of the noise of the equations before
 /// is not white to the new one, which therefore begins anew.
-#define REFRESH_STRIDE 0.05F
+#define REFRESH_STRIDE 0.005F
 
 /// The estimate remembers some 1 / (1 - forgetting) samples. After so many times that without an edge, what it says of A comes from
 /// the noise, which any A = C fits: C would follow it anywhere.
@@ -52,7 +52,7 @@ EST_OUTLINE void count(uint16_t* const counter) { *counter = (uint16_t)(*counter
 
 EST_OUTLINE void count_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
-static uint_fast8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
+static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
 EST_OUTLINE bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 
@@ -133,13 +133,8 @@ static void shift_y(est_t* const self, const float newest) {
 }
 
 /// How many samples before its own an equation reaches back to.
-static uint_fast8_t past_n(const est_config_t* const config) {
-    return larger(config->na, (uint_fast8_t)(config->nb + config->nk - 1U));
-}
-
-/// The next equation is at least `pending_n` samples away, and the first of its kind.
-static void restart(est_t* const self, const uint_fast8_t pending_n) {
-    self->pending_n = (uint8_t)larger(self->pending_n, pending_n);
+EST_OUTLINE uint8_t past_n(const est_config_t* const config) {
+    return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
 }
 
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
@@ -162,8 +157,7 @@ static void follow_slip(est_t* const self, const bool late) {
 
 /// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
 /// 3.5: noise on the output).
-EST_SHAPED void contracted(const est_t* const self, float* const c) {
-    const uint_fast8_t na     = est_shape_of(self->config).na;
+EST_SHAPED void contracted(const est_t* const self, const uint_fast8_t na, float* const c) {
     float              factor = 1.0F;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -174,7 +168,7 @@ EST_SHAPED void contracted(const est_t* const self, float* const c) {
 
 static void refresh_prefilter(est_t* const self) {
     float c[EST_NA_MAX];
-    contracted(self, c);
+    contracted(self, est_shape_of(self->config).na, c);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(c, EST_NA_MAX)) {
         est_whitener_set(&self->whitener, c, EST_NA_MAX);
@@ -186,7 +180,7 @@ static void refresh_prefilter(est_t* const self) {
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
-        self->refresh_in = self->config->refresh_n;
+        self->refresh_in = EST_WITH_ADAPTATION ? self->config->refresh_n : 0U;
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
@@ -211,11 +205,11 @@ static void gather(est_t* const self) {
 }
 
 /// The samples before the next are unknown, or belong to another plant.
-static void forget_samples(est_t* const self) {
+EST_OUTLINE void forget_samples(est_t* const self) {
     if (self->known) {
-        self->known = false;
+        self->known     = false;
+        self->pending_n = past_n(self->config);
         est_edges_forget(&self->edges);
-        restart(self, past_n(self->config));
     }
 }
 
@@ -271,7 +265,7 @@ static void enter_edge(est_t* const self) {
     if ((self->config->edge_instants == EST_EDGES_MAY_SLIP) && (self->config->trigger.kind == EST_TRIGGER_CUSUM)) {
         doubt_edge(self);
     } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
-        restart(self, self->config->na);
+        self->pending_n = larger(self->pending_n, self->config->na);
     } else {
         // the b's take it in
     }
@@ -309,7 +303,7 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
     if (inside(self->config, sample.u) && inside(self->config, sample.y)) {
         return enter_input(self, sample);  // MISRA D4
     }
-    if (plausible(sample.u) && plausible(sample.y)) {
+    if (EST_WITH_WATCH && plausible(sample.u) && plausible(sample.y)) {
         count(&self->counters.saturated);
     }
     return EST_REFUSED;
@@ -319,18 +313,18 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 /// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
 /// they are taken against what was believed before the doubt.
-EST_INLINE void read_otherwise(est_t* const                self,
+EST_INLINE est_finding_t read_otherwise(est_t* const                self,
                                const est_shape_t           shape,
                                const est_equation_t* const equation,
-                               float* const                readings) {
+                               const float                 weight) {
     const float e = (self->edges.age_n > 1U)
                         ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
                         : equation->innovation;  // theta has not moved since
     float       early;
     float       late;
     est_edges_shares(&self->edges, shape, &self->whitener, self->u, &early, &late);
-    readings[0] = e - early;
-    readings[1] = e - late;
+    return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - early, e - late, weight,
+                                     self->edges.age_n >= EST_DOUBT_N);
 }
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
@@ -354,15 +348,16 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
-/// Whether one of the coefficients is further from the C in use than this.
-EST_SHAPED bool further(const est_whitener_t* const whitener, const float* const c, const float distance) {
-    bool out = false;
+/// How far these coefficients are from the C in use: the sum of the squares.
+EST_INLINE float distance(const est_whitener_t* const whitener, const float* const c) {
+    const float first = c[0] - whitener->c[0];
+    float       sum   = first * first;
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
+    for (uint_fast8_t i = 1U; i < EST_NA_MAX; i++) {
         const float step = c[i] - whitener->c[i];
-        out              = out || (est_magnitude(step) > distance);
+        sum += step * step;
     }
-    return out;
+    return sum;
 }
 
 static bool remembers_edge(const est_t* const self) {
@@ -371,27 +366,28 @@ static bool remembers_edge(const est_t* const self) {
 
 /// Where C moves far, or the gains are on their way to it anyway, the whitening begins anew: C is then taken with the next
 /// sample, which has no equation.
-static void compare_prefilter(est_t* const self) {
+EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     float c[EST_NA_MAX];
-    contracted(self, c);
-    if (!further(&self->whitener, c, REFRESH_STEP)) {
+    contracted(self, shape.na, c);
+    const float moved = distance(&self->whitener, c);
+    if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
         self->refresh_in = self->config->refresh_n;
         return;  // MISRA D4
     }
     self->renewal = EST_RENEWAL_PREFILTER;
-    if (!self->settled || further(&self->whitener, c, REFRESH_STRIDE)) {
+    if (!self->settled || (moved > REFRESH_STRIDE)) {
         self->pending_n = 1U;
     }
 }
 
 /// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so
 /// that no step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
-static void consider_refresh(est_t* const self) {
+EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
     if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
-        compare_prefilter(self);
+        compare_prefilter(self, shape);
     } else if (self->renewal == EST_RENEWAL_PREFILTER) {
         self->renewal = EST_RENEWAL_NONE;
         refresh_prefilter(self);
@@ -487,26 +483,26 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     est_equation_fill(self, shape, y, equation.phi);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
-    float readings[EST_OTHER_READINGS];
-    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        read_otherwise(self, shape, &equation, readings);
-    }
     const float precision =
         est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
-        consider_refresh(self);
+        consider_refresh(self, shape);
     } else {
         // C stays
     }
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
     }
-    const est_finding_t finding = est_trigger_step(&self->trigger, &config->trigger, equation.innovation,
-                                                   precision / self->noise_variance, readings, self->edges.age_n);
+    const float weight = est_trigger_weight(&self->trigger, config->trigger.kind, precision / self->noise_variance);
+    est_trigger_step(&self->trigger, &config->trigger, equation.innovation, weight);
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
+    est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
+    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+        finding = read_otherwise(self, shape, &equation, weight);
+    }
     if (finding != EST_QUIET) {
         step->alarm = finding == EST_ALARM;
         react(self, finding);
@@ -573,10 +569,10 @@ bool est_init(est_t* const self, const est_config_t* const config) {
     }
     *self                = (est_t){ .config = config };
     self->adaptive       = EST_WITH_ADAPTATION && adaptive(config);
-    self->refresh_in     = config->refresh_n;
+    self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
-    restart(self, past_n(config));
+    self->pending_n = past_n(config);
     est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;

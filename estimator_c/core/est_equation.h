@@ -14,7 +14,7 @@ typedef struct {
     float variance;                 ///< of the equation's noise, in noise variances
 } est_equation_t;
 
-EST_INLINE float* append(float* const out, const float* const from, const uint_fast8_t n) {
+EST_SHAPED float* append(float* const out, const float* const from, const uint_fast8_t n) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
         out[i] = from[i];
@@ -24,19 +24,16 @@ EST_INLINE float* append(float* const out, const float* const from, const uint_f
 
 /// From the samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
-    float* out = phi;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < shape.na; i++) {
-        *out++ = -self->y[i];  // MISRA D3
+        phi[i] = -self->y[i];
     }
-    out = append(out, &self->u[shape.nk], shape.nb);
+    float* out = append(&phi[shape.na], &self->u[shape.nk], shape.nb);
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
-    if (shape.offset) {
-        *out++ = 1.0F;  // MISRA D3
-    }
-    *out = y;
+    out[0]                        = 1.0F;
+    out[shape.offset ? 1U : 0U] = y;
 }
 
 /// What theta does not foresee of y(k), the element after the regressor.

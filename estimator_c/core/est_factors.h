@@ -25,8 +25,9 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
     const float p0_offset = config->p0_offset;
     const float scale     = factor / self->weight;
     self->weight          = 1.0F;
+    const uint_fast8_t count = est_shape_count(shape);
     EST_UNROLL
-    for (uint_fast8_t j = 0U; j < est_shape_count(shape); j++) {
+    for (uint_fast8_t j = 0U; j < count; j++) {
         const float d     = self->d[j] * scale;
         const float prior = est_is_offset(shape, j) ? p0_offset : p0;
         self->d[j]        = (d < prior) ? d : prior;

@@ -21,12 +21,7 @@ typedef enum {
 void est_trigger_restart(est_trigger_t* self, uint16_t quiet_n);
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
-EST_OUTLINE void est_trigger_begin_doubt(est_trigger_t* const self) {
-    EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
-        self->rival[i] = self->statistic;
-    }
-}
+void est_trigger_begin_doubt(est_trigger_t* self);
 
 /// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
 /// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best
@@ -52,34 +47,56 @@ EST_OUTLINE float est_trigger_sum(const float before, const float innovation, co
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
-/// In every reading of the edges in doubt, the statistic already being that of the first.
-est_finding_t est_trigger_find_in_doubt(
-    est_trigger_t* self, float ceiling, const float readings[EST_OTHER_READINGS], float weight, bool expires);
+/// The statistic of the other reading that explains the innovations better.
+EST_OUTLINE float est_trigger_best_rival(const est_trigger_t* const self) {
+    return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
+}
 
-/// What is no cumulative sum, or waits.
+/// In every reading of the edges in doubt, the statistic already being that of the first. The plant has changed only if no
+/// reading explains the innovations.
+EST_OUTLINE est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
+                                        const float          ceiling,
+                                        const float          early,
+                                        const float late,
+                                        const float          weight,
+                                        const bool           expires) {
+    self->rival[0] = est_trigger_sum(self->rival[0], early, weight);
+    self->rival[1] = est_trigger_sum(self->rival[1], late, weight);
+    if (self->statistic < ceiling) {
+        return EST_QUIET;  // MISRA D4
+    }
+    if (est_trigger_best_rival(self) < ceiling) {
+        return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
+    }
+    return EST_ALARM;
+}
+
+/// Of the kinds that are no cumulative sum.
 float est_trigger_other_statistic(est_trigger_t*              self,
                                   const est_trigger_config_t* config,
                                   float                       innovation,
-                                  float                       precision);
+                                  float                       weight);
 
-/// Enters one innovation [codes] as recorded and in the other readings of the edges in doubt, and the reciprocal of its
-/// predicted variance [codes^-2]. doubt_n: samples since the doubt began; 0: no doubt, and the first reading alone counts.
-EST_INLINE est_finding_t est_trigger_step(est_trigger_t* const              self,
-                                          const est_trigger_config_t* const config,
-                                          const float                       innovation,
-                                          const float                       precision,
-                                          const float                       readings[EST_OTHER_READINGS],
-                                          const uint16_t                    doubt_n) {
-    if ((config->kind == EST_TRIGGER_CUSUM) && (self->quiet_n == 0U)) {
-        const float weight = EST_CUSUM_GAIN * precision;
-        self->statistic    = est_trigger_sum(self->statistic, innovation, weight);
-        if (EST_WITH_EDGES && (doubt_n > 0U)) {
-            return est_trigger_find_in_doubt(self, config->ceiling, readings, weight, doubt_n >= EST_DOUBT_N);  // MISRA D4
-        }
-    } else {
-        self->statistic = est_trigger_other_statistic(self, config, innovation, precision);
+/// The weight of a squared innovation in the cumulative sum, from the reciprocal of its predicted variance [codes^-2]: none
+/// while the statistic is held at zero.
+EST_INLINE float est_trigger_weight(est_trigger_t* const self, const est_trigger_kind_t kind, const float precision) {
+    if (self->quiet_n > 0U) {
+        self->quiet_n--;
+        return 0.0F;  // MISRA D4
     }
-    return (self->statistic < config->ceiling) ? EST_QUIET : EST_ALARM;
+    return (kind == EST_TRIGGER_NONE) ? 0.0F : (EST_CUSUM_GAIN * precision);
+}
+
+/// Enters one innovation [codes] as recorded.
+EST_INLINE void est_trigger_step(est_trigger_t* const              self,
+                                 const est_trigger_config_t* const config,
+                                 const float                       innovation,
+                                 const float                       weight) {
+    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && (weight > 0.0F)) {
+        self->statistic = est_trigger_other_statistic(self, config, innovation, weight);
+    } else {
+        self->statistic = est_trigger_sum(self->statistic, innovation, weight);
+    }
 }
 
 #endif  // EST_TRIGGER_H_INCLUDED

@@ -16,11 +16,11 @@
 EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
     float a[EST_NA_MAX] = { 0.0F };  // MISRA D2
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        a[i] = (i < na) ? c[i] : 0.0F;
+    for (uint_fast8_t i = 0U; i < na; i++) {
+        a[i] = c[i];
     }
     EST_UNROLL
-    for (uint_fast8_t order = EST_NA_MAX; order > 0U; order--) {
+    for (uint_fast8_t order = na; order > 0U; order--) {
         const float k = a[order - 1U];
         if (!((k > -REFLECTION_MAX) && (k < REFLECTION_MAX))) {
             return false;  // MISRA D4
@@ -37,12 +37,12 @@ EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t n
     return true;
 }
 
-/// From now on C is this; how the next equations hang together with those before is kept.
+/// From now on C is this, and its other coefficients as they are; how the next equations hang together with those before is kept.
 EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
     EST_UNROLL
-    for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
-        self->c[i]       = (i < na) ? c[i] : 0.0F;
-        self->gain[0][i] = self->c[i];
+    for (uint_fast8_t i = 0U; i < na; i++) {
+        self->c[i]       = c[i];
+        self->gain[0][i] = c[i];
     }
 }
 
