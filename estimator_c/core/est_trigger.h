@@ -1,6 +1,6 @@
 /// The change triggers of est.h. They see the innovation, in every reading of the edges in doubt, and its variance, and
 /// nothing else of the estimator. A user's trigger is a function in the configuration (est_trigger_fn); one of the library's
-/// own is a new est_trigger_kind_t and a new function in est_trigger.c.
+/// own is a new est_trigger_kind_t and a new function here.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
@@ -8,8 +8,16 @@
 #include "est_edges.h"
 #include "est_shape.h"
 
+#include <stddef.h>
+
 /// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
-bool est_trigger_config_valid(const est_trigger_config_t* config);
+static inline bool est_trigger_config_valid(const est_trigger_config_t* const config) {
+    const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
+                       (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
+                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
+    const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
+    return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
+}
 
 typedef enum {
     EST_QUIET = 0,
@@ -18,22 +26,52 @@ typedef enum {
 } est_finding_t;
 
 /// Ready for the first innovation; the statistic is zero for the next quiet_n samples.
-void est_trigger_restart(est_trigger_t* self, uint16_t quiet_n);
+static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
+    self->statistic = 0.0F;
+    self->mean_n    = 0U;
+    self->quiet_n   = quiet_n;
+}
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
-void est_trigger_begin_doubt(est_trigger_t* self);
+static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
+    EST_UNROLL
+    for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
+        self->rival[i] = self->statistic;
+    }
+}
+
+/// The statistic of the other reading that explains the innovations better.
+EST_OUTLINE float est_trigger_best_rival(const est_trigger_t* const self) {
+    return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
+}
+
+/// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
+static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
+    return est_trigger_best_rival(self) < self->statistic;
+}
 
 /// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
 /// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best
 /// reading, since none can be followed any further; at its term a doubt has seen all there is of an edge, and the recorded one
 /// goes on.
-bool est_trigger_end_doubt(est_trigger_t* self, const est_trigger_config_t* config);
+static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
+    if (self->statistic >= config->ceiling) {
+        return true;  // MISRA D4
+    }
+    if (est_trigger_in_doubt(self)) {
+        self->statistic = est_trigger_best_rival(self);
+    }
+    est_trigger_begin_doubt(self);
+    return false;
+}
 
 /// Makes the best of the other readings the statistic; true iff it is the one in which the edges came late.
-bool est_trigger_settle_late(est_trigger_t* self);
-
-/// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
-bool est_trigger_in_doubt(const est_trigger_t* self);
+static inline bool est_trigger_settle_late(est_trigger_t* const self) {
+    const bool late = self->rival[1] < self->rival[0];
+    self->statistic = est_trigger_best_rival(self);
+    est_trigger_begin_doubt(self);
+    return late;
+}
 
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
@@ -45,11 +83,6 @@ bool est_trigger_in_doubt(const est_trigger_t* self);
 EST_OUTLINE float est_trigger_sum(const float before, const float innovation, const float weight) {
     const float sum = before + ((innovation * innovation * weight) - EST_CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
-}
-
-/// The statistic of the other reading that explains the innovations better.
-EST_OUTLINE float est_trigger_best_rival(const est_trigger_t* const self) {
-    return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
 }
 
 /// In every reading of the edges in doubt, the statistic already being that of the first. The plant has changed only if no
@@ -71,11 +104,38 @@ EST_OUTLINE est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
     return EST_ALARM;
 }
 
+/// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
+static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
+    const float term = absolute ? est_magnitude(innovation) : innovation;
+    float* const mean = &self->rival[0];
+    *mean             = (self->mean_n == 0U) ? 0.0F : *mean;
+    self->mean_n      = (uint16_t)(self->mean_n + ((self->mean_n < UINT16_MAX) ? 1U : 0U));
+    *mean += (term - *mean) / (float)self->mean_n;
+    return est_magnitude(*mean);
+}
+
+static inline float custom(est_trigger_t* const              self,
+                    const est_trigger_config_t* const config,
+                    const float                       innovation,
+                    const float                       variance) {
+    const bool anew = self->mean_n == 0U;
+    self->mean_n    = 1U;
+    return config->custom(config->context, innovation, variance, anew);
+}
+
 /// Of the kinds that are no cumulative sum.
-float est_trigger_other_statistic(est_trigger_t*              self,
-                                  const est_trigger_config_t* config,
-                                  float                       innovation,
-                                  float                       weight);
+static inline float est_trigger_other_statistic(est_trigger_t* const              self,
+                                  const est_trigger_config_t* const config,
+                                  const float                       innovation,
+                                  const float                       weight) {
+    if (config->kind == EST_TRIGGER_PREDICTION_ERROR) {
+        return est_magnitude(innovation);  // MISRA D4
+    }
+    if (config->kind == EST_TRIGGER_MEAN_BETWEEN_FAULTS) {
+        return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
+    }
+    return custom(self, config, innovation, EST_CUSUM_GAIN / weight);
+}
 
 /// The weight of a squared innovation in the cumulative sum, from the reciprocal of its predicted variance [codes^-2]: none
 /// while the statistic is held at zero.
