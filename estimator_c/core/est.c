@@ -209,7 +209,7 @@ EST_OUTLINE void forget_samples(est_t* const self) {
     if (self->known) {
         self->known     = false;
         self->pending_n = past_n(self->config);
-        est_edges_forget(&self->edges);
+        self->doubt_n   = 0U;
     }
 }
 
@@ -249,16 +249,17 @@ static bool stuck(est_t* const self, const float y, const bool edge) {
 
 /// An edge joins the doubt about earlier ones if another reading of those is ahead, and otherwise begins a doubt of its own.
 static void doubt_edge(est_t* const self) {
-    if ((self->edges.age_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
+    if ((self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
         return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
+    self->doubt_n = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step, self->pending_n == 0U);
     est_trigger_begin_doubt(&self->trigger);
 }
 
 static void enter_edge(est_t* const self) {
-    self->edges.since_n = 0U;
+    self->edge_age_n = 0U;
     if (!EST_WITH_EDGES) {
         return;  // MISRA D4
     }
@@ -280,10 +281,10 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
         return EST_REFUSED;  // MISRA D4
     }
     if (EST_KNOWS_EDGES) {
-        count(&self->edges.since_n);
+        count(&self->edge_age_n);
     }
-    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
-        est_edges_age(&self->edges);
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
+        self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
     }
     if (edge) {
         enter_edge(self);
@@ -317,14 +318,14 @@ EST_INLINE est_finding_t read_otherwise(est_t* const                self,
                                const est_shape_t           shape,
                                const est_equation_t* const equation,
                                const float                 weight) {
-    const float e = (self->edges.age_n > 1U)
+    const float e = (self->doubt_n > 1U)
                         ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
                         : equation->innovation;  // theta has not moved since
     float       early;
     float       late;
-    est_edges_shares(&self->edges, shape, &self->whitener, self->u, &early, &late);
+    est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
     return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - early, e - late, weight,
-                                     self->edges.age_n >= EST_DOUBT_N);
+                                     self->doubt_n >= EST_DOUBT_N);
 }
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
@@ -361,7 +362,7 @@ EST_INLINE float distance(const est_whitener_t* const whitener, const float* con
 }
 
 static bool remembers_edge(const est_t* const self) {
-    return ((1.0F - self->config->forgetting) * (float)self->edges.since_n) < REFRESH_MEMORIES;
+    return ((1.0F - self->config->forgetting) * (float)self->edge_age_n) < REFRESH_MEMORIES;
 }
 
 /// Where C moves far, or the gains are on their way to it anyway, the whitening begins anew: C is then taken with the next
@@ -384,7 +385,7 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
 /// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so
 /// that no step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
-    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->renewal = EST_RENEWAL_NONE;
     } else if (self->renewal == EST_RENEWAL_COMPARE) {
         compare_prefilter(self, shape);
@@ -434,7 +435,7 @@ static void enter_gap(est_t* const self, const est_status_t status) {
     } else {
         count_long(&self->counters.missing);
     }
-    if (EST_WITH_EDGES && self->known && (self->edges.age_n > 0U)) {
+    if (EST_WITH_EDGES && self->known && (self->doubt_n > 0U)) {
         if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
             react(self, EST_SLIP);
         }
@@ -457,7 +458,7 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
 
 /// P is kept bounded in a step that has nothing else to do besides, if there is one in time.
 EST_SHAPED void limit_factors(est_t* const self, const est_shape_t shape) {
-    const bool busy = (EST_WITH_EDGES && (self->edges.age_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
+    const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         if (EST_SHAPES_APART) {
             est_factors_scale(&self->factors, self->config, shape, 1.0F);
@@ -500,7 +501,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     step->innovation = equation.innovation;
     step->statistic  = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
-    if (EST_WITH_EDGES && (self->edges.age_n > 0U)) {
+    if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         finding = read_otherwise(self, shape, &equation, weight);
     }
     if (finding != EST_QUIET) {
@@ -591,7 +592,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         }
         shift_y(self, sample.y);
     }
-    step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edges.since_n >= self->config->idle_n);
+    step.idle = EST_WITH_WATCH && (self->config->idle_n > 0U) && (self->edge_age_n >= self->config->idle_n);
     return step;
 }
 

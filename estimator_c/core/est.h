@@ -221,8 +221,6 @@ typedef struct {
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
-    uint8_t  age_n;    ///< samples since the first of these edges, that one included; 0: no doubt
-    uint16_t since_n;  ///< samples since the last edge of u
     est_past_t early;  ///< their share in the whitened equations
     est_past_t late;
     float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
@@ -258,6 +256,8 @@ typedef struct {
     bool                known;      ///< the sample before this one is known; if not, samples are pending
     bool                settled;    ///< the gains of the whitener are c, and its variance is 1
     uint16_t            refresh_in;  ///< equations to come before C is considered; 0: never
+    uint16_t            edge_age_n;  ///< samples since the last edge of u
+    uint8_t             doubt_n;  ///< samples since the first edge in doubt, that one included; 0: no doubt
     float               noise_variance;  ///< [codes^2]
     float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
     float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...

@@ -11,14 +11,6 @@
 /// Doubt ends, one way or the other, so many samples after it began: the readings differ most in the first few.
 #define EST_DOUBT_N 12U
 
-/// No edge is in doubt.
-EST_INLINE void est_edges_forget(est_edges_t* const self) { self->age_n = 0U; }
-
-/// One sample later, with an edge in doubt. A doubt that has lasted its term has been decided by est_trigger_step().
-EST_INLINE void est_edges_age(est_edges_t* const self) {
-    self->age_n = (self->age_n < EST_DOUBT_N) ? (uint8_t)(self->age_n + 1U) : 0U;
-}
-
 /// True iff u[0] comes after an edge, the values of u newest first.
 static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
     return est_magnitude(u[0] - u[1]) >= config->edge_codes;
@@ -31,7 +23,6 @@ EST_INLINE void est_edges_begin(est_edges_t* const        self,
                      const float* const        theta,
                      const float               step,
                      const bool                after_equation) {
-    self->age_n = 1U;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->early.x[i] = 0.0F;
@@ -53,18 +44,20 @@ EST_INLINE void est_edges_shares(est_edges_t* const          self,
                                  const est_shape_t           shape,
                                  const est_whitener_t* const whitener,
                                  const float* const          u,
+                                 const uint_fast8_t          doubt_n,
+                                 const uint_fast16_t         edge_age_n,
                                  float* const                early,
                                  float* const                late) {
     const float* const b         = &self->theta[shape.na];
     float              early_raw = 0.0F;
     float              late_raw  = 0.0F;
-    if (self->since_n < ((uint32_t)shape.nb + shape.nk)) {
+    if (edge_age_n < ((uint32_t)shape.nb + shape.nk)) {
         EST_UNROLL
         for (uint_fast8_t j = 0U; j < shape.nb; j++) {
             const uint_fast8_t lag = (uint_fast8_t)(shape.nk + j);
-            late_raw -= b[j] * ((lag < self->age_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
+            late_raw -= b[j] * ((lag < doubt_n) ? (u[lag] - u[lag + 1U]) : 0.0F);
             if (lag > 0U) {
-                early_raw += b[j] * ((lag <= self->age_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
+                early_raw += b[j] * ((lag <= doubt_n) ? (u[lag - 1U] - u[lag]) : 0.0F);
             }
         }
     }
