@@ -239,10 +239,9 @@ static bool stuck(est_t* const self, const float y, const bool edge) {
         self->same_n = 0U;
         return false;  // MISRA D4
     }
-    if (edge || (self->same_n > 0U)) {
-        self->same_n = (uint8_t)(self->same_n + ((self->same_n < UINT8_MAX) ? 1U : 0U));
-    } else {
-        // no edge that it has not answered
+    const uint32_t watched = (edge ? 1U : 0U) | self->same_n;  // none: there is no edge that it has not answered
+    if ((watched > 0U) && (self->same_n < UINT8_MAX)) {
+        self->same_n++;
     }
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
