@@ -109,13 +109,6 @@ bool est_config_valid(const est_config_t* const config) {
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-static void shift(float* const x, const uint_fast8_t n, const float newest) {
-    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
-        x[i] = x[i - 1U];
-    }
-    x[0] = newest;
-}
-
 static void shift_u(est_t* const self, const float newest) {
     EST_UNROLL
     for (uint_fast8_t i = EST_INPUTS_KEPT - 1U; i > 0U; i--) {
@@ -140,19 +133,17 @@ EST_OUTLINE uint8_t past_n(const est_config_t* const config) {
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
 /// did on u(k), or the other way round.
 static void follow_slip(est_t* const self, const bool late) {
-    const uint_fast8_t nb = self->config->nb;
-    float* const  b  = &self->theta[self->config->na];
+    const uint32_t nb    = self->config->nb;
+    float* const   b     = &self->theta[self->config->na];
+    const float* const before = &self->edges.theta[self->config->na];
+    const uint32_t place = late ? UINT32_MAX : 1U;  // where each b comes from, modulo 2^32
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
+    for (uint32_t j = 0U; j < nb; j++) {
+        b[j] = ((j + place) < nb) ? before[j + place] : 0.0F;
+    }
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
-    if (late) {
-        shift(b, nb, 0.0F);
-        return;  // MISRA D4
-    }
-    for (uint_fast8_t j = 0U; j < nb; j++) {
-        b[j] = ((j + 1U) < nb) ? b[j + 1U] : 0.0F;
-    }
 }
 
 /// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
@@ -234,7 +225,7 @@ static bool same(const float a, const float b) {
 
 /// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant, until it
 /// is another. It may rest while u does.
-static bool stuck(est_t* const self, const float y, const bool edge) {
+EST_OUTLINE bool stuck(est_t* const self, const float y, const bool edge) {
     if (!same(y, self->y[0])) {
         self->same_n = 0U;
         return false;  // MISRA D4
@@ -326,6 +317,15 @@ EST_INLINE est_finding_t read_otherwise(est_t* const                self,
     return est_trigger_find_in_doubt(&self->trigger, self->config->trigger.ceiling, e - early, e - late, weight,
                                      self->doubt_n >= EST_DOUBT_N);
 }
+
+#if EST_NC_MAX > 0
+static void shift(float* const x, const uint_fast8_t n, const float newest) {
+    for (uint_fast8_t i = (uint_fast8_t)(n - 1U); i > 0U; i--) {
+        x[i] = x[i - 1U];
+    }
+    x[0] = newest;
+}
+#endif
 
 /// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
 static void keep_residual(est_t* const self, const float* const phi) {
@@ -456,7 +456,7 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
 }
 
 /// P is kept bounded in a step that has nothing else to do besides, if there is one in time.
-EST_SHAPED void limit_factors(est_t* const self, const est_shape_t shape) {
+EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
         if (EST_SHAPES_APART) {

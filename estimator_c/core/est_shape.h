@@ -26,10 +26,16 @@
 #endif
 
 /// gcc would rather call a long function than inline it for each shape.
-#ifdef __GNUC__
+#if defined(__GNUC__) && !defined(__OPTIMIZE_SIZE__)
 #define EST_INLINE static inline __attribute__((always_inline))
 #else
 #define EST_INLINE static inline
+#endif
+
+#ifdef __GNUC__
+#define EST_INLINE_ALWAYS static inline __attribute__((always_inline))
+#else
+#define EST_INLINE_ALWAYS static inline
 #endif
 
 /// Inline for each shape; a build for size has it once.

@@ -87,7 +87,7 @@ EST_OUTLINE float est_trigger_sum(const float before, const float innovation, co
 
 /// In every reading of the edges in doubt, the statistic already being that of the first. The plant has changed only if no
 /// reading explains the innovations.
-EST_OUTLINE est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
+static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
                                         const float          ceiling,
                                         const float          early,
                                         const float late,
