@@ -530,6 +530,9 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
 
 // ---------------------------------------------          API           ---------------------------------------------
 
+/// Or gcc takes the default apart into instructions that store its fields.
+EST_OUTLINE est_config_t copied(const est_config_t* const config) { return *config; }
+
 est_config_t est_config_default(void) {
     static const est_config_t config = {
         .na             = (uint8_t)DEFAULT_NA,
@@ -559,7 +562,7 @@ est_config_t est_config_default(void) {
                             .warm_up_n  = 150U,
                             .ceiling    = 11.512925F },
     };
-    return config;
+    return copied(&config);
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
