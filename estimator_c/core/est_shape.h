@@ -40,7 +40,11 @@
 
 /// Inline for each shape; a build for size has it once.
 #if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
+#if EST_WITH_EDGES
 #define EST_SHAPED static __attribute__((noinline, unused))
+#else
+#define EST_SHAPED static inline
+#endif
 #define EST_SHAPES_APART 0
 #else
 #define EST_SHAPED EST_INLINE

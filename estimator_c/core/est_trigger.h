@@ -80,7 +80,7 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 #define EST_CUSUM_DRIFT 0.69314718F
 
 /// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
-EST_OUTLINE float est_trigger_sum(const float before, const float innovation, const float weight) {
+EST_SHAPED float est_trigger_sum(const float before, const float innovation, const float weight) {
     const float sum = before + ((innovation * innovation * weight) - EST_CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
