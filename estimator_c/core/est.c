@@ -171,7 +171,9 @@ static void refresh_prefilter(est_t* const self) {
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
-        self->refresh_in = EST_WITH_ADAPTATION ? self->config->refresh_n : 0U;
+        if (EST_WITH_ADAPTATION) {
+            self->refresh_in = self->config->refresh_n;
+        }
     } else if (EST_WITH_EDGES && (self->renewal >= EST_RENEWAL_EARLY)) {
         follow_slip(self, self->renewal == EST_RENEWAL_LATE);
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
@@ -184,7 +186,7 @@ static void renew(est_t* const self) {
 
 /// One sample less to come before the next equation is complete. There is time here for what the step that found a change
 /// left to do: that one is long enough.
-static void gather(est_t* const self) {
+EST_OUTLINE void gather(est_t* const self) {
     self->pending_n--;
     self->known = true;
     renew(self);
@@ -279,6 +281,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     if (edge) {
         enter_edge(self);
     }
+    count_long(&self->counters.updated);
     if (self->pending_n > 0U) {
         gather(self);
         return EST_GATHERING;  // MISRA D4
@@ -411,7 +414,6 @@ static void zero(float* const x, const uint_fast8_t n) {
 static void estimate_afresh(est_t* const self) {
     if ((self->config->trigger.reset == EST_RESET_ALL) || !(self->trigger.statistic < FLT_MAX)) {
         zero(self->theta, EST_THETA_MAX);
-        est_factors_reset(&self->factors, self->config);
     }
     self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
@@ -588,7 +590,6 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
         enter_gap(self, step.status);
     } else {
-        count_long(&self->counters.updated);
         if (step.status == EST_UPDATED) {
             enter_equation_of_any_shape(self, sample.y, &step);
         }

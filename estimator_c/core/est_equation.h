@@ -24,7 +24,7 @@ EST_SHAPED float* append(float* const out, const float* const from, const uint_f
 
 /// From the samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
-    EST_UNROLL
+    EST_ROLL
     for (uint_fast8_t i = 0U; i < shape.na; i++) {
         phi[i] = -self->y[i];
     }

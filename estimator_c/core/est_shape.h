@@ -65,6 +65,13 @@
 #define EST_UNROLL
 #endif
 
+/// A loop that gcc would rather unroll at -Os as well.
+#if defined(__GNUC__) && !EST_SHAPES_APART && !defined(EST_FIXED_NA)
+#define EST_ROLL _Pragma("GCC unroll 1")
+#else
+#define EST_ROLL EST_UNROLL
+#endif
+
 /// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
 /// faster one. An edge that may have come early or late wants one more.
 #ifdef EST_FIXED_NA
