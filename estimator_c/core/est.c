@@ -58,17 +58,15 @@ EST_OUTLINE bool within(const float x, const float low, const float high) { retu
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-EST_INLINE bool alike(const est_shape_t a, const est_shape_t b) {
+EST_INLINE_ALWAYS bool alike(const est_shape_t a, const est_shape_t b) {
     return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
 }
 
-static est_shape_t asked_for(const est_config_t* const config) {
+EST_INLINE_ALWAYS est_shape_t asked_for(const est_config_t* const config) {
     return (est_shape_t){
-        .na = config->na, .nb = config->nb, .nk = config->nk, .nc = config->nc, .offset = config->offset
+        .na = config->na, .nb = config->nb, .nk = config->nk, .nc = config->nc, .offset = config->offset ? 1U : 0U
     };
 }
-
-EST_OUTLINE uint_fast8_t count_of(const est_config_t* const config) { return est_shape_count(est_shape_of(config)); }
 
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
@@ -334,7 +332,7 @@ static void shift(float* const x, const uint_fast8_t n, const float newest) {
 static void keep_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
-        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, count_of(self->config)));
+        shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, est_theta_count(self)));
     }
 #else
     (void)self;
@@ -516,8 +514,8 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
     const est_shape_t shape = est_shape_of(self->config);
 #if !defined(EST_FIXED_NA) && !defined(__OPTIMIZE_SIZE__) && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) &&               \
     (EST_NK_MAX >= 1U) && (EST_THETA_MAX >= 6U)
-    const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = false };
-    const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = true };
+    const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
+    const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U };
     if (alike(shape, free_running)) {
         enter_equation(self, free_running, y, step);
         return;  // MISRA D4
@@ -601,17 +599,17 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
 
 uint8_t est_theta_count(const est_t* const self) {
     EST_ASSERT(self != NULL);
-    return (uint8_t)count_of(self->config);
+    return (uint8_t)est_shape_count(est_shape_of(self->config));
 }
 
 float est_theta(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != NULL) && (index < count_of(self->config)));
+    EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
     return self->theta[index];
 }
 
 float est_variance(const est_t* const self, const uint8_t index) {
-    EST_ASSERT((self != NULL) && (index < count_of(self->config)));
-    return est_factors_variance(&self->factors, (uint_fast8_t)count_of(self->config), index);
+    EST_ASSERT((self != NULL) && (index < est_theta_count(self)));
+    return est_factors_variance(&self->factors, est_theta_count(self), index);
 }
 
 float est_noise_variance(const est_t* const self) {
@@ -633,7 +631,7 @@ bool est_invariants_hold(const est_t* const self) {
     if ((self == NULL) || (self->config == NULL) || !est_config_valid(self->config)) {
         return false;  // MISRA D4
     }
-    for (uint_fast8_t i = 0U; i < count_of(self->config); i++) {
+    for (uint_fast8_t i = 0U; i < est_theta_count(self); i++) {
         if (!within(self->factors.d[i], FLT_MIN, FLT_MAX) || !within(self->theta[i], -FLT_MAX, FLT_MAX)) {
             return false;  // MISRA D4
         }

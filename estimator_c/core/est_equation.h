@@ -33,7 +33,7 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
     out = append(out, self->residual, shape.nc);
 #endif
     out[0]                        = 1.0F;
-    out[shape.offset ? 1U : 0U] = y;
+    out[shape.offset] = y;
 }
 
 /// What theta does not foresee of y(k), the element after the regressor.

@@ -41,6 +41,7 @@ EST_OUTLINE void est_factors_inflate(est_factors_t* const self, const est_config
 
 static inline void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
     self->weight = 1.0F;
+    EST_ROLL
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
         self->d[j] = EST_VARIANCE_MAX;
     }

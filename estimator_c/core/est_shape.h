@@ -103,11 +103,11 @@ typedef struct {
     uint8_t nb;
     uint8_t nk;
     uint8_t nc;
-    bool    offset;
+    uint8_t offset;  ///< 1 with one, else 0
 } est_shape_t;
 
 /// The orders that the configuration asks for, or that the build has fixed by -DEST_FIXED_NA=2U, _NB, _NK, _NC and _OFFSET.
-EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
+EST_INLINE_ALWAYS est_shape_t est_shape_of(const est_config_t* const config) {
 #ifdef EST_FIXED_NA
     (void)config;
     return (est_shape_t){ EST_FIXED_NA, EST_FIXED_NB, EST_FIXED_NK, EST_FIXED_NC, EST_FIXED_OFFSET };
@@ -116,13 +116,13 @@ EST_INLINE est_shape_t est_shape_of(const est_config_t* const config) {
                           .nb     = config->nb,
                           .nk     = config->nk,
                           .nc     = EST_WITH_ADAPTATION ? config->nc : 0U,
-                          .offset = config->offset };
+                          .offset = config->offset ? 1U : 0U };
 #endif
 }
 
 /// The number of parameters.
-EST_INLINE uint_fast8_t est_shape_count(const est_shape_t shape) {
-    return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + (shape.offset ? 1U : 0U));
+EST_INLINE_ALWAYS uint_fast8_t est_shape_count(const est_shape_t shape) {
+    return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + shape.offset);
 }
 
 /// Whether parameter j, one of them, is the offset, the last, which has a prior of its own.
