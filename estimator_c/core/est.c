@@ -124,7 +124,7 @@ static void shift_y(est_t* const self, const float newest) {
 }
 
 /// How many samples before its own an equation reaches back to.
-EST_OUTLINE uint8_t past_n(const est_config_t* const config) {
+static inline uint8_t past_n(const est_config_t* const config) {
     return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
 }
 
@@ -200,7 +200,9 @@ EST_OUTLINE void forget_samples(est_t* const self) {
     if (self->known) {
         self->known     = false;
         self->pending_n = past_n(self->config);
-        self->doubt_n   = 0U;
+        if (EST_WITH_EDGES) {
+            self->doubt_n = 0U;
+        }
     }
 }
 

@@ -28,8 +28,10 @@ typedef enum {
 /// Ready for the first innovation; the statistic is zero for the next quiet_n samples.
 static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
     self->statistic = 0.0F;
-    self->mean_n    = 0U;
     self->quiet_n   = quiet_n;
+    if (EST_WITH_TRIGGERS) {
+        self->mean_n = 0U;
+    }
 }
 
 /// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
