@@ -20,8 +20,8 @@ SLIP_DOUBT = 1000.0
 """How much less certain a slip leaves every parameter."""
 
 CONTRACTION = 0.99
-REFRESH_STEP = 0.002
-REFRESH_STRIDE = 0.05
+REFRESH_STEP = 8e-6
+REFRESH_STRIDE = 0.005
 REFRESH_MEMORIES = 2.0
 
 SETTLED = 1.0001
@@ -358,7 +358,7 @@ class Twin:
         return [a * CONTRACTION ** (i + 1) for i, a in enumerate(self.theta[: self.config.na])]
 
     def _compare_c(self) -> None:
-        step = max(abs(new - old) for new, old in zip(self._contracted, self.whitener.c, strict=True))
+        step = sum((new - old) ** 2 for new, old in zip(self._contracted, self.whitener.c, strict=True))
         if step <= REFRESH_STEP:
             self.equations = -1
             return

@@ -30,11 +30,12 @@
 /// would remember for ever.
 #define CONTRACTION 0.99F
 
-/// C is left as it is while every coefficient of A is as near to it as this: the innovations are then white enough, their
-/// variance at most 1 % too large with poles up to 0.95. 0.02 may put a zero of C on the unit circle.
+/// C is left as it is while A is as near to it as this, as the sum of the squares of the coefficients' distances: the
+/// innovations are then white enough, their variance at most 1 % too large with poles up to 0.95. A hundred times that may put a
+/// zero of C on the unit circle.
 #define REFRESH_STEP 8.0e-6F
 
-/// A coefficient that moves by more than this makes another filter: what the old one left of the noise of the equations before
+/// Further away, again as a sum of squares, it makes another filter: what the old one left of the noise of the equations before
 /// is not white to the new one, which therefore begins anew.
 #define REFRESH_STRIDE 0.005F
 
@@ -48,7 +49,9 @@
 #define NOISE_CLIP 9.0F
 #define NOISE_KEPT 0.9851F
 
-EST_OUTLINE void count(uint16_t* const counter) { *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U)); }
+EST_OUTLINE void count(uint16_t* const counter) {
+    *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U));
+}
 
 EST_OUTLINE void count_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
@@ -58,11 +61,11 @@ EST_OUTLINE bool within(const float x, const float low, const float high) { retu
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-EST_INLINE_ALWAYS bool alike(const est_shape_t a, const est_shape_t b) {
+EST_WITHIN bool alike(const est_shape_t a, const est_shape_t b) {
     return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
 }
 
-EST_INLINE_ALWAYS est_shape_t asked_for(const est_config_t* const config) {
+EST_WITHIN est_shape_t asked_for(const est_config_t* const config) {
     return (est_shape_t){
         .na = config->na, .nb = config->nb, .nk = config->nk, .nc = config->nc, .offset = config->offset ? 1U : 0U
     };
@@ -94,7 +97,8 @@ static bool adaptive(const est_config_t* const config) {
 
 /// A build may have left something out, or know one shape only.
 static bool in_this_build(const est_config_t* const config) {
-    return alike(asked_for(config), est_shape_of(config)) && (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
+    return alike(asked_for(config), est_shape_of(config)) &&
+           (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
            (EST_WITH_ADAPTATION || (!adaptive(config) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
@@ -131,10 +135,10 @@ static inline uint8_t past_n(const est_config_t* const config) {
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
 /// did on u(k), or the other way round.
 static void follow_slip(est_t* const self, const bool late) {
-    const uint32_t nb    = self->config->nb;
-    float* const   b     = &self->theta[self->config->na];
+    const uint32_t     nb     = self->config->nb;
+    float* const       b      = &self->theta[self->config->na];
     const float* const before = &self->edges.theta[self->config->na];
-    const uint32_t place = late ? UINT32_MAX : 1U;  // where each b comes from, modulo 2^32
+    const uint32_t     place  = late ? UINT32_MAX : 1U;  // where each b comes from, modulo 2^32
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
@@ -147,7 +151,7 @@ static void follow_slip(est_t* const self, const bool late) {
 /// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
 /// 3.5: noise on the output).
 EST_SHAPED void contracted(const est_t* const self, const uint_fast8_t na, float* const c) {
-    float              factor = 1.0F;
+    float factor = 1.0F;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         factor *= CONTRACTION;
@@ -216,7 +220,7 @@ static bool inside(const est_config_t* const config, const float code) {
 
 /// Whether the two are the same number, to the bit.
 static bool same(const float a, const float b) {
-    typedef union {  // MISRA D5
+    typedef union {       // MISRA D5
         float    number;  // cppcheck F4
         uint32_t bits;
     } est_bits_t;
@@ -245,7 +249,7 @@ static void doubt_edge(est_t* const self) {
         return;  // MISRA D4
     }
     const float step = self->u[0] - self->u[1];
-    self->doubt_n = 1U;
+    self->doubt_n    = 1U;
     est_edges_begin(&self->edges, self->config, self->theta, step, self->pending_n == 0U);
     est_trigger_begin_doubt(&self->trigger);
 }
@@ -305,12 +309,12 @@ static est_status_t examine(est_t* const self, const est_sample_t sample) {
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-/// The innovation as the other readings of the edges in doubt have it. The estimate has followed what was recorded since, so
-/// they are taken against what was believed before the doubt.
+/// What the innovation says in the other readings of the edges in doubt. The estimate has followed what was recorded since, so
+/// that they are taken against what was believed before the doubt.
 EST_INLINE est_finding_t read_otherwise(est_t* const                self,
-                               const est_shape_t           shape,
-                               const est_equation_t* const equation,
-                               const float                 weight) {
+                                        const est_shape_t           shape,
+                                        const est_equation_t* const equation,
+                                        const float                 weight) {
     const float e = (self->doubt_n > 1U)
                         ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
                         : equation->innovation;  // theta has not moved since
@@ -351,7 +355,7 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
-/// How far these coefficients are from the C in use: the sum of the squares.
+/// How far these coefficients are from the C in use, squared.
 EST_INLINE float distance(const est_whitener_t* const whitener, const float* const c) {
     const float first = c[0] - whitener->c[0];
     float       sum   = first * first;
@@ -461,10 +465,10 @@ static void adapt(est_t* const self, const float* const phi, const float innovat
 EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
-        if (EST_SHAPES_APART) {
-            est_factors_scale(&self->factors, self->config, shape, 1.0F);
-        } else {
+        if (EST_FOR_SIZE) {
             est_factors_inflate(&self->factors, self->config, 1.0F);
+        } else {
+            est_factors_scale(&self->factors, self->config, shape, 1.0F);
         }
     }
 }
@@ -472,7 +476,7 @@ EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
 EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const float y, est_step_t* const step) {
     const est_config_t* const config = self->config;
     est_equation_t            equation;
-    float weight_min;
+    float                     weight_min;
     if (self->settled) {
         equation.variance = 1.0F;
         weight_min        = EST_WEIGHT_DUE;
@@ -485,8 +489,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     }
     est_equation_fill(self, shape, y, equation.phi);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
-    const float precision =
-        est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
+    const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
     if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
@@ -498,9 +501,9 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
         adapt(self, equation.phi, equation.innovation, precision);
     }
     const float weight = est_trigger_weight(&self->trigger, config->trigger.kind, precision / self->noise_variance);
-    est_trigger_step(&self->trigger, &config->trigger, equation.innovation, weight);
-    step->innovation = equation.innovation;
-    step->statistic  = self->trigger.statistic;
+    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, weight);
+    step->innovation      = equation.innovation;
+    step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         finding = read_otherwise(self, shape, &equation, weight);
@@ -514,8 +517,8 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
 /// The usual shapes have code of their own, unless the build has one anyway, or room is scarce.
 static void enter_equation_of_any_shape(est_t* const self, const float y, est_step_t* const step) {
     const est_shape_t shape = est_shape_of(self->config);
-#if !defined(EST_FIXED_NA) && !defined(__OPTIMIZE_SIZE__) && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) &&               \
-    (EST_NK_MAX >= 1U) && (EST_THETA_MAX >= 6U)
+#if !defined(EST_FIXED_NA) && !EST_FOR_SIZE && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) && (EST_NK_MAX >= 1U) &&       \
+    (EST_THETA_MAX >= 6U)
     const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
     const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U };
     if (alike(shape, free_running)) {
@@ -532,7 +535,7 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-/// Or gcc takes the default apart into instructions that store its fields.
+/// A copy as such, or gcc makes instructions of it that store each field.
 EST_OUTLINE est_config_t copied(const est_config_t* const config) { return *config; }
 
 est_config_t est_config_default(void) {
@@ -552,17 +555,17 @@ est_config_t est_config_default(void) {
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
 #if EST_NA_MAX >= 2
-        .c              = { -1.6F, 0.64F },
+        .c = { -1.6F, 0.64F },
 #endif
-        .edge_codes     = 64.0F,
-        .code_low       = -EST_CODE_LIMIT,
-        .code_high      = EST_CODE_LIMIT,
-        .trigger        = { .kind       = EST_TRIGGER_CUSUM,
-                            .reset      = EST_RESET_COVARIANCE,
-                            .absolute   = false,
-                            .hold_off_n = 0U,
-                            .warm_up_n  = 150U,
-                            .ceiling    = 11.512925F },
+        .edge_codes = 64.0F,
+        .code_low   = -EST_CODE_LIMIT,
+        .code_high  = EST_CODE_LIMIT,
+        .trigger    = { .kind       = EST_TRIGGER_CUSUM,
+                        .reset      = EST_RESET_COVARIANCE,
+                        .absolute   = false,
+                        .hold_off_n = 0U,
+                        .warm_up_n  = 150U,
+                        .ceiling    = 11.512925F },
     };
     return copied(&config);
 }

@@ -192,7 +192,7 @@ typedef struct {
 
 #define EST_UPPER_N ((EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U)
 
-/// P = U D U' / weight with U unit upper triangular. Private to est_factors.c.
+/// P = U D U' / weight with U unit upper triangular. Private to est_factors.h.
 typedef struct {
     float weight;  ///< forgetting to the power of the equations since the d's were last limited
     float d[EST_THETA_MAX];
@@ -211,7 +211,7 @@ typedef struct {
     float x[EST_NA_MAX];
 } est_past_t;
 
-/// Makes the noise of consecutive equations white. Private to est_whitener.c.
+/// Makes the noise of consecutive equations white. Private to est_whitener.h.
 typedef struct {
     float c[EST_NA_MAX];
     float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< of the newest equation first
@@ -229,7 +229,7 @@ typedef struct {
 /// The readings of the recent edges besides the recorded one: one sample early, one sample late.
 #define EST_OTHER_READINGS 2U
 
-/// The state of a trigger. Private to est_trigger.c.
+/// The state of a trigger. Private to est_trigger.h.
 typedef struct {
     float    statistic;
     float    rival[EST_OTHER_READINGS];  ///< the cumulative sum as it would be under the other readings

@@ -19,10 +19,10 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
 /// sample before had an equation, which an edge one sample early would have entered.
 EST_INLINE void est_edges_begin(est_edges_t* const        self,
-                     const est_config_t* const config,
-                     const float* const        theta,
-                     const float               step,
-                     const bool                after_equation) {
+                                const est_config_t* const config,
+                                const float* const        theta,
+                                const float               step,
+                                const bool                after_equation) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->early.x[i] = 0.0F;

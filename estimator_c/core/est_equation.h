@@ -32,7 +32,7 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
-    out[0]                        = 1.0F;
+    out[0]            = 1.0F;  // of the offset, or y's place
     out[shape.offset] = y;
 }
 
@@ -52,8 +52,8 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
     const uint_fast8_t count = est_shape_count(shape);  // cppcheck F3
-    float* const  phi   = equation->phi;  // cppcheck F2
-    float         gain[EST_NA_MAX];
+    float* const       phi   = equation->phi;           // cppcheck F2
+    float              gain[EST_NA_MAX];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         gain[i] = whitener->gain[0][i];
@@ -73,13 +73,13 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint_fast8_t count   = est_shape_count(shape);  // cppcheck F3
-    const float* const phi     = equation->phi;
-    const float        weight  = forgetting * self->weight;
+    const uint_fast8_t count               = est_shape_count(shape);  // cppcheck F3
+    const float* const phi                 = equation->phi;
+    const float        weight              = forgetting * self->weight;
     float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled; MISRA D2
-    float              alpha   = weight * equation->variance;
-    float              inverse = 0.0F;  // 1 / alpha, once there are u's that want it
-    float*             column  = self->upper;
+    float              alpha               = weight * equation->variance;
+    float              inverse             = 0.0F;  // 1 / alpha, once there are u's that want it
+    float*             column              = self->upper;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < count; j++) {
         float f = phi[j];

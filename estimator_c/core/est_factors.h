@@ -21,11 +21,11 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
                                   const est_config_t* const config,
                                   const est_shape_t         shape,
                                   const float               factor) {
-    const float p0        = config->p0;
-    const float p0_offset = config->p0_offset;
-    const float scale     = factor / self->weight;
-    self->weight          = 1.0F;
-    const uint_fast8_t count = est_shape_count(shape);
+    const uint_fast8_t count     = est_shape_count(shape);
+    const float        p0        = config->p0;
+    const float        p0_offset = config->p0_offset;
+    const float        scale     = factor / self->weight;
+    self->weight                 = 1.0F;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < count; j++) {
         const float d     = self->d[j] * scale;
@@ -41,7 +41,6 @@ EST_OUTLINE void est_factors_inflate(est_factors_t* const self, const est_config
 
 static inline void est_factors_reset(est_factors_t* const self, const est_config_t* const config) {
     self->weight = 1.0F;
-    EST_ROLL
     for (uint_fast8_t j = 0U; j < EST_THETA_MAX; j++) {
         self->d[j] = EST_VARIANCE_MAX;
     }
@@ -80,7 +79,8 @@ static inline void est_factors_walk(est_factors_t* const self, const est_config_
 }
 
 /// One diagonal element of P.
-static inline float est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const uint_fast8_t index) {
+static inline float
+est_factors_variance(const est_factors_t* const self, const uint_fast8_t count, const uint_fast8_t index) {
     float sum = self->d[index];
     for (uint_fast8_t k = (uint_fast8_t)(index + 1U); k < count; k++) {
         const float u = self->upper[((k * (k - 1U)) / 2U) + index];

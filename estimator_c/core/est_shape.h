@@ -16,7 +16,7 @@
 #define EST_WITH_ADAPTATION 1  ///< nc, random_walk, noise_estimated, refresh_n
 #endif
 #ifndef EST_WITH_WATCH
-#define EST_WITH_WATCH 1  ///< stuck_n, idle_n
+#define EST_WITH_WATCH 1  ///< stuck_n, idle_n, and to count what is saturated
 #endif
 
 /// Without, est_init() takes the configuration at its word. For a build whose configuration is a constant that est_config_valid()
@@ -25,51 +25,49 @@
 #define EST_WITH_CHECKS 1
 #endif
 
-/// gcc would rather call a long function than inline it for each shape.
-#if defined(__GNUC__) && !defined(__OPTIMIZE_SIZE__)
-#define EST_INLINE static inline __attribute__((always_inline))
+/// Whether the build is for size: -Os.
+#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
+#define EST_FOR_SIZE 1
 #else
-#define EST_INLINE static inline
+#define EST_FOR_SIZE 0
 #endif
 
+/// How a function becomes part of its callers: gcc guesses wrong both ways, and a build for size has a fifth more code if it is
+/// left alone.
 #ifdef __GNUC__
-#define EST_INLINE_ALWAYS static inline __attribute__((always_inline))
+#define EST_WITHIN static inline __attribute__((always_inline))
+#define EST_APART static __attribute__((noinline, unused))
 #else
-#define EST_INLINE_ALWAYS static inline
+#define EST_WITHIN static inline
+#define EST_APART static inline
 #endif
 
-/// Inline for each shape; a build for size has it once.
-#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
-#if EST_WITH_EDGES
-#define EST_SHAPED static __attribute__((noinline, unused))
+#if EST_FOR_SIZE
+#define EST_INLINE static inline  ///< inline for each shape
+#define EST_OUTLINE EST_APART     ///< short, but wanted in many places
 #else
-#define EST_SHAPED static inline
-#endif
-#define EST_SHAPES_APART 0
-#else
-#define EST_SHAPED EST_INLINE
-#define EST_SHAPES_APART 1
-#endif
-
-/// A build for size would rather call a short function than have it everywhere.
-#if defined(__GNUC__) && defined(__OPTIMIZE_SIZE__)
-#define EST_OUTLINE static __attribute__((noinline, unused))
-#else
+#define EST_INLINE EST_WITHIN
 #define EST_OUTLINE static inline
 #endif
 
-/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUTS_KEPT, which are small.
-#if defined(__GNUC__) && (defined(EST_FIXED_NA) || !defined(__OPTIMIZE_SIZE__))
-#define EST_UNROLL _Pragma("GCC unroll 8")
+/// Inline for each shape, but wanted in more than one place if edges may slip.
+#if EST_FOR_SIZE && EST_WITH_EDGES
+#define EST_SHAPED EST_APART
 #else
-#define EST_UNROLL
+#define EST_SHAPED EST_INLINE
 #endif
 
-/// A loop that gcc would rather unroll at -Os as well.
-#if defined(__GNUC__) && !EST_SHAPES_APART && !defined(EST_FIXED_NA)
+/// Loops over the parameters, and over the constants EST_NA_MAX and EST_INPUTS_KEPT, which are small; EST_ROLL: one that gcc
+/// would unroll in a build for size too.
+#if defined(__GNUC__) && (defined(EST_FIXED_NA) || !EST_FOR_SIZE)
+#define EST_UNROLL _Pragma("GCC unroll 8")
+#define EST_ROLL EST_UNROLL
+#elif defined(__GNUC__)
+#define EST_UNROLL
 #define EST_ROLL _Pragma("GCC unroll 1")
 #else
-#define EST_ROLL EST_UNROLL
+#define EST_UNROLL
+#define EST_ROLL
 #endif
 
 /// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
@@ -107,7 +105,7 @@ typedef struct {
 } est_shape_t;
 
 /// The orders that the configuration asks for, or that the build has fixed by -DEST_FIXED_NA=2U, _NB, _NK, _NC and _OFFSET.
-EST_INLINE_ALWAYS est_shape_t est_shape_of(const est_config_t* const config) {
+EST_WITHIN est_shape_t est_shape_of(const est_config_t* const config) {
 #ifdef EST_FIXED_NA
     (void)config;
     return (est_shape_t){ EST_FIXED_NA, EST_FIXED_NB, EST_FIXED_NK, EST_FIXED_NC, EST_FIXED_OFFSET };
@@ -121,7 +119,7 @@ EST_INLINE_ALWAYS est_shape_t est_shape_of(const est_config_t* const config) {
 }
 
 /// The number of parameters.
-EST_INLINE_ALWAYS uint_fast8_t est_shape_count(const est_shape_t shape) {
+EST_WITHIN uint_fast8_t est_shape_count(const est_shape_t shape) {
     return (uint_fast8_t)((uint32_t)shape.na + shape.nb + shape.nc + shape.offset);
 }
 

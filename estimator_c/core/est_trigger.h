@@ -12,9 +12,10 @@
 
 /// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
 static inline bool est_trigger_config_valid(const est_trigger_config_t* const config) {
-    const bool known = (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
-                       (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
-                       ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
+    const bool known =
+        (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
+        (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
+        ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
     return known && reset && (config->ceiling > 0.0F) && (config->ceiling <= EST_CEILING_LIMIT);
 }
@@ -87,14 +88,14 @@ EST_SHAPED float est_trigger_sum(const float before, const float innovation, con
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
-/// In every reading of the edges in doubt, the statistic already being that of the first. The plant has changed only if no
-/// reading explains the innovations.
+/// Enters the innovation in the other readings of the edges in doubt, that of what was recorded being the statistic already. The
+/// plant has changed only if no reading explains the innovations. `expires` is true iff the doubt has lasted its term.
 static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
-                                        const float          ceiling,
-                                        const float          early,
-                                        const float late,
-                                        const float          weight,
-                                        const bool           expires) {
+                                                      const float          ceiling,
+                                                      const float          early,
+                                                      const float          late,
+                                                      const float          weight,
+                                                      const bool           expires) {
     self->rival[0] = est_trigger_sum(self->rival[0], early, weight);
     self->rival[1] = est_trigger_sum(self->rival[1], late, weight);
     if (self->statistic < ceiling) {
@@ -108,7 +109,7 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
 
 /// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
 static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
-    const float term = absolute ? est_magnitude(innovation) : innovation;
+    const float  term = absolute ? est_magnitude(innovation) : innovation;
     float* const mean = &self->rival[0];
     *mean             = (self->mean_n == 0U) ? 0.0F : *mean;
     self->mean_n      = (uint16_t)(self->mean_n + ((self->mean_n < UINT16_MAX) ? 1U : 0U));
@@ -117,19 +118,19 @@ static inline float mean_between_faults(est_trigger_t* const self, const bool ab
 }
 
 static inline float custom(est_trigger_t* const              self,
-                    const est_trigger_config_t* const config,
-                    const float                       innovation,
-                    const float                       variance) {
+                           const est_trigger_config_t* const config,
+                           const float                       innovation,
+                           const float                       variance) {
     const bool anew = self->mean_n == 0U;
     self->mean_n    = 1U;
     return config->custom(config->context, innovation, variance, anew);
 }
 
-/// Of the kinds that are no cumulative sum.
+/// Of the kinds that are no cumulative sum. The one that is not named is the caller's.
 static inline float est_trigger_other_statistic(est_trigger_t* const              self,
-                                  const est_trigger_config_t* const config,
-                                  const float                       innovation,
-                                  const float                       weight) {
+                                                const est_trigger_config_t* const config,
+                                                const float                       innovation,
+                                                const float                       weight) {
     if (config->kind == EST_TRIGGER_PREDICTION_ERROR) {
         return est_magnitude(innovation);  // MISRA D4
     }
@@ -149,11 +150,12 @@ EST_INLINE float est_trigger_weight(est_trigger_t* const self, const est_trigger
     return (kind == EST_TRIGGER_NONE) ? 0.0F : (EST_CUSUM_GAIN * precision);
 }
 
-/// Enters one innovation [codes] as recorded.
-EST_INLINE void est_trigger_step(est_trigger_t* const              self,
-                                 const est_trigger_config_t* const config,
-                                 const float                       innovation,
-                                 const float                       weight) {
+/// Enters one innovation [codes], as recorded. A cumulative sum that is held at zero still tells an innovation whose square is
+/// beyond float32, or that is no number: theta has overflowed then.
+EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
+                                  const est_trigger_config_t* const config,
+                                  const float                       innovation,
+                                  const float                       weight) {
     if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && (weight > 0.0F)) {
         self->statistic = est_trigger_other_statistic(self, config, innovation, weight);
     } else {

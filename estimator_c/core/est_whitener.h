@@ -63,7 +63,7 @@ static inline void est_whitener_restart(est_whitener_t* const self) {
 }
 
 /// The autocovariance of C(z) e at this lag.
-EST_INLINE_ALWAYS float autocovariance(const float* const c, const uint_fast8_t lag) {
+EST_WITHIN float autocovariance(const float* const c, const uint_fast8_t lag) {
     float sum = (lag == 0U) ? 1.0F : c[lag - 1U];
     EST_UNROLL
     for (uint_fast8_t i = lag; i < EST_NA_MAX; i++) {
