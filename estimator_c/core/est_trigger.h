@@ -64,7 +64,6 @@ static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_tr
     if (est_trigger_in_doubt(self)) {
         self->statistic = est_trigger_best_rival(self);
     }
-    est_trigger_begin_doubt(self);
     return false;
 }
 
@@ -72,7 +71,6 @@ static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_tr
 static inline bool est_trigger_settle_late(est_trigger_t* const self) {
     const bool late = self->rival[1] < self->rival[0];
     self->statistic = est_trigger_best_rival(self);
-    est_trigger_begin_doubt(self);
     return late;
 }
 
