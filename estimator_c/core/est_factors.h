@@ -21,7 +21,7 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
                                   const est_config_t* const config,
                                   const est_shape_t         shape,
                                   const float               factor) {
-    const uint_fast8_t count     = est_shape_count(shape);
+    const uint_fast8_t count     = est_shape_count(shape);  // cppcheck F3
     const float        p0        = config->p0;
     const float        p0_offset = config->p0_offset;
     const float        scale     = factor / self->weight;

@@ -36,15 +36,13 @@
 /// is left alone.
 #ifdef __GNUC__
 #define EST_WITHIN static inline __attribute__((always_inline))
-#define EST_APART static __attribute__((noinline, unused))
 #else
 #define EST_WITHIN static inline
-#define EST_APART static inline
 #endif
 
 #if EST_FOR_SIZE
-#define EST_INLINE static inline  ///< inline for each shape
-#define EST_OUTLINE EST_APART     ///< short, but wanted in many places
+#define EST_INLINE static inline                              ///< inline for each shape
+#define EST_OUTLINE static __attribute__((noinline, unused))  ///< short, but wanted in many places
 #else
 #define EST_INLINE EST_WITHIN
 #define EST_OUTLINE static inline
@@ -52,7 +50,7 @@
 
 /// Inline for each shape, but wanted in more than one place if edges may slip.
 #if EST_FOR_SIZE && EST_WITH_EDGES
-#define EST_SHAPED EST_APART
+#define EST_SHAPED EST_OUTLINE
 #else
 #define EST_SHAPED EST_INLINE
 #endif
