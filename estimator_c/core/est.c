@@ -15,9 +15,12 @@
 #endif
 #endif
 
-/// The orders of the default configuration, as far as this build has room for them.
-#define DEFAULT_NA ((EST_NA_MAX < 2U) ? EST_NA_MAX : 2U)
-#define DEFAULT_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
+/// The orders of the default configuration, ARX(2, 3) with offset, as far as this build has room for them: the offset is the
+/// first to go, A the last.
+#define DEFAULT_NA (((EST_NA_MAX < 2U) || (EST_THETA_MAX < 3U)) ? 1U : 2U)
+#define WANTED_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
+#define DEFAULT_NB ((WANTED_NB < (EST_THETA_MAX - DEFAULT_NA)) ? WANTED_NB : (EST_THETA_MAX - DEFAULT_NA))
+#define DEFAULT_OFFSET ((DEFAULT_NA + DEFAULT_NB) < EST_THETA_MAX)
 
 /// How much less certain a slip leaves every parameter: enough for b's whose covariance is that of their neighbours (10 is
 /// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
@@ -250,7 +253,7 @@ static void doubt_edge(est_t* const self) {
     }
     const float step = self->u[0] - self->u[1];
     self->doubt_n    = 1U;
-    est_edges_begin(&self->edges, self->config, self->theta, step, self->pending_n == 0U);
+    est_edges_begin(&self->edges, self->config, self->theta, step);
     est_trigger_begin_doubt(&self->trigger);
 }
 
@@ -416,8 +419,12 @@ static void zero(float* const x, const uint_fast8_t n) {
 /// Data beyond all measure can drive theta to where its products overflow. So does the statistic then, and nothing of the
 /// estimate is worth keeping.
 static void estimate_afresh(est_t* const self) {
-    if ((self->config->trigger.reset == EST_RESET_ALL) || !(self->trigger.statistic < FLT_MAX)) {
+    const bool overflown = !(self->trigger.statistic < FLT_MAX);
+    if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
         zero(self->theta, EST_THETA_MAX);
+    }
+    if (EST_WITH_ADAPTATION && overflown) {  // the residuals among the regressors may have been, too
+        est_factors_reset(&self->factors, self->config);
     }
     self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
@@ -500,8 +507,9 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
     }
-    const float weight = est_trigger_weight(&self->trigger, config->trigger.kind, precision / self->noise_variance);
-    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, weight);
+    const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
+    const float weight = held ? 0.0F : (EST_CUSUM_GAIN * (precision / self->noise_variance));
+    est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, weight, held);
     step->innovation      = equation.innovation;
     step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
@@ -544,7 +552,7 @@ est_config_t est_config_default(void) {
         .nb             = (uint8_t)DEFAULT_NB,
         .nk             = 0U,
         .nc             = 0U,
-        .offset         = true,
+        .offset         = DEFAULT_OFFSET,
         .refresh_n      = EST_WITH_ADAPTATION ? 40U : 0U,
         .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
         .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
@@ -554,7 +562,7 @@ est_config_t est_config_default(void) {
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
-#if EST_NA_MAX >= 2
+#if (EST_NA_MAX >= 2U) && (EST_THETA_MAX >= 3U)
         .c = { -1.6F, 0.64F },
 #endif
         .edge_codes = 64.0F,

@@ -10,7 +10,8 @@
 ///
 /// The library is freestanding C99 in float32: no heap, no libm, no globals, no recursion. The caller owns the state;
 /// any number of instances may live side by side. It is not thread-safe: one instance belongs to one context, which
-/// may be an interrupt. Nothing here reads beyond, or keeps, a pointer that it is given.
+/// may be an interrupt. Of the pointers that it is given it keeps
+/// that to the configuration, which must stay as it is, and with it the context of a trigger of the caller's own.
 ///
 /// Compile every file with -ffp-contract=off: only then are the estimates the same bits on every target.
 ///

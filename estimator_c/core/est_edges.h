@@ -16,19 +16,18 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
     return est_magnitude(u[0] - u[1]) >= config->edge_codes;
 }
 
-/// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed; `after_equation` is true iff the
-/// sample before had an equation, which an edge one sample early would have entered.
+/// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed. An edge one sample early would have
+/// entered the equation before; if that was none, the gains are such that this does not count.
 EST_INLINE void est_edges_begin(est_edges_t* const        self,
                                 const est_config_t* const config,
                                 const float* const        theta,
-                                const float               step,
-                                const bool                after_equation) {
+                                const float               step) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->early.x[i] = 0.0F;
         self->late.x[i]  = 0.0F;
     }
-    if (after_equation && (config->nk == 0U)) {
+    if (config->nk == 0U) {
         self->early.x[0] = theta[config->na] * step;
     }
     EST_UNROLL

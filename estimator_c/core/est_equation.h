@@ -65,6 +65,13 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     equation->innovation = est_equation_residual(phi, theta, count);
 }
 
+/// gcc does not see that each gain is written before it is read. A build for size, in which it would call memset(), is not asked.
+#if EST_FOR_SIZE
+#define EST_ZEROED
+#else
+#define EST_ZEROED = { 0.0F }
+#endif
+
 /// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3. The forgetting
 /// factor of thesis Equ 3.21 divides the weight of P, and with it every d at once. Moves theta, and returns the reciprocal
 /// of the innovation's variance, in noise variances.
@@ -76,7 +83,7 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
     const uint_fast8_t count               = est_shape_count(shape);  // cppcheck F3
     const float* const phi                 = equation->phi;
     const float        weight              = forgetting * self->weight;
-    float              gain[EST_THETA_MAX] = { 0.0F };  // P phi, unscaled; MISRA D2
+    float              gain[EST_THETA_MAX] EST_ZEROED;  // P phi, unscaled; MISRA D2
     float              alpha               = weight * equation->variance;
     float              inverse             = 0.0F;  // 1 / alpha, once there are u's that want it
     float*             column              = self->upper;

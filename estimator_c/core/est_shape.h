@@ -68,21 +68,21 @@
 #define EST_ROLL
 #endif
 
+/// Whether anything wants to know of the edges of u.
+#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
+
 /// How many values of u are kept, u(k) included: all of the past, whatever the order needs, since a loop of fixed length is the
-/// faster one. An edge that may have come early or late wants one more.
+/// faster one. An edge takes two to be seen, and one more than the model if it may have come early or late.
 #ifdef EST_FIXED_NA
 #define EST_INPUTS_WANTED (EST_FIXED_NB + EST_FIXED_NK)
 #else
 #define EST_INPUTS_WANTED (EST_NB_MAX + EST_NK_MAX)
 #endif
-#if EST_WITH_EDGES
+#if EST_WITH_EDGES || (EST_KNOWS_EDGES && (EST_INPUTS_WANTED < 2U))
 #define EST_INPUTS_KEPT (EST_INPUTS_WANTED + 1U)
 #else
 #define EST_INPUTS_KEPT EST_INPUTS_WANTED
 #endif
-
-/// Whether anything wants to know of the edges of u.
-#define EST_KNOWS_EDGES (EST_WITH_EDGES || EST_WITH_ADAPTATION || EST_WITH_WATCH)
 
 /// One instruction where there is one.
 EST_INLINE float est_magnitude(const float x) {

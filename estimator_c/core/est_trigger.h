@@ -77,12 +77,18 @@ static inline bool est_trigger_settle_late(est_trigger_t* const self) {
 /// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
 /// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
 /// once in exp(h) samples on average: the ceiling is ln(ARL0) without any asymptotics.
-#define EST_CUSUM_GAIN 0.375F
+#define EST_CUSUM_GAIN (0.375F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
 #define EST_CUSUM_DRIFT 0.69314718F
 
-/// Not a number if the innovation is none: the comparisons with the ceiling are such that this is an alarm.
+/// A power of two, so that nothing is rounded. No plant with codes below EST_CODE_LIMIT has an innovation whose square overflows
+/// with it, 1.1e15: theta has, or is about to.
+#define EST_INNOVATION_SCALE 16384.0F
+
+/// Infinite or not a number if the innovation is beyond all measure, whatever the weight, or is none: the comparisons with the
+/// ceiling are such that this is an alarm.
 EST_SHAPED float est_trigger_sum(const float before, const float innovation, const float weight) {
-    const float sum = before + ((innovation * innovation * weight) - EST_CUSUM_DRIFT);
+    const float scaled = EST_INNOVATION_SCALE * innovation;
+    const float sum    = before + ((scaled * scaled * weight) - EST_CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
@@ -138,23 +144,22 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
     return custom(self, config, innovation, EST_CUSUM_GAIN / weight);
 }
 
-/// The weight of a squared innovation in the cumulative sum, from the reciprocal of its predicted variance [codes^-2]: none
-/// while the statistic is held at zero.
-EST_INLINE float est_trigger_weight(est_trigger_t* const self, const est_trigger_kind_t kind, const float precision) {
+/// Whether the statistic is held at zero.
+EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_kind_t kind) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
-        return 0.0F;  // MISRA D4
+        return true;  // MISRA D4
     }
-    return (kind == EST_TRIGGER_NONE) ? 0.0F : (EST_CUSUM_GAIN * precision);
+    return kind == EST_TRIGGER_NONE;
 }
 
-/// Enters one innovation [codes], as recorded. A cumulative sum that is held at zero still tells an innovation whose square is
-/// beyond float32, or that is no number: theta has overflowed then.
+/// Enters one innovation [codes], as recorded, whose square has this weight in the cumulative sum: none while that is held.
 EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const est_trigger_config_t* const config,
                                   const float                       innovation,
-                                  const float                       weight) {
-    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && (weight > 0.0F)) {
+                                  const float                       weight,
+                                  const bool                        held) {
+    if (EST_WITH_TRIGGERS && (config->kind != EST_TRIGGER_CUSUM) && !held) {
         self->statistic = est_trigger_other_statistic(self, config, innovation, weight);
     } else {
         self->statistic = est_trigger_sum(self->statistic, innovation, weight);
