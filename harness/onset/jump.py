@@ -304,6 +304,8 @@ class Problem:
         course = _course(
             np.where(later[:, None, None], new.transition, old.transition),
             np.where(later[:, None], new.inputs(self.signals, guess.new[0]), old.inputs(self.signals, guess.old[0])),
+            self.signals,
+            guess.offset,
         )
         return (
             Forwards.of(old, self.signals, Columns.of(old, self.signals, course, (guess.offset, guess.old[0]))),
@@ -419,7 +421,7 @@ def _settled(
     for _ in range(rounds if len(signals) >= _LEAST_FIT_N else 0):
         model = Model.of(beside(plant, guess.old), guess.edges, signals)
         transitions = np.broadcast_to(model.transition, (len(signals), 2, 2))
-        course = _course(transitions, model.inputs(signals, guess.old[0]))
+        course = _course(transitions, model.inputs(signals, guess.old[0]), signals, guess.offset)
         filtered = Forwards.of(model, signals, Columns.of(model, signals, course, (guess.offset, guess.old[0])))
         rows = np.zeros((_COMMON + _OWN, 1 + _COMMON + _OWN))
         rows[:, 0] = [guess.offset - first.offset, guess.edges.mean - first.edges.mean, *(guess.old - first.old)]
@@ -440,9 +442,20 @@ def _minimum(form: Array) -> tuple[Array, Array]:
     return at, np.asarray(form[:, 0, 0] + (form[:, 0, 1:] * at).sum(axis=1))
 
 
-def _course(transitions: Array, inputs: Array) -> Array:
-    """(n, 2): the state at each sample, from rest."""
-    return np.concatenate([np.zeros((1, 2)), scan(transitions[:-1], inputs[:-1, :, None])[:, :, 0]])
+def _course(transitions: Array, inputs: Array, signals: Signals, offset: float) -> Array:
+    """(n, 2): the state at each sample, from that at the first one which explains the displacement best (least
+    squares). Nothing says that a window begins at rest.
+
+    :param offset: of the displacement, in the rms of its noise.
+    """
+    factors = np.concatenate([np.eye(2)[None], transitions[:-1]])
+    terms = np.zeros((len(signals), 2, 3))
+    terms[0, :, 1:] = np.eye(2)
+    terms[1:, :, 0] = inputs[:-1]
+    forced, free = np.split(scan(factors, terms), [1], axis=2)
+    left = signals.displacement_m / signals.noise_m - offset - forced[:, 0, 0]
+    first = np.linalg.lstsq(free[signals.valid, 0], left[signals.valid])[0]
+    return np.asarray(forced[:, :, 0] + free @ first)
 
 
 def beside(plant: Plant, own: Array) -> Plant:

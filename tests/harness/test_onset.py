@@ -233,6 +233,16 @@ def test_another_change_nearby_is_kept_out() -> None:
         onset(signals, FRONT, SOFT, range(500, 650), within=range(550, 700))
 
 
+def test_change_between_two_others_is_found_from_the_few_samples_about_its_range() -> None:
+    """49 samples before the range and 50 after it, which begin while the mass is on its way from the change before."""
+    for seed in range(40):
+        signals = simulated([(0, SOFT), (300, FRONT), (550, SOFT)], 800, seed)
+        out = onset(signals, FRONT, SOFT, range(350, 750), within=range(301, 800), confidence=0.999)
+        assert isinstance(out, Onset), (seed, out)
+        assert out.low <= 550 <= out.high, (seed, out)
+        assert out.high - out.low < 50, (seed, out)  # it is at the latest edge, or at the next
+
+
 def test_samples_of_something_else_are_refused() -> None:
     signals = simulated([(0, FRONT), (600, SOFT)], 1200, seed=19)
     turned_round = dataclasses.replace(signals, displacement_m=signals.displacement_m[::-1].copy())
