@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Self
 
@@ -61,7 +61,7 @@ _LOCKED = 0.05
 _TOO_NARROW = 1.5
 """Variance of what is left of the samples, in that of the noise, with which the edges may come elsewhere after all."""
 _HELD = 1e-3
-"""Standard deviation of what other samples have told."""
+"""Standard deviation of an offset of the displacement that the offsets of the force are to go with."""
 
 _ROUNDS = 8
 _SETTLED = 5e-3
@@ -286,16 +286,16 @@ class Problem:
             self.signals.part(self.candidates.stop, len(self.signals)),
         )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        guess, cost, innovation = _settled(earlier, self.before, guess, known)
-        locked = _settled(earlier, self.before, dataclasses.replace(guess, half_width=_LOCKED), known)
-        if locked[1] < cost:
-            guess, _, innovation = locked
-        known = np.array([_HELD, _HELD, *np.hypot(self.moves, known[_COMMON:])])
-        after, _, innovation_after = _settled(later, self.after, guess, known)
-        every = [innovation, innovation_after]
+        fit = _settled(earlier, self.before, guess, known)
+        locked = _settled(earlier, self.before, dataclasses.replace(fit.guess, half_width=_LOCKED), known)
+        if locked.cost < fit.cost:
+            fit = locked
+        known = np.array([_HELD, fit.place_deviation, *np.hypot(self.moves, known[_COMMON:])])
+        after = _settled(later, self.after, fit.guess, known)
+        every = [fit.innovation, after.innovation]
         settled = np.concatenate([each[_SETTLING_N:] for each in every])
         left = float(settled @ settled) / len(settled) if len(settled) >= _LEAST_FIT_N else 1.0
-        return dataclasses.replace(guess, new=after.old, left=left, colour=colour(every))
+        return dataclasses.replace(after.guess, old=fit.guess.old, new=after.guess.old, left=left, colour=colour(every))
 
     def filters(self, guess: Guess) -> tuple[Forwards, Backwards]:
         """Of the plant as it was, and of the plant as it then is."""
@@ -304,6 +304,8 @@ class Problem:
         course = _course(
             np.where(later[:, None, None], new.transition, old.transition),
             np.where(later[:, None], new.inputs(self.signals, guess.new[0]), old.inputs(self.signals, guess.old[0])),
+            self.signals,
+            guess.offset,
         )
         return (
             Forwards.of(old, self.signals, Columns.of(old, self.signals, course, (guess.offset, guess.old[0]))),
@@ -351,7 +353,7 @@ class Problem:
                 " variance of their noise"
             )
         known = np.array([_OFFSET, _PLACE, _OFFSET, *[_NOMINAL] * len(PARAMETERS)])
-        _, none, _ = _settled(self.signals, self.before, guess, known, rounds=1)
+        none = _settled(self.signals, self.before, guess, known, rounds=1).cost
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if none - cost < chance * doubt(guess, unexplained):
             return NoOnset(f"nothing in the samples {self._searched} shows that the plant has changed", unchanged=True)
@@ -406,32 +408,47 @@ def colour(innovations: Sequence[Array]) -> float:
     return max(1.0, variance)
 
 
-def _settled(
-    signals: Signals, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS
-) -> tuple[Guess, float, Array]:
-    """The guess with its offset, place and ``old`` moved to what these samples of one plant say, twice the negative
-    logarithm of their likelihood, and the innovations.
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What samples of one plant say."""
+
+    guess: Guess
+    """With offset, place and ``old`` as they say."""
+    place_deviation: float
+    """Standard deviation with which the place is known then: that of before, where the samples have no edge."""
+    cost: float = 0.0
+    """Twice the negative logarithm of the likelihood."""
+    innovation: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def _settled(signals: Signals, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS) -> _Fit:
+    """From a guess; too few samples say nothing.
 
     :param known: (6,) standard deviations of what is known beforehand: the guess.
     """
-    cost, innovation = 0.0, np.zeros(0)
+    fit = _Fit(guess, float(known[1]))
     first = guess
     for _ in range(rounds if len(signals) >= _LEAST_FIT_N else 0):
-        model = Model.of(beside(plant, guess.old), guess.edges, signals)
+        last = fit.guess
+        model = Model.of(beside(plant, last.old), last.edges, signals)
         transitions = np.broadcast_to(model.transition, (len(signals), 2, 2))
-        course = _course(transitions, model.inputs(signals, guess.old[0]))
-        filtered = Forwards.of(model, signals, Columns.of(model, signals, course, (guess.offset, guess.old[0])))
+        course = _course(transitions, model.inputs(signals, last.old[0]), signals, last.offset)
+        filtered = Forwards.of(model, signals, Columns.of(model, signals, course, (last.offset, last.old[0])))
         rows = np.zeros((_COMMON + _OWN, 1 + _COMMON + _OWN))
-        rows[:, 0] = [guess.offset - first.offset, guess.edges.mean - first.edges.mean, *(guess.old - first.old)]
+        rows[:, 0] = [last.offset - first.offset, last.edges.mean - first.edges.mean, *(last.old - first.old)]
         rows[:, 1:] = np.eye(_COMMON + _OWN)
         rows /= known[:, None]
-        unknowns, fit = _minimum((filtered.misfit[-1] + rows.T @ rows)[None])
-        cost = float(fit[0] + filtered.log[-1])
-        innovation = filtered.innovation @ np.append(1.0, unknowns[0])
-        last, guess = guess, guess.moved(Move(np.append(unknowns[0], np.zeros(_OWN)), guess.sample))
-        if guess.near(last):
+        form = filtered.misfit[-1] + rows.T @ rows
+        unknowns, left = _minimum(form[None])
+        fit = _Fit(
+            last.moved(Move(np.append(unknowns[0], np.zeros(_OWN)), last.sample)),
+            float(np.linalg.inv(form[1:, 1:])[1, 1] ** 0.5),
+            float(left[0] + filtered.log[-1]),
+            filtered.innovation @ np.append(1.0, unknowns[0]),
+        )
+        if fit.guess.near(last):
             break
-    return guess, cost, innovation
+    return fit
 
 
 def _minimum(form: Array) -> tuple[Array, Array]:
@@ -440,9 +457,20 @@ def _minimum(form: Array) -> tuple[Array, Array]:
     return at, np.asarray(form[:, 0, 0] + (form[:, 0, 1:] * at).sum(axis=1))
 
 
-def _course(transitions: Array, inputs: Array) -> Array:
-    """(n, 2): the state at each sample, from rest."""
-    return np.concatenate([np.zeros((1, 2)), scan(transitions[:-1], inputs[:-1, :, None])[:, :, 0]])
+def _course(transitions: Array, inputs: Array, signals: Signals, offset: float) -> Array:
+    """(n, 2): the state at each sample, from that at the first one which explains the displacement best (least
+    squares). Nothing says that a window begins at rest.
+
+    :param offset: of the displacement, in the rms of its noise.
+    """
+    factors = np.concatenate([np.eye(2)[None], transitions[:-1]])
+    terms = np.zeros((len(signals), 2, 3))
+    terms[0, :, 1:] = np.eye(2)
+    terms[1:, :, 0] = inputs[:-1]
+    forced, free = np.split(scan(factors, terms), [1], axis=2)
+    left = signals.displacement_m / signals.noise_m - offset - forced[:, 0, 0]
+    first = np.linalg.lstsq(free[signals.valid, 0], left[signals.valid])[0]
+    return np.asarray(forced[:, :, 0] + free @ first)
 
 
 def beside(plant: Plant, own: Array) -> Plant:

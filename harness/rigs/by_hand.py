@@ -21,10 +21,13 @@ that it stood."""
 
 LEAST_SEARCH_N = 8
 
-_BESIDE_N = 200
-"""So far beside its sample a tweak of the instrument is looked for ..."""
 _PLAIN = 1000.0
-"""... and with so much information, in the sense of ``harness.information``, it cannot but be found."""
+"""With so much information, in the sense of ``harness.information``, a change cannot but be found."""
+_BEYOND_DOUBT = 1.0 - 1e-6
+"""With which the samples must date a turn elsewhere: of a hundred campaigns of ten thousand turns each on a sound rig,
+one has a turn that is doubted."""
+_GRACE_N = 1
+"""An instrument's own instants lie between its samples."""
 
 
 @dataclass(frozen=True)
@@ -131,21 +134,22 @@ def _dated(signals: Signals, tweak: Tweak, search: range, within: range, *, slow
 def doubts(signals: Signals, tweaks: Sequence[Tweak], first: int) -> list[str]:
     """What the samples of a record say against tweaks whose instants are taken for exact.
 
-    The interval in which the samples date a turn leaves it out now and then: of a sound rig too, once in so many. An
-    instant is doubted that lies outside by more than the interval is wide.
+    Each is looked for in all samples that no other one changes: where it came is what is in doubt, and a search that
+    ends near the instant that is told would take the turn itself for what is amiss with the plant around it.
     """
     out = []
     starts = [tweak.sample for tweak in tweaks]
     for tweak, before, after in zip(tweaks, [0, *starts], [*starts[1:], len(signals)], strict=False):
-        search = range(max(tweak.sample - _BESIDE_N, before + 2), min(tweak.sample + _BESIDE_N, after - 1))
+        search = range(before + 2, after - 1)
         if len(search) < LEAST_SEARCH_N:
             continue
-        found = onset(signals, tweak.before, tweak.after, search, within=range(before + 1, after))
+        alone = range(before + 1, after)
+        found = onset(signals, tweak.before, tweak.after, search, within=alone, confidence=_BEYOND_DOUBT)
         where = f"the pot that was to be turned at sample {first + tweak.sample} ({tweak.words})"
         if isinstance(found, NoOnset):
             if found.unchanged and _is_plain(signals, tweak, range(tweak.sample, after)):
                 out.append(f"{where}: {found.reason}")
-        elif not found.low - 1 - (width := found.high - found.low) <= tweak.sample <= found.high + 1 + width:
+        elif not found.low - _GRACE_N <= tweak.sample <= found.high + _GRACE_N:
             span = f"{first + found.low} to {first + found.high}"
             out.append(f"{where} was turned at {first + found.sample} ({span}) by the samples")
     return out

@@ -1,27 +1,41 @@
 """How well the instant of a turn is learned from the samples: coverage of its interval, and its width beside the least
 that any could have. Trials of tests.harness.onsets; fixed seeds.
 
-python -m tests.benchmarks.bench_onset [jump] [ramp] [still]
+python -m tests.benchmarks.bench_onset [jump] [ramp] [still] [several]
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from harness.onset.jump import NoOnset, Onset
+from harness.onset.jump import NoOnset, Onset, onset
 from harness.onset.turn import SlowTurn
+from harness.rigs.by_hand import Tweak, doubts
+from harness.rigs.description import open_rig
+from harness.rigs.rig import Rig
 from harness.statistics import lower_rate
-from tests.harness.onsets import Clock, Trial, still
+from tests.harness.onsets import Clock, Several, Trial, still
+from tests.harness.served import served
 
 from .figure import Figure
 
-JUMPS_N, RAMPS_N, STILL_N = 500, 100, 100
+JUMPS_N, RAMPS_N, STILL_N, SEVERAL_N = 500, 100, 100, 50
 CLOCKS: tuple[Clock, ...] = ("card", "free")
+
+WRONG_BY_N = (2, 5, 10, 30, 100)
+SIZES = {"below 10 %": 0.1, "below 20 %": 0.2, "below 40 %": 0.4, "more": 1.0}
+"""Of a change, as a part of the larger value."""
+WRONG_N = 25
+"""Records, of which every turn is told wrong."""
 
 Found = TypeVar("Found", Onset, SlowTurn)
 
@@ -84,6 +98,65 @@ def quiet(trials: int = STILL_N) -> Iterator[Figure]:
         yield _coverage(f"no turn, clock {clock}: said so", said, trials)
 
 
+def several(records: int = SEVERAL_N) -> Iterator[Figure]:
+    """Eight turns a record, each looked for in all samples that no other one changes; then told wrong instants of."""
+    for clock in CLOCKS:
+        yield from _told(f"several, clock {clock}", [Several.of(seed, clock) for seed in range(records)])
+    with _served() as rig:
+        every = [Several.of(seed, "card", rig) for seed in range(records)]
+    yield from _told("several, served", every)
+    yield from _wrong("several, served", every[:WRONG_N])
+
+
+@contextlib.contextmanager
+def _served() -> Iterator[Rig]:
+    with (
+        served() as instrument,
+        tempfile.TemporaryDirectory() as folder,
+        open_rig(str(instrument.rigs_file(Path(folder)))) as rig,
+    ):
+        yield rig
+
+
+def _told(name: str, every: Sequence[Several]) -> Iterator[Figure]:
+    held, unseen, silent = [], 0, []
+    for record in every:
+        for tweak, alone in record.stretches():
+            search = range(alone.start + 1, alone.stop - 1)
+            found = onset(record.signals, tweak.before, tweak.after, search, within=alone)
+            held.append(isinstance(found, Onset) and _holds(found, tweak.sample))
+            unseen += isinstance(found, NoOnset)
+            silent.append(not _doubted(record, tweak, alone, 0))
+    yield _coverage(f"{name}: instants within the interval", held, len(held))
+    yield Figure(f"{name}: nothing found", unseen, f"of {len(held)}")
+    yield _coverage(f"{name}: true instants that are not doubted", silent, len(silent))
+
+
+def _wrong(name: str, every: Sequence[Several]) -> Iterator[Figure]:
+    """By the error of the instant, either way, and the size of the change."""
+    for error_n in WRONG_BY_N:
+        said: dict[str, list[bool]] = {size: [] for size in SIZES}
+        for record in every:
+            for tweak, alone in record.stretches():
+                said[_size(tweak)] += [_doubted(record, tweak, alone, each) for each in (-error_n, error_n)]
+        by_size = ", ".join(f"{size}: {np.mean(each):.2f} of {len(each)}" for size, each in said.items())
+        share = float(np.mean(np.concatenate(list(said.values()))))
+        yield Figure(f"{name}: doubted if wrong by {error_n} samples", share, by_size)
+
+
+def _size(tweak: Tweak) -> str:
+    (old, new), *_ = tweak.before.changes_to(tweak.after).values()
+    part = 1.0 - min(old, new) / max(old, new)
+    return next(size for size, most in SIZES.items() if part < most)
+
+
+def _doubted(record: Several, tweak: Tweak, alone: range, error_n: int) -> bool:
+    """The turn by itself, told so many samples beside where it was."""
+    first = alone.start - 1
+    told = dataclasses.replace(tweak, sample=tweak.sample - first + error_n)
+    return bool(doubts(record.signals.part(first, alone.stop), [told], first))
+
+
 def _coverage(name: str, held: list[bool], trials: int) -> Figure:
     remark = (
         f"of {len(held)}; {trials - len(held)} of {trials} trials without an onset"
@@ -93,7 +166,7 @@ def _coverage(name: str, held: list[bool], trials: int) -> Figure:
     return Figure(name, sum(held) / len(held), remark, bounds=(lower_rate(sum(held), len(held), 0.99), 1.0))
 
 
-PARTS: Mapping[str, Callable[[], Iterator[Figure]]] = {"jump": jumps, "ramp": ramps, "still": quiet}
+PARTS: Mapping[str, Callable[[], Iterator[Figure]]] = {"jump": jumps, "ramp": ramps, "still": quiet, "several": several}
 
 
 def figures(*parts: str) -> Iterator[Figure]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +18,9 @@ from harness.onset.jump import NoOnset, Onset, onset
 from harness.onset.turn import SlowTurn, turn
 from harness.onset.two_filter import Signals
 from harness.plant import PARAMETERS, Plant, SampledPlant
+from harness.rigs.by_hand import Tweak as Told
 from harness.rigs.emulator import EmulatorDescription, EmulatorRig
+from harness.rigs.rig import Rig
 from harness.scenario import PLANTS, Scenario, Tweak
 
 FRONT = PLANTS["front"]
@@ -42,9 +45,9 @@ def machines() -> EmulatorRig:
     return EmulatorRig(dataclasses.replace(described, computer=computer))
 
 
-def played(scenario: Scenario, seed: int) -> Signals:
-    """What the card takes of it."""
-    performance = machines().perform(scenario, seed)
+def played(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
+    """What the card takes of it; on one of the machines, or another rig."""
+    performance = (rig or machines()).perform(scenario, seed)
     blocks = list(performance.blocks)
     codes, clipped = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("codes", "clipped"))
     return Signals.of(codes, clipped, performance.channels, performance.sample_period_s * performance.time_scale)
@@ -54,16 +57,17 @@ def scenario_of(
     samples: int, clock: Clock, frequency_hz: float, plant: Plant = FRONT, sample: int = 0, ramp_n: int = 0
 ) -> Scenario:
     """The front suspension, which becomes ``plant`` at a sample."""
-    changed = {FIELDS[name]: new for name, (_, new) in FRONT.changes_to(plant).items()}
-    return Scenario(
-        samples=samples,
-        excitation=Excitation(
-            low_v=0.1, high_v=9.9, frequency_hz=frequency_hz, clock=clock, drift_ppm=20.0 if clock == "free" else 0.0
-        ),
-        random_phase=True,
-        tweaks=(Tweak(sample, ramp_n=ramp_n, **changed),) if changed else (),
-        name="onset",
-    )
+    tweaks = (tweak_of(sample, FRONT, plant, ramp_n),) if plant != FRONT else ()
+    return Scenario(samples, square(clock, frequency_hz, 9.9), random_phase=True, tweaks=tweaks, name="onset")
+
+
+def square(clock: Clock, frequency_hz: float, high_v: float) -> Excitation:
+    drift_ppm = 20.0 if clock == "free" else 0.0
+    return Excitation(low_v=0.1, high_v=high_v, frequency_hz=frequency_hz, clock=clock, drift_ppm=drift_ppm)
+
+
+def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> Tweak:
+    return Tweak(sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()})
 
 
 def changed(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
@@ -136,6 +140,39 @@ class Trial:
             changed = k >= samples
             x, v = np.where(changed, xb, xa), np.where(changed, vb, va)
         return np.array(out).T
+
+
+@dataclass(frozen=True, eq=False)
+class Several:
+    """Turns of one record, told to the sample."""
+
+    signals: Signals
+    tweaks: tuple[Told, ...]
+
+    @classmethod
+    def of(cls, seed: int, clock: Clock, rig: Rig | None = None) -> Several:
+        """Eight, 150 to 600 samples apart: one of M, B, K by 5 to 74 %, and back. The force is such that no amplifier
+        comes to its end where K is least."""
+        rng = np.random.default_rng([12, seed])
+        away = [changed(rng, 0.05, 0.74, together=1) for _ in range(4)]
+        plants = [FRONT, *(plant for each in away for plant in (each, FRONT))]
+        instants = 600 + np.append(0, np.cumsum(rng.integers(150, 600, size=8)))
+        pairs = list(zip(instants.tolist(), plants, plants[1:], strict=False))
+        softest = min(1.0, *(plant.stiffness_n_per_m / FRONT.stiffness_n_per_m for plant in away))
+        scenario = Scenario(
+            samples=int(instants[-1]),
+            excitation=square(clock, float(rng.choice([100.0, 200.0])), 9.0 * softest),
+            random_phase=True,
+            tweaks=tuple(tweak_of(*pair) for pair in pairs),
+            name="several",
+        )
+        return cls(played(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
+
+    def stretches(self) -> Iterator[tuple[Told, range]]:
+        """Each turn with the samples that no other one changes."""
+        starts = [tweak.sample for tweak in self.tweaks]
+        for tweak, before, after in zip(self.tweaks, [0, *starts], [*starts[1:], len(self.signals)], strict=False):
+            yield tweak, range(before + 1, after)
 
 
 def _next(

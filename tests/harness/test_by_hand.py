@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pytest
 
 from harness.links.wire import VirtualClock
 from harness.onset.two_filter import Signals
 from harness.plant import Plant
-from harness.rigs.by_hand import ByHand, Tweak
+from harness.rigs.by_hand import ByHand, Tweak, doubts
 from harness.scenario import Tweak as PlayedTweak
-from tests.harness.onsets import FRONT, played, scenario_of
+from tests.harness.onsets import FRONT, Clock, Several, played, scenario_of
 
 RATE_HZ = 20e3
 
@@ -132,3 +133,28 @@ def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> No
     tweaks = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
     (segment,) = turned(tweaks, takes_s=0.01).dated(taken(1100), first=0)
     assert (segment.plant, bool(segment.unseen)) == (light, True)
+
+
+# ---- instants that are taken for exact
+
+
+@pytest.mark.parametrize("clock", ["card", "free"])
+def test_turns_at_the_very_instants_that_are_told_are_not_doubted(clock: Clock) -> None:
+    """24 turns each. ``make bench ARGS=onset`` has 400."""
+    for seed in range(3):
+        several = Several.of(seed, clock)
+        assert doubts(several.signals, several.tweaks, first=0) == []
+
+
+@pytest.mark.parametrize("error_n", [-900, -250, -30, -2, 2, 30, 250, 900])
+def test_instant_that_is_wrong_is_doubted_wherever_the_pot_was_turned(error_n: int) -> None:
+    """K falls by a fifth while the mass is on its way."""
+    stiff = FRONT.scaled("K", 0.8)
+    quiet = taken(4000)
+    moving = 2004 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[2000:])) > 1000.0)[0])
+    signals = taken(4000, PlayedTweak(moving, stiffness_n_per_m=stiff.stiffness_n_per_m))
+    (said,) = doubts(signals, [asked(moving + error_n, {}, FRONT, stiff)], first=5000)
+    assert said == (
+        f"the pot that was to be turned at sample {5000 + moving + error_n} (K 19600) was turned at {5000 + moving}"
+        f" ({5000 + moving} to {5000 + moving}) by the samples"
+    )

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator import COMPONENTS, Excitation, SuspensionComputer
-from harness.onset.jump import NoOnset, Onset, colour, interval, onset
+from harness.onset.jump import NoOnset, Onset, Problem, colour, interval, onset
 from harness.onset.turn import SlowTurn, turn
 from harness.onset.two_filter import ANYWHERE, Backwards, Columns, EdgePlace, Forwards, Model, Signals, joined
 from harness.plant import Plant, SampledPlant
@@ -231,6 +231,27 @@ def test_another_change_nearby_is_kept_out() -> None:
     assert onset(signals, FRONT, SOFT, range(500, 650), within=range(700)) == Onset(600, 600, 600)
     with pytest.raises(ValueError, match=r"leaves range\(550, 700\), in which the plant changes no other time"):
         onset(signals, FRONT, SOFT, range(500, 650), within=range(550, 700))
+
+
+def test_change_between_two_others_is_found_from_the_few_samples_about_its_range() -> None:
+    """49 samples before the range and 50 after it, which begin while the mass is on its way from the change before."""
+    for seed in range(20):
+        signals = simulated([(0, SOFT), (300, FRONT), (550, SOFT)], 800, seed)
+        out = onset(signals, FRONT, SOFT, range(350, 750), within=range(301, 800), confidence=0.999)
+        assert isinstance(out, Onset), (seed, out)
+        assert out.low <= 550 <= out.high, (seed, out)
+        assert out.high - out.low < 50, (seed, out)  # it is at the latest edge, or at the next
+
+
+def test_place_that_only_the_samples_after_the_range_tell_is_not_taken_for_noise() -> None:
+    """In half of the records no edge comes within the 49 samples before the range. What is left of some 60 samples is
+    their noise, on average over 16 records to 5 %."""
+    ratios = []
+    for seed in range(16):
+        signals = simulated([(0, SOFT), (300, FRONT), (550, SOFT)], 800, seed, place=0.3, half_n=100)
+        problem = Problem.of(signals, FRONT, SOFT, range(350, 750), range(301, 800))
+        ratios.append(problem.fit().left * (problem.signals.noise_m / signals.noise_m) ** 2)
+    assert 0.85 < np.mean(ratios) < 1.15
 
 
 def test_samples_of_something_else_are_refused() -> None:
