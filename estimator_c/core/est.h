@@ -10,8 +10,8 @@
 ///
 /// The library is freestanding C99 in float32: no heap, no libm, no globals, no recursion. The caller owns the state;
 /// any number of instances may live side by side. It is not thread-safe: one instance belongs to one context, which
-/// may be an interrupt. Of the pointers that it is given it keeps
-/// that to the configuration, which must stay as it is, and with it the context of a trigger of the caller's own.
+/// may be an interrupt. Of the pointers that it is given it keeps that to the configuration, which must stay as it
+/// is, and with it the context of a trigger of the caller's own.
 ///
 /// Compile every file with -ffp-contract=off: only then are the estimates the same bits on every target.
 ///
@@ -112,7 +112,8 @@ typedef enum {
     EST_EDGES_LOCKED = 0,
     /// At nearly the same place, but it may drift across a sampling instant: then the edge is recorded one sample earlier
     /// or later than before, and no alarm is raised for that alone. For a generator on a clock of its own whose period is
-    /// a whole number of samples, to some 20 ppm: the forgetting must follow what the drift does to the b's.
+    /// a whole number of samples, to some 20 ppm: the forgetting must follow what the drift does to the b's. With the
+    /// cumulative sum; to any other trigger such an edge is one of EST_EDGES_LOCKED.
     EST_EDGES_MAY_SLIP = 1,
     /// Anywhere, and each elsewhere: what an edge did to the plant within its interval is unknown, so that the na equations
     /// that involve it are left out. For any generator; costs some 10 % of latency.
@@ -175,7 +176,7 @@ typedef struct {
     bool         alarm;       ///< the plant has changed: theta is being estimated afresh from the next sample on
     bool         idle;        ///< excitation is lost: the estimate can only be as good as it was
     float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1), [codes]; 0 unless status is EST_UPDATED
-    float        statistic;   ///< the trigger's statistic after this sample, before any reset by the alarm
+    float        statistic;   ///< the trigger's statistic after this sample, before any reset by an alarm or a gap
 } est_step_t;
 
 /// Counters since est_init(). They saturate, they do not wrap.

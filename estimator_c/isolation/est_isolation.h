@@ -1,8 +1,8 @@
 /// est_isolation: after an alarm of est.h, which of mass, damping and stiffness has changed, by how much, and since when
 /// (thesis 6.2.1.2, left open there).
 ///
-/// The plant is M x'' + B x' + K x = F. It serves any estimator with na = 2, whatever nk, nb and
-/// offset: neither T nor M, B, K need be known. estimator_c/README.md derives it.
+/// The plant is M x'' + B x' + K x = F. It serves any estimator with na = 2 and nb + nk <= 3, with or
+/// without offset: neither T nor M, B, K need be known. estimator_c/README.md derives it.
 ///
 /// Optional: est.c does not know of it, and what is not called is not linked. The caller owns the state. Two contexts of
 /// different priority must not be in it at the same time.
@@ -118,7 +118,7 @@ typedef struct {
 
 /// Ready for the first sample of an estimator with this configuration, which is kept as est_init() keeps it. `force_zero` is
 /// u where F = 0 [codes]: what the spring carries is counted from there.
-/// False iff na is not 2 or the trigger is not the cumulative sum: the plant is then not one of mass, damper and spring, or
+/// False iff na is not 2, nb + nk is beyond 3 or the trigger is not the cumulative sum: the plant is then not one of mass, damper and spring, or
 /// nothing tells when it was last well. The state is then unusable. Cost: constant. May be called from an interrupt.
 bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
