@@ -225,6 +225,7 @@ class Twin:
             self.refresh = Refresh.WAITS
             if not self.pending:
                 self.whitener.restart()
+                self.residuals = [0.0] * self.config.nc
                 self.settled = False
             step = TwinStep(statistic=self.statistic)
         else:

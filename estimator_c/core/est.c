@@ -15,12 +15,27 @@
 #endif
 #endif
 
-/// The orders of the default configuration, ARX(2, 3) with offset, as far as this build has room for them: the offset is the
-/// first to go, A the last.
-#define DEFAULT_NA (((EST_NA_MAX < 2U) || (EST_THETA_MAX < 3U)) ? 1U : 2U)
+/// The orders of the default configuration: those that the build has fixed, or ARX(2, 3) with offset as far as there is room, the
+/// offset being the first to go, A the last.
+#ifdef EST_FIXED_NA
+#define DEFAULT_NA EST_FIXED_NA
+#define DEFAULT_NB EST_FIXED_NB
+#define DEFAULT_NK EST_FIXED_NK
+#define DEFAULT_NC EST_FIXED_NC
+#define DEFAULT_OFFSET EST_FIXED_OFFSET
+#else
+#if (EST_NA_MAX < 2) || (EST_THETA_MAX < 3)
+#define DEFAULT_NA 1U
+#else
+#define DEFAULT_NA 2U
+#endif
 #define WANTED_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
-#define DEFAULT_NB ((WANTED_NB < (EST_THETA_MAX - DEFAULT_NA)) ? WANTED_NB : (EST_THETA_MAX - DEFAULT_NA))
+#define ROOM_NB (EST_THETA_MAX - DEFAULT_NA)
+#define DEFAULT_NB ((WANTED_NB < ROOM_NB) ? WANTED_NB : ROOM_NB)
+#define DEFAULT_NK 0U
+#define DEFAULT_NC 0U
 #define DEFAULT_OFFSET ((DEFAULT_NA + DEFAULT_NB) < EST_THETA_MAX)
+#endif
 
 /// How much less certain a slip leaves every parameter: enough for b's whose covariance is that of their neighbours (10 is
 /// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
@@ -135,6 +150,12 @@ static inline uint8_t past_n(const est_config_t* const config) {
     return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
 }
 
+static void zero(float* const x, const uint_fast8_t n) {
+    for (uint_fast8_t i = 0U; i < n; i++) {
+        x[i] = 0.0F;
+    }
+}
+
 /// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
 /// did on u(k), or the other way round.
 static void follow_slip(est_t* const self, const bool late) {
@@ -189,6 +210,15 @@ static void renew(est_t* const self) {
     self->renewal = EST_RENEWAL_NONE;
 }
 
+/// They are of the equations before, and may be beyond all measure.
+EST_INLINE void forget_residuals(est_t* const self) {
+#if EST_NC_MAX > 0
+    zero(self->residual, EST_NC_MAX);
+#else
+    (void)self;
+#endif
+}
+
 /// One sample less to come before the next equation is complete. There is time here for what the step that found a change
 /// left to do: that one is long enough.
 EST_OUTLINE void gather(est_t* const self) {
@@ -197,6 +227,7 @@ EST_OUTLINE void gather(est_t* const self) {
     renew(self);
     if (self->pending_n == 0U) {
         est_whitener_restart(&self->whitener);
+        forget_residuals(self);
         self->settled = false;
         count(&self->counters.restarts);
     }
@@ -410,12 +441,6 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-static void zero(float* const x, const uint_fast8_t n) {
-    for (uint_fast8_t i = 0U; i < n; i++) {
-        x[i] = 0.0F;
-    }
-}
-
 /// Data beyond all measure can drive theta to where its products overflow. So does the statistic then, and nothing of the
 /// estimate is worth keeping.
 static void estimate_afresh(est_t* const self) {
@@ -497,18 +522,11 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     est_equation_fill(self, shape, y, equation.phi);
     est_equation_whiten(&equation, shape, &self->whitener, self->theta);
     const float precision = est_equation_measure(&self->factors, config->forgetting, shape, &equation, self->theta);
-    if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
-        self->refresh_in--;
-    } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
-        consider_refresh(self, shape);
-    } else {
-        // C stays
-    }
     if (EST_WITH_ADAPTATION && self->adaptive) {
         adapt(self, equation.phi, equation.innovation, precision);
     }
     const bool  held   = est_trigger_holds(&self->trigger, config->trigger.kind);
-    const float weight = held ? 0.0F : (EST_CUSUM_GAIN * (precision / self->noise_variance));
+    const float weight = (held ? 0.0F : EST_CUSUM_GAIN) * (precision / self->noise_variance);
     est_trigger_enter(&self->trigger, &config->trigger, equation.innovation, weight, held);
     step->innovation      = equation.innovation;
     step->statistic       = self->trigger.statistic;
@@ -519,6 +537,12 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (finding != EST_QUIET) {
         step->alarm = finding == EST_ALARM;
         react(self, finding);
+    } else if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
+        self->refresh_in--;
+    } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
+        consider_refresh(self, shape);
+    } else {
+        // C stays
     }
 }
 
@@ -550,8 +574,8 @@ est_config_t est_config_default(void) {
     static const est_config_t config = {
         .na             = (uint8_t)DEFAULT_NA,
         .nb             = (uint8_t)DEFAULT_NB,
-        .nk             = 0U,
-        .nc             = 0U,
+        .nk             = (uint8_t)DEFAULT_NK,
+        .nc             = (uint8_t)DEFAULT_NC,
         .offset         = DEFAULT_OFFSET,
         .refresh_n      = EST_WITH_ADAPTATION ? 40U : 0U,
         .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
@@ -562,8 +586,10 @@ est_config_t est_config_default(void) {
         .p0             = 10.0F,
         .p0_offset      = 1.0e6F,
         .noise_variance = 1.2F,
-#if (EST_NA_MAX >= 2U) && (EST_THETA_MAX >= 3U)
+#if DEFAULT_NA > 1
         .c = { -1.6F, 0.64F },
+#else
+        .c = { -0.8F },
 #endif
         .edge_codes = 64.0F,
         .code_low   = -EST_CODE_LIMIT,

@@ -91,7 +91,7 @@ typedef enum {
 } est_reset_t;
 
 /// A trigger of the caller's own: takes in one innovation [codes] and its predicted variance [codes^2] and returns its
-/// statistic, which raises an alarm when it reaches the ceiling. `anew` is true for the first innovation after est_init()
+/// statistic, finite and not negative, which raises an alarm when it reaches the ceiling. `anew` is true for the first innovation after est_init()
 /// and after an alarm. Nothing else of the estimator is its business.
 typedef float (*est_trigger_fn)(void* context, float innovation, float variance, bool anew);
 

@@ -8,6 +8,7 @@
 #include "est_edges.h"
 #include "est_shape.h"
 
+#include <float.h>
 #include <stddef.h>
 
 /// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
@@ -93,7 +94,7 @@ EST_SHAPED float est_trigger_sum(const float before, const float innovation, con
 }
 
 /// Enters the innovation in the other readings of the edges in doubt, that of what was recorded being the statistic already. The
-/// plant has changed only if no reading explains the innovations. `expires` is true iff the doubt has lasted its term.
+/// plant has changed only if no reading explains the innovations, or theta has overflowed. `expires` is true iff the doubt has lasted its term.
 static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
                                                       const float          ceiling,
                                                       const float          early,
@@ -105,7 +106,7 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
     if (self->statistic < ceiling) {
         return EST_QUIET;  // MISRA D4
     }
-    if (est_trigger_best_rival(self) < ceiling) {
+    if ((est_trigger_best_rival(self) < ceiling) && (self->statistic < FLT_MAX)) {
         return expires ? EST_SLIP : EST_QUIET;  // MISRA D4
     }
     return EST_ALARM;

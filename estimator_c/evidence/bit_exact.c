@@ -199,7 +199,7 @@ static void enter_diagnosis(record_t* const self, const est_diagnosis_t diagnosi
     enter_number(self, diagnosis.extent);
 }
 
-/// Locked edges with four parameters or any edges with six; M, B, K or two of them change.
+/// Locked edges with four parameters or edges that may slip with six; M, B, K or two of them change.
 static bool run_isolation(record_t* const self, uint32_t number) {
     const plant_mechanics_t front     = PLANT_FRONT;
     const plant_mechanics_t changed[] = { PLANT_FRONT_SOFT,
@@ -209,7 +209,7 @@ static bool run_isolation(record_t* const self, uint32_t number) {
     est_config_t            config    = est_config_default();
     plant_t                 plant     = plant_at_rest(PLANT_FRONT, number, 5U * PLANT_TICKS_PER_SAMPLE);
     const uint32_t          change    = digit(&number, 4U);
-    config.edge_instants              = (est_edge_instants_t)digit(&number, 3U);
+    config.edge_instants              = (est_edge_instants_t)digit(&number, 2U);
     if (config.edge_instants == EST_EDGES_LOCKED) {
         config.nb     = 2U;
         config.nk     = 1U;

@@ -424,7 +424,8 @@ bool est_isolation_init(est_isolation_t* const self, const est_config_t* const c
     EST_ASSERT((self != NULL) && (config != NULL));
     *self           = (est_isolation_t){ .config = config, .force_zero = force_zero };
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
-    return (config->na == 2U) && ((config->nb + config->nk) <= 3U) && (config->trigger.kind == EST_TRIGGER_CUSUM);
+    return (config->na == 2U) && ((config->nb + config->nk) <= 3U) && (config->trigger.kind == EST_TRIGGER_CUSUM) &&
+           (config->edge_instants != EST_EDGES_ANYWHERE);
 }
 
 /// The plant is well: this is what it is.

@@ -118,8 +118,9 @@ typedef struct {
 
 /// Ready for the first sample of an estimator with this configuration, which is kept as est_init() keeps it. `force_zero` is
 /// u where F = 0 [codes]: what the spring carries is counted from there.
-/// False iff na is not 2, nb + nk is beyond 3 or the trigger is not the cumulative sum: the plant is then not one of mass, damper and spring, or
-/// nothing tells when it was last well. The state is then unusable. Cost: constant. May be called from an interrupt.
+/// False iff na is not 2, nb + nk is beyond 3, the trigger is not the cumulative sum, or edges of u may come anywhere: the plant
+/// is then not one of mass, damper and spring, or nothing tells when it was last well, or what forced it since. The state is then
+/// unusable. Cost: constant. May be called from an interrupt.
 bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// To be called after every est_step(), with what went in and came out. Cost: some 150 instructions on a Cortex-M4F, at the

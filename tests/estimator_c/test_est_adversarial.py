@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
@@ -94,12 +95,23 @@ def test_invariants_hold_after_every_sample(
         assert np.isfinite(values).all()
 
 
-def test_theta_that_overflows_begins_anew(estimator: Estimator) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"warm_up_n": 150, "edge_instants": 0},
+        {"kind": 0, "edge_instants": 0},
+        {"warm_up_n": 2000, "edge_instants": 0},
+        {"warm_up_n": 2000, "edge_instants": 1},
+        {"nc": 2, "nb": 2, "offset": 0, "warm_up_n": 150, "edge_instants": 0},
+    ],
+    ids=["sum", "none", "held", "in doubt", "residuals"],
+)
+def test_theta_that_overflows_begins_anew(estimator: Estimator, settings: dict[str, float]) -> None:
     """Hardly any excitation, a prior much vaguer than the data, a short memory: theta grows beyond any number."""
     anew = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        assert estimator.init(p0=1e3, forgetting=0.5, ceiling=1e6, warm_up_n=150, edge_instants=0)
+        assert estimator.init(**{"p0": 1e3, "forgetting": 0.5, "ceiling": 1e6} | settings)
         u = np.where(rng.random(2000) < 0.02, 4095.0 * rng.choice([-1.0, 1.0], 2000), 1e-3)
         result = estimator.run(u, np.where(np.arange(2000) % 2, 1e5, -1e5), np.ones(2000, bool))
         assert np.isfinite(result.theta).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator, compile_driver
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
+CORE = Path(__file__).parents[2] / "estimator_c" / "core"
 WITHOUT = tuple(f"-DEST_WITH_{part}=0" for part in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH"))
 UNCHECKED = "-DEST_WITH_CHECKS=0"
 MINIMAL = {"refresh_n": 0, "stuck_n": 0, "idle_n": 0, "edge_instants": LOCKED}
@@ -79,3 +81,47 @@ def test_build_without_checks_takes_the_configuration_at_its_word(
     tmp_path: Path, option: tuple[str, ...], *, accepts: bool
 ) -> None:
     assert Estimator(compile_driver(tmp_path, *option)).init(forgetting=2.0) == accepts
+
+
+@pytest.mark.parametrize("orders", [("-DEST_NB_MAX=1U", "-DEST_NK_MAX=0U"), fixed({**CARD, "nb": 1, "nk": 0})])
+def test_build_with_room_for_one_input_sees_edges_where_they_are(tmp_path: Path, orders: tuple[str, ...]) -> None:
+    build = Estimator(compile_driver(tmp_path, "-DEST_WITH_EDGES=0", *orders))
+    assert build.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
+    u, y = np.full(40, 1000.0), np.full(40, 1500.0)
+    assert build.run(u, y).counters["stuck"] == 0, "u never moves"
+    u[20:] = 3000.0
+    assert build.init(na=2, nb=1, nk=0, offset=0, edge_instants=LOCKED, stuck_n=4, refresh_n=0)
+    assert build.run(u, y).counters["stuck"] == 17
+
+
+def room(most: int) -> tuple[str, ...]:
+    return (f"-DEST_THETA_MAX={most}U",)
+
+
+@pytest.mark.parametrize(
+    ("options", "orders"),
+    [
+        (room(6), (2, 3, 1)),
+        (room(5), (2, 3, 0)),
+        (room(4), (2, 2, 0)),
+        (room(3), (2, 1, 0)),
+        (room(2), (1, 1, 0)),
+        ((*room(25), "-DEST_NA_MAX=8U", "-DEST_NB_MAX=8U", "-DEST_NC_MAX=8U"), (2, 3, 1)),
+        (fixed(CARD), (2, 2, 0)),
+        (fixed({**CARD, "na": 1, "offset": 1}), (1, 2, 1)),
+    ],
+)
+def test_default_configuration_fits_into_every_build(
+    tmp_path: Path, options: tuple[str, ...], orders: tuple[int, int, int]
+) -> None:
+    program = tmp_path / "program.c"
+    program.write_text(
+        '#include "est.h"\n#include <stdio.h>\nint main(void) {\n    static est_t estimator;\n'
+        "    const est_config_t c = est_config_default();\n"
+        '    (void)printf("%d %d %d %d", est_init(&estimator, &c), c.na, c.nb, c.offset);\n    return 0;\n}\n'
+    )
+    built = tmp_path / "program"
+    flags = (*options, f"-I{CORE}", "-Wall", "-Wextra", "-Wconversion", "-Werror")
+    subprocess.run(["gcc", "-std=c99", *flags, program, CORE / "est.c", "-o", built], check=True)
+    done = subprocess.run([built], check=True, capture_output=True, text=True, timeout=10)
+    assert done.stdout == f"1 {' '.join(map(str, orders))}"
