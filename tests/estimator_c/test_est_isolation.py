@@ -122,6 +122,8 @@ def test_interval_of_onsets_mostly_contains_the_true_one(estimator: Estimator) -
     before_n = found.alarm - played.onset
     inside = (found.least_n - 2 <= before_n) & (before_n <= found.most_n + 2)
     assert inside[found.change == "M"].mean() > 0.8
+    assert (found.most_n - found.least_n).mean() < 5.0, "an interval that holds everything says nothing"
+    assert np.sqrt(np.mean((found.onset_n - before_n) ** 2)) < 0.5 * np.sqrt(np.mean(before_n**2))
 
 
 def test_healthy_plant_has_no_diagnosis(estimator: Estimator) -> None:
