@@ -1,6 +1,6 @@
 /// The change triggers of est.h. They see the innovation, in every reading of the edges in doubt, and its variance, and
 /// nothing else of the estimator. A user's trigger is a function in the configuration (est_trigger_fn); one of the library's
-/// own is a new est_trigger_kind_t and a new function here.
+/// own is a new est_trigger_kind_t, a new function here, and a new value wherever a kind is set: device/, catalogue/, harness/.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
