@@ -571,7 +571,7 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
 EST_OUTLINE est_config_t copied(const est_config_t* const config) { return *config; }
 
 est_config_t est_config_default(void) {
-    static const est_config_t config = {
+    static const est_config_t config = {  // MISRA D2
         .na             = (uint8_t)DEFAULT_NA,
         .nb             = (uint8_t)DEFAULT_NB,
         .nk             = (uint8_t)DEFAULT_NK,

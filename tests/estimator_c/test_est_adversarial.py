@@ -95,27 +95,42 @@ def test_invariants_hold_after_every_sample(
         assert np.isfinite(values).all()
 
 
+def barely_excited(seed: int, n: int, *, rest: float, busy: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A u that rests but for a part of the samples, a y that says more."""
+    rng = np.random.default_rng(seed)
+    u = np.where(rng.random(n) < busy, 4095.0 * rng.choice([-1.0, 1.0], n), rest)
+    return u, np.where(np.arange(n) % 2, 1e5, -1e5)
+
+
+VAGUE = {"p0": 1e3, "forgetting": 0.5, "ceiling": 1e6, "warm_up_n": 150, "edge_instants": 0}
+"""A prior much vaguer than such data, and a short memory: theta grows beyond any number."""
+
+
 @pytest.mark.parametrize(
     "settings",
     [
-        {"warm_up_n": 150, "edge_instants": 0},
-        {"kind": 0, "edge_instants": 0},
-        {"warm_up_n": 2000, "edge_instants": 0},
+        {},
+        {"kind": 0, "warm_up_n": 0},
+        {"warm_up_n": 2000},
         {"warm_up_n": 2000, "edge_instants": 1},
-        {"nc": 2, "nb": 2, "offset": 0, "warm_up_n": 150, "edge_instants": 0},
+        {"nc": 2, "nb": 2, "offset": 0},
     ],
     ids=["sum", "none", "held", "in doubt", "residuals"],
 )
 def test_theta_that_overflows_begins_anew(estimator: Estimator, settings: dict[str, float]) -> None:
-    """Hardly any excitation, a prior much vaguer than the data, a short memory: theta grows beyond any number."""
     anew = 0
     for seed in range(60):
-        rng = np.random.default_rng(seed)
-        assert estimator.init(**{"p0": 1e3, "forgetting": 0.5, "ceiling": 1e6} | settings)
-        u = np.where(rng.random(2000) < 0.02, 4095.0 * rng.choice([-1.0, 1.0], 2000), 1e-3)
-        result = estimator.run(u, np.where(np.arange(2000) % 2, 1e5, -1e5), np.ones(2000, bool))
+        assert estimator.init(**VAGUE | settings)
+        result = estimator.run(*barely_excited(seed, 2000, rest=1e-3, busy=0.02))
         assert np.isfinite(result.theta).all()
         overflowed = result.alarms[~(result.statistic[result.alarms] < np.finfo(np.float32).max)]
         assert (result.theta[overflowed] == 0.0).all()
         anew += len(overflowed)
     assert anew > 0  # it does happen
+
+
+def test_p_that_overflows_with_theta_begins_anew_at_once(estimator: Estimator) -> None:
+    """Says est_invariants_hold(), which the driver asks; otherwise P waits for the next sample."""
+    for seed in range(60):
+        assert estimator.init(**VAGUE)
+        estimator.run(*barely_excited(seed, 400, rest=1e-6, busy=0.1))

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.estimator_c import isolation
-from tests.estimator_c.est_driver import GATHERING, PREDICTION_ERROR, REFUSED, SLICES_N, Estimator
+from tests.estimator_c.est_driver import ANYWHERE, GATHERING, PREDICTION_ERROR, REFUSED, SLICES_N, Estimator
 from tests.estimator_c.isolation import Change
 from tests.estimator_c.performance import FULL, FULL_FREE, OWN_CLOCK, SHARED_CLOCK, Settings
 from tests.estimator_c.plants import FRONT, SHOCK, Excitation, random_plants, simulate
@@ -150,8 +150,12 @@ def test_zero_of_the_force_may_lie_anywhere_in_its_range(estimator: Estimator) -
     assert abs(found.extent[found.change == "K"].mean() - 0.8) < 0.01
 
 
-@pytest.mark.parametrize("settings", [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}], ids=str)
-def test_models_that_are_no_suspension_are_refused(estimator: Estimator, settings: Settings) -> None:
+@pytest.mark.parametrize(
+    "settings",
+    [{"na": 1}, {"kind": PREDICTION_ERROR}, {"nb": 3, "nk": 1}, {"edge_instants": ANYWHERE}],
+    ids=str,
+)
+def test_what_is_no_suspension_or_hides_its_edges_is_refused(estimator: Estimator, settings: Settings) -> None:
     assert estimator.init(**{"c": (0.0, 0.0), **settings})
     assert not estimator.can_isolate()
 

@@ -95,12 +95,10 @@ def test_after_an_alarm_everything_is_as_uncertain_as_at_the_start(estimator: Es
     u, y = suspension([(0, FRONT), (245, (115.0, 3021.0, 18000.0))], np.arange(10.0, 400.0, 50.0), 400, 0.0, 1)
     settings = PLAIN | {"kind": PREDICTION_ERROR, "ceiling": 8.0, "warm_up_n": 50, "reset": reset, "p0": 10.0}
     assert estimator.init(**settings)
-    first = estimator.run(u, y - 410.0).alarms[0]
+    end = estimator.run(u, y - 410.0).alarms[0] + 1
     assert estimator.init(**settings)
-    assert (estimator.run(u[:first], y[:first] - 410.0).variance < 1.0).all()
-    assert estimator.init(**settings)
-    end = first + 2
-    assert (estimator.run(u[:end], y[:end] - 410.0).variance == 10.0).all()
+    assert (estimator.run(u[:end], y[:end] - 410.0).variance < 1.0).all()
+    assert (estimator.run(u[end : end + 1], y[end : end + 1] - 410.0).variance == 10.0).all()
 
 
 def test_mean_between_faults_follows_the_thesis(estimator: Estimator) -> None:
@@ -126,6 +124,20 @@ def test_mean_between_faults_follows_the_thesis(estimator: Estimator) -> None:
     assert result.statistic == pytest.approx(np.array(expected), rel=1e-3, abs=1e-3)
     assert (np.diff(result.alarms) > 4).all()
     assert (result.theta[result.alarms[0]] != 0.0).any()
+
+
+def test_mean_after_an_alarm_begins_with_its_first_term(estimator: Estimator) -> None:
+    """Nothing is left of the mean before, not even by rounding."""
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(0.0, 100.0, 300), rng.normal(0.0, 0.01, 300)
+    y[200] = 1e5
+    quiet_n = 50
+    assert estimator.init(**PLAIN, kind=MEAN_BETWEEN_FAULTS, ceiling=100.0, warm_up_n=0, hold_off_n=quiet_n)
+    result = estimator.run(u, y)
+    assert result.alarms.tolist() == [200]
+    first = int(np.flatnonzero(result.statistic[201:])[0]) + 201
+    assert np.count_nonzero(result.status[201:first] != GATHERING) == quiet_n
+    assert result.statistic[first] == np.abs(result.innovation[first])
 
 
 def test_absolute_mean_averages_magnitudes(estimator: Estimator) -> None:
