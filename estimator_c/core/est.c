@@ -441,10 +441,14 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-/// Data beyond all measure can drive theta to where its products overflow. So does the statistic then, and nothing of the
-/// estimate is worth keeping.
-static void estimate_afresh(est_t* const self) {
-    const bool overflown = !(self->trigger.statistic < FLT_MAX);
+/// The plant has changed, and the samples before the next belong to what it was. Data beyond all measure can drive theta to where
+/// its products overflow. So does the statistic then, and nothing of the estimate is worth keeping.
+static void raise_alarm(est_t* const self, est_step_t* const step) {
+    step->alarm          = true;
+    const bool overflown = !(step->statistic < FLT_MAX);
+    if (overflown) {
+        step->statistic = FLT_MAX;
+    }
     if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
         zero(self->theta, EST_THETA_MAX);
     }
@@ -453,17 +457,15 @@ static void estimate_afresh(est_t* const self) {
     }
     self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
+    count(&self->counters.alarms);
+    forget_samples(self);
 }
 
-static void react(est_t* const self, const est_finding_t finding) {
-    if (!EST_WITH_EDGES || (finding == EST_ALARM)) {
-        count(&self->counters.alarms);
-        estimate_afresh(self);
-    } else {
-        count(&self->counters.slips);
-        self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
-    }
-    forget_samples(self);  // they belong to the plant, or the clock, as it was
+/// The clock of the edges has moved by a sample, and the samples before the next belong to what it was.
+EST_OUTLINE void note_slip(est_t* const self) {
+    self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
+    count(&self->counters.slips);
+    forget_samples(self);
 }
 
 static void enter_gap(est_t* const self, const est_status_t status) {
@@ -474,7 +476,7 @@ static void enter_gap(est_t* const self, const est_status_t status) {
     }
     if (EST_WITH_EDGES && self->known && (self->doubt_n > 0U)) {
         if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
-            react(self, EST_SLIP);
+            note_slip(self);
         }
     }
     forget_samples(self);
@@ -534,9 +536,10 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         finding = read_otherwise(self, shape, &equation, weight);
     }
-    if (finding != EST_QUIET) {
-        step->alarm = finding == EST_ALARM;
-        react(self, finding);
+    if (finding == EST_ALARM) {
+        raise_alarm(self, step);
+    } else if (EST_WITH_EDGES && (finding == EST_SLIP)) {
+        note_slip(self);
     } else if (EST_WITH_ADAPTATION && (self->refresh_in > 1U)) {
         self->refresh_in--;
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
