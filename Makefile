@@ -15,9 +15,9 @@ STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pe
 
 BIN := $(VENV)/bin
 
-PRODUCTS := harness/_catalogue.py emulator/_engine.so harness/_device.so harness/bin/analogrig-device \
-            harness/bin/analogrig-tether harness/report/uPlot.iife.min.js harness/report/uPlot.min.css
-NATIVE_SOURCES := $(wildcard emulator/*.[ch] harness/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
+            harness/analogrig/bin/analogrig-tether harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
+NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
@@ -123,7 +123,7 @@ lock: ## resolve requirements.lock again from pyproject.toml; needs uv
 	        --custom-compile-command "make lock" --extra test --output-file requirements.lock pyproject.toml -
 
 clean: ## remove what was built, but not the environment
-	rm -rf $(BUILD) analogrig.egg-info harness/bin $(PRODUCTS)
+	rm -rf $(BUILD) *.egg-info harness/analogrig/bin $(PRODUCTS)
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 
 distclean: clean ## remove the environment too

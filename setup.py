@@ -24,26 +24,27 @@ from setuptools import Command, Distribution, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build import build
 
-CATALOGUE = Path("harness/_catalogue.py")
-ENGINE = Path("emulator/_engine.so")
-DEVICE = Path("harness/_device.so")
-HOST = Path("harness/bin/analogrig-device")
-TETHER = Path("harness/bin/analogrig-tether")
+CATALOGUE = Path("harness/analogrig/_catalogue.py")
+ENGINE = Path("emulator/analogrig_emulator/_engine.so")
+DEVICE = Path("harness/analogrig/_device.so")
+HOST = Path("harness/analogrig/bin/analogrig-device")
+TETHER = Path("harness/analogrig/bin/analogrig-tether")
 UPLOT = {
-    Path("harness/report/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
-    Path("harness/report/uPlot.min.css"): "uplot/static/uPlot.min.css",
+    Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
+    Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
 PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
-ENGINE_SOURCES = ("emulator/*.c",)
+ENGINE_SOURCES = ("emulator/analogrig_emulator/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
-TETHER_SOURCES = ("harness/tether.c",)
+TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
+DATA = Path("analogrig")
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 OTHER_SOURCES = (
-    "emulator/*.h",
+    "emulator/analogrig_emulator/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/*/*.h",
@@ -89,25 +90,28 @@ class BuildProducts(Command):
     def run(self) -> None:
         """Make every product; each appears whole or not at all."""
         in_tree = self.inplace or self.editable_mode
-        destination = Path() if in_tree else Path(self.build_lib)
+
+        def placed(product: Path) -> Path:
+            return product if in_tree else Path(self.build_lib) / in_wheel(product)
+
         generated = Path("build" if in_tree else self.build_temp) / "generated"
         for product in PRODUCTS:
-            (destination / product).parent.mkdir(parents=True, exist_ok=True)
-        generate_codecs(generated, destination / CATALOGUE)
+            placed(product).parent.mkdir(parents=True, exist_ok=True)
+        generate_codecs(generated, placed(CATALOGUE))
         device = (*sources(DEVICE_SOURCES), *sorted(generated.glob("*.c")))
         folders = (*(f"estimator_c/{part}" for part in ("core", "isolation", "device", "ports/loop")), generated)
         include = (*ROOM, *(f"-I{path}" for path in folders))
-        compile_c(destination / ENGINE, sources(ENGINE_SOURCES), SHARED)
-        compile_c(destination / DEVICE, (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
-        compile_c(destination / HOST, (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
-        compile_c(destination / TETHER, sources(TETHER_SOURCES), POSIX)
+        compile_c(placed(ENGINE), sources(ENGINE_SOURCES), SHARED)
+        compile_c(placed(DEVICE), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
+        compile_c(placed(HOST), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
+        compile_c(placed(TETHER), sources(TETHER_SOURCES), POSIX)
         for product, origin in UPLOT.items():
-            shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), destination / product)
+            shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), placed(product))
         if not in_tree:
             for path in sources(FIXTURES):
-                installed = destination / "harness" / path
-                installed.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path, installed)
+                copied = Path(self.build_lib) / DATA / path
+                copied.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copied)
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
@@ -116,12 +120,17 @@ class BuildProducts(Command):
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""
-        fixtures = [Path("harness") / path for path in sources(FIXTURES)]
-        return [str(Path(self.build_lib) / product) for product in (*PRODUCTS, *fixtures)]
+        copied = [DATA / path for path in sources(FIXTURES)]
+        return [str(Path(self.build_lib) / path) for path in (*map(in_wheel, PRODUCTS), *copied)]
 
     def get_output_mapping(self) -> dict[str, str]:
         """Part of the protocol of setuptools: where an editable install finds each product."""
-        return {str(Path(self.build_lib) / product): str(product) for product in PRODUCTS}
+        return {str(Path(self.build_lib) / in_wheel(product)): str(product) for product in PRODUCTS}
+
+
+def in_wheel(product: Path) -> Path:
+    """Path below site-packages: the folders ``harness`` and ``emulator`` hold packages and are none themselves."""
+    return Path(*product.parts[1:])
 
 
 def sources(patterns: Iterable[str]) -> tuple[Path, ...]:

@@ -69,16 +69,16 @@ def test_wheel_serves_every_python_3_on_one_platform(wheel: Path) -> None:
 def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
     held = set(zipfile.ZipFile(wheel).namelist())
     assert held >= {
-        "emulator/_engine.so",
-        "emulator/py.typed",
-        "harness/_catalogue.py",
-        "harness/_device.so",
-        "harness/bin/analogrig-device",
-        "harness/bin/analogrig-tether",
-        "harness/fixtures/scenarios/thesis.toml",
-        "harness/py.typed",
-        "harness/report/uPlot.iife.min.js",
-        "harness/report/uPlot.min.css",
+        "analogrig_emulator/_engine.so",
+        "analogrig_emulator/py.typed",
+        "analogrig/_catalogue.py",
+        "analogrig/_device.so",
+        "analogrig/bin/analogrig-device",
+        "analogrig/bin/analogrig-tether",
+        "analogrig/fixtures/scenarios/thesis.toml",
+        "analogrig/py.typed",
+        "analogrig/reporting/uPlot.iife.min.js",
+        "analogrig/reporting/uPlot.min.css",
     }
     assert not [name for name in held if name.endswith((".c", ".h")) or name.startswith("tests/")]
 
@@ -88,7 +88,7 @@ def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Pa
     assert fixtures
     with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
         assert {name.partition("/")[2] for name in sdist.getnames()} >= fixtures
-    assert set(zipfile.ZipFile(wheel).namelist()) >= {f"harness/{fixture}" for fixture in fixtures}
+    assert set(zipfile.ZipFile(wheel).namelist()) >= {f"analogrig/{fixture}" for fixture in fixtures}
 
 
 def test_command_works_from_the_wheel(environment: Path) -> None:
@@ -97,7 +97,7 @@ def test_command_works_from_the_wheel(environment: Path) -> None:
 
 
 def test_installed_device_can_be_executed(environment: Path) -> None:
-    device = next(environment.parent.glob("lib/python*/site-packages/harness/bin/analogrig-device"))
+    device = next(environment.parent.glob("lib/python*/site-packages/analogrig/bin/analogrig-device"))
     assert "analogrig-device" in _run(device, "--help")
 
 
@@ -168,7 +168,7 @@ def _ended(status: int, *command: str | Path, cwd: Path) -> str:
 
 
 def test_help_loads_nothing_heavy(environment: Path) -> None:
-    listing = _run(environment / "python", "-X", "importtime", "-m", "harness.cli", "run", "--help")
+    listing = _run(environment / "python", "-X", "importtime", "-m", "analogrig.cli", "run", "--help")
     loaded = set(re.findall(r"\| +(\w+)", listing))
     assert "argparse" in loaded
     assert not loaded & {"numpy", "scipy", "serial", "cobs", "anycrc"}

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from scipy.stats import chi2
 
-from harness.calibration.fit import POTS, Calibration
-from harness.calibration.plan import check_scenario
+from analogrig.hardware.calibration.fit import POTS, Calibration
+from analogrig.hardware.calibration.plan import check_scenario
 from tests.harness.calibration_rigs import DrawnRig, calibrated, drawn, rms_lsb, thesis_profile, truth
 
 from .figure import Figure

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from harness.plant import PARAMETERS
+from analogrig.plant import PARAMETERS
 from tests.thesis.detection import detect
 
 from .figure import Figure

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     CARDS,
     OP_AMP_GRADES,
     TICKS_PER_SAMPLE,
@@ -36,8 +36,8 @@ from emulator import (
     piecewise_linear,
     to_spice,
 )
-from emulator.spice import Accuracy
-from emulator.suspension import BLOCK_SAMPLES, Tweak
+from analogrig_emulator.spice import Accuracy
+from analogrig_emulator.suspension import BLOCK_SAMPLES, Tweak
 from tests.emulator.conftest import _read_raw
 
 from .figure import Figure

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from harness.bench import Bench
-from harness.devices import FIRMWARE, CanDevice, DeviceDescription, HostDevice, InprocDevice, QemuM4
-from harness.dut import connect
-from harness.pace import Pace
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario
+from analogrig.bench import Bench
+from analogrig.devices.devices import FIRMWARE, CanDevice, DeviceDescription, HostDevice, InprocDevice, QemuM4
+from analogrig.protocol.dut import connect
+from analogrig.protocol.pace import Pace
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
 from tests.can_guest.__main__ import throughput_in_guest
 
 from .figure import Figure

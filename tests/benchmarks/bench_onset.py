@@ -17,12 +17,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from harness.onset.jump import NoOnset, Onset, onset
-from harness.onset.turn import SlowTurn
-from harness.rigs.by_hand import Tweak, doubts
-from harness.rigs.description import open_rig
-from harness.rigs.rig import Rig
-from harness.statistics import lower_rate
+from analogrig.hardware.by_hand import Tweak, doubts
+from analogrig.hardware.onset.jump import NoOnset, Onset, onset
+from analogrig.hardware.onset.turn import SlowTurn
+from analogrig.judging.statistics import lower_rate
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.rig import Rig
 from tests.harness.onsets import Clock, Several, Trial, still
 from tests.harness.served import served
 

@@ -14,11 +14,16 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from numpy.typing import NDArray
 
-from harness.devices import describe
-from harness.information import detectable
-from harness.played import Played
-from harness.properties import TRIES, is_playable
-from harness.properties.test_detection import (
+from analogrig.campaigns.trials import Trials
+from analogrig.devices.devices import describe
+from analogrig.judging.information import detectable
+from analogrig.judging.statistics import upper_rate
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.scenario import Scenario
+from analogrig.testing.played import Played
+from analogrig.testing.properties import TRIES, is_playable
+from analogrig.testing.properties.test_detection import (
     ARL0,
     DOUBTFUL_LATENCY,
     MOST_INFORMATION,
@@ -27,13 +32,8 @@ from harness.properties.test_detection import (
     PATIENT,
     PLAYS_N,
 )
-from harness.properties.test_estimates import WITHIN
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.scenario import Scenario
-from harness.statistics import upper_rate
-from harness.strategies import profile, scenarios, seeds
-from harness.trials import Trials
+from analogrig.testing.properties.test_estimates import WITHIN
+from analogrig.testing.strategies import profile, scenarios, seeds
 
 from .figure import Figure
 

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from harness.rigs.self_test.conduct import self_test
-from harness.run import CHANNELS
-from harness.statistics import upper_rate
+from analogrig.hardware.self_test.conduct import self_test
+from analogrig.judging.statistics import upper_rate
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from analogrig.run import CHANNELS
 
 from .figure import Figure
 

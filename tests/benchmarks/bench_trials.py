@@ -16,11 +16,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from harness.devices import describe
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.scenario import Scenario
-from harness.trials import Trials
+from analogrig.campaigns.trials import Trials
+from analogrig.devices.devices import describe
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.scenario import Scenario
 
 from .figure import Figure
 
@@ -92,6 +92,6 @@ def _processes(count: int) -> float:
 def _certificate(*command: str) -> tuple[float, float]:
     """On the wall and of CPU time, start and end of the command included."""
     before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    subprocess.run([sys.executable, "-m", "harness.cli", *command], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, "-m", "analogrig.cli", *command], check=True, stdout=subprocess.DEVNULL)
     wall_s, after = time.perf_counter() - start_s, resource.getrusage(resource.RUSAGE_CHILDREN)
     return wall_s, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

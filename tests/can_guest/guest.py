@@ -7,7 +7,8 @@
     results  what the command leaves in /run/results; its status in /run/results/status; what it prints, on the console
 
 QEMU emulates every instruction: a program takes ten to twenty times as long as outside. It runs below a tether
-(harness/links/child.py), so that it ends with whoever started it, and may not run for longer than it was given.
+(harness/analogrig/links/child.py), so that it ends with whoever started it, and may not run for longer than it was
+given.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-from harness.links.child import END_TIMEOUT_S, TETHER
+from analogrig.links.child import END_TIMEOUT_S, TETHER
 
 from .linux import BUSYBOX, MODULES, VMLINUX
 

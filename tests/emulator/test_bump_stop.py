@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     BumpStop,
     CircuitError,

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from emulator import (
+from analogrig_emulator import (
     IDEAL,
     Capacitor,
     Circuit,
@@ -24,8 +24,8 @@ from emulator import (
     Switch,
     VoltageSource,
 )
-from emulator.circuit import Element
-from emulator.opamp import preset
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.opamp import preset
 
 SOURCE = VoltageSource("V1", "in")
 

@@ -12,7 +12,7 @@ import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator import (
+from analogrig_emulator import (
     COMPONENTS,
     DIELECTRICS,
     IDEAL,
@@ -38,8 +38,8 @@ from emulator import (
     piecewise_linear,
     to_spice,
 )
-from emulator.circuit import Element
-from emulator.opamp import preset
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.opamp import preset
 
 from .conftest import NgSpice
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -28,7 +28,7 @@ from emulator import (
     VoltageSource,
     read_deck,
 )
-from emulator.circuit import Element
+from analogrig_emulator.circuit import Element
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 
@@ -361,7 +361,7 @@ def test_more_than_memory_should_hold_is_refused() -> None:
 
 def test_slices_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = read_deck(INVERTER).volts()
-    monkeypatch.setattr("emulator.deck.SLICE_SAMPLES", 7)
+    monkeypatch.setattr("analogrig_emulator.deck.SLICE_SAMPLES", 7)
     assert read_deck(INVERTER).volts().tobytes() == whole.tobytes()
 
 
@@ -376,7 +376,7 @@ C1 m 0 10n IC=1
 .tran 50u 10 uic
 .end
 """
-    monkeypatch.setattr("emulator.deck.MAX_EVENTS", 10_000)
+    monkeypatch.setattr("analogrig_emulator.deck.MAX_EVENTS", 10_000)
     with pytest.raises(CircuitError, match="more than 10000 events in [0-9]+ samples: it oscillates"):
         read_deck(text).volts(["out"])
 

@@ -10,9 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import Capacitor, Circuit, CircuitError, Deck, EmulatorError, Resistor, SuspensionComputer, read_deck
-from emulator.circuit import Element
-from emulator.nodal import Nodal
+from analogrig_emulator import (
+    Capacitor,
+    Circuit,
+    CircuitError,
+    Deck,
+    EmulatorError,
+    Resistor,
+    SuspensionComputer,
+    read_deck,
+)
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.nodal import Nodal
 
 WRITTEN = Deck(SuspensionComputer().circuit, samples=20, turns=[(4, {"K": 0.5})], initial_v={"C1": 1.0}).text().encode()
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from emulator import Deck, EmulatorError, SuspensionComputer, read_deck
+from analogrig_emulator import Deck, EmulatorError, SuspensionComputer, read_deck
 
 WRITTEN = Deck(
     SuspensionComputer().circuit, samples=20, turns=[(4, {"K": 0.5})], initial_v={"C1": 1.0, "U2": 1.0}

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -26,9 +26,9 @@ from emulator import (
     VoltageSource,
     read_deck,
 )
-from emulator.circuit import Element
-from emulator.deck_library import LIBRARY
-from emulator.opamp import PRESETS
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.deck_library import LIBRARY
+from analogrig_emulator.opamp import PRESETS
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 

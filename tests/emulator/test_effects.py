@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     DIELECTRICS,
     NOMINAL,
     OP_AMP_GRADES,
@@ -20,7 +20,7 @@ from emulator import (
     PotGrade,
     SuspensionComputer,
 )
-from emulator.effects import Effect, measured_effects
+from analogrig_emulator.effects import Effect, measured_effects
 
 REFERENCE_LSB = {
     "R 1 %, C 5 %, not calibrated": (47.0, 60.0),

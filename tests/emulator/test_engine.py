@@ -11,7 +11,7 @@ import scipy.integrate
 import scipy.linalg
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -25,7 +25,7 @@ from emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from emulator.opamp import CLAMP_RATE
+from analogrig_emulator.opamp import CLAMP_RATE
 
 Volts = NDArray[np.float64]
 Slope = Callable[[float, Volts, float], tuple[float, ...]]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -28,8 +28,8 @@ from emulator import (
     piecewise_linear,
     to_spice,
 )
-from emulator.nodal import Nodal
-from emulator.opamp import preset
+from analogrig_emulator.nodal import Nodal
+from analogrig_emulator.opamp import preset
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 

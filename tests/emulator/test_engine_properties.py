@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     FRONT,
     OP_AMP_GRADES,
     SHOCK,
@@ -33,10 +33,10 @@ from emulator import (
     piecewise_linear,
     to_spice,
 )
-from emulator.nodal import Nodal
-from emulator.opamp import preset
-from emulator.pot import dial_for
-from emulator.suspension import Tweak
+from analogrig_emulator.nodal import Nodal
+from analogrig_emulator.opamp import preset
+from analogrig_emulator.pot import dial_for
+from analogrig_emulator.suspension import Tweak
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,
@@ -27,7 +27,7 @@ from emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from emulator.nodal import Nodal
+from analogrig_emulator.nodal import Nodal
 
 Volts = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     Capacitor,
     Circuit,

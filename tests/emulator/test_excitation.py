@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from emulator import TICKS_PER_SAMPLE, Edges, Excitation, ExcitationError
+from analogrig_emulator import TICKS_PER_SAMPLE, Edges, Excitation, ExcitationError
 
 RATE_HZ = 20e3
 

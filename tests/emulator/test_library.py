@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from emulator import TICKS_PER_SAMPLE, EngineError, library
+from analogrig_emulator import TICKS_PER_SAMPLE, EngineError, library
 
 
 def test_an_engine_that_is_not_built_is_reported_with_the_line_that_builds_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(library, "_HERE", tmp_path)
-    with pytest.raises(EngineError, match="is not built in .*: run `pip install -e .`, or `cc .*engine.c`"):
+    with pytest.raises(EngineError, match="is not built in .*: run `pip install -e .`, or `make setup`"):
         library.load.__wrapped__()
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     COMPONENTS,
     FRONT,
     IDEAL,
@@ -42,10 +42,10 @@ from emulator import (
     read_deck,
     to_spice,
 )
-from emulator.circuit import Element
-from emulator.machine import RelaySwitch
-from emulator.opamp import preset
-from emulator.pot import coefficient_under_load
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.machine import RelaySwitch
+from analogrig_emulator.opamp import preset
+from analogrig_emulator.pot import coefficient_under_load
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]

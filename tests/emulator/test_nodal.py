@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from emulator import (
+from analogrig_emulator import (
     IDEAL,
     Capacitor,
     Circuit,
@@ -23,9 +23,9 @@ from emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from emulator.circuit import _TwoEnded
-from emulator.nodal import Kink, Nodal, PiecewiseLinear
-from emulator.opamp import CLAMP_RATE
+from analogrig_emulator.circuit import _TwoEnded
+from analogrig_emulator.nodal import Kink, Nodal, PiecewiseLinear
+from analogrig_emulator.opamp import CLAMP_RATE
 
 SOURCE = VoltageSource("V1", "in")
 

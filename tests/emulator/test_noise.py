@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from emulator import (
+from analogrig_emulator import (
     OP_AMP_GRADES,
     Capacitor,
     Circuit,
@@ -25,8 +25,8 @@ from emulator import (
     SuspensionComputer,
     VoltageSource,
 )
-from emulator.circuit import Element
-from emulator.noise import BOLTZMANN_J_PER_K
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.noise import BOLTZMANN_J_PER_K
 
 KT_J = BOLTZMANN_J_PER_K * (25.0 + 273.15)
 LSB_V = 10.0 / 4096

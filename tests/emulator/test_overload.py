@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emulator import PROGRAMS, Excitation, PotError, Resistor, SuspensionComputer
-from emulator.circuit import Capacitor, OpAmp, Pot
+from analogrig_emulator import PROGRAMS, Excitation, PotError, Resistor, SuspensionComputer
+from analogrig_emulator.circuit import Capacitor, OpAmp, Pot
 
 QUIET: dict[str, float] = {}
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from emulator import (
+from analogrig_emulator import (
     IDEAL,
     AnalogComputer,
     Capacitor,
@@ -20,9 +20,9 @@ from emulator import (
     SuspensionComputer,
     VoltageSource,
 )
-from emulator.circuit import Element
-from emulator.opamp import preset
-from emulator.patching import Patch, patches
+from analogrig_emulator.circuit import Element
+from analogrig_emulator.opamp import preset
+from analogrig_emulator.patching import Patch, patches
 
 Change = Callable[[list[Element]], Iterable[Element]]
 

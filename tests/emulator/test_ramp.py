@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from emulator import (
+from analogrig_emulator import (
     COMPONENTS,
     TICKS_PER_SAMPLE,
     AnalogComputer,

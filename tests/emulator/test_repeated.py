@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from emulator import (
+from analogrig_emulator import (
     CircuitError,
     EngineError,
     Excitation,
@@ -18,7 +18,7 @@ from emulator import (
     drawn_offsets_v,
     is_repeatable,
 )
-from emulator.opamp import PRESETS, preset
+from analogrig_emulator.opamp import PRESETS, preset
 
 OFFSET_V, SAMPLES = 3e-3, 400
 JUMPS = [(150, {"K_n_per_m": 18000.0}), (151, {"B_n_s_per_m": 3453.0}), (SAMPLES - 1, {"K_n_per_m": 24500.0})]

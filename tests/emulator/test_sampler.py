@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from emulator import Card, Sampler, SamplerError
+from analogrig_emulator import Card, Sampler, SamplerError
 
 UNIPOLAR = Card(ranges_v=((0.0, 10.0),) * 4)
 LSB_V = 10.0 / 4096

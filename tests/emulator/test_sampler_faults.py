@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     CARDS,
     Card,
     Excitation,
@@ -23,7 +23,7 @@ from emulator import (
     drawn_levels,
     probes_per_sample,
 )
-from emulator.suspension import RampedTweak, Tweak
+from analogrig_emulator.suspension import RampedTweak, Tweak
 
 Volts = NDArray[np.float64]
 

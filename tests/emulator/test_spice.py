@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     FRONT,
     SHOCK,
     TICKS_PER_SAMPLE,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator import Deck
-from harness.cli import main
+from analogrig.cli import main
+from analogrig_emulator import Deck
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 

@@ -10,7 +10,7 @@ import pytest
 import scipy.signal
 from numpy.typing import NDArray
 
-from emulator import (
+from analogrig_emulator import (
     FRONT,
     PROGRAMS,
     CircuitError,
@@ -23,7 +23,7 @@ from emulator import (
     Program,
     SuspensionComputer,
 )
-from emulator.suspension import Tweak
+from analogrig_emulator.suspension import Tweak
 
 Volts = NDArray[np.float64]
 

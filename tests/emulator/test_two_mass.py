@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from emulator import (
+from analogrig_emulator import (
     TICKS_PER_SAMPLE,
     TWO_MASS,
     Circuit,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from harness.plant import physical_parameters
+from analogrig.plant import physical_parameters
 from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator
 from tests.estimator_c.plants import (
     CODES,

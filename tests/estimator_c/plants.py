@@ -105,7 +105,7 @@ class Trials:
     onset: NDArray[np.int64]
     """(t,) the last sample before the change can be seen; n where there is none."""
     information: Array
-    """(t, n): I of harness.information up to each sample; 0 as long as nothing has changed."""
+    """(t, n): I of analogrig.judging.information up to each sample; 0 as long as nothing has changed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,9 @@ import ctypes
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from harness.catalogue import (
+from analogrig.links import frame
+from analogrig.links.wire import LIBRARY, MemoryWire
+from analogrig.protocol.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     Command,
@@ -22,8 +24,6 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.links import frame
-from harness.links.wire import LIBRARY, MemoryWire
 from tests.estimator_c.test_device import NONCE, blocks, codes
 
 EXTENDED, REMOTE, FD, ERROR = 1, 2, 4, 8

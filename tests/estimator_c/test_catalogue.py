@@ -20,7 +20,8 @@ from cantools.database.can import Database, Message
 from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.signal import Signal
 
-from harness.catalogue import (
+from analogrig.links.wire import LIBRARY
+from analogrig.protocol.catalogue import (
     CATALOGUE_HASH,
     LAYOUTS,
     Alarm,
@@ -37,7 +38,6 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.links.wire import LIBRARY
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 DBC = ESTIMATOR / "catalogue" / "analogrig.dbc"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.links import frame
+from analogrig.links import frame
 from tests.estimator_c.est_driver import STRICT
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.catalogue import (
+from analogrig.links import frame
+from analogrig.links.link import FramedLink
+from analogrig.links.wire import LIBRARY, MemoryWire
+from analogrig.protocol.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     RUN_SHIFT,
@@ -45,9 +48,6 @@ from harness.catalogue import (
     Trigger,
     pack,
 )
-from harness.links import frame
-from harness.links.link import FramedLink
-from harness.links.wire import LIBRARY, MemoryWire
 from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import FULL

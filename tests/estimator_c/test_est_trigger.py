@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-import harness.estimator
-from harness.estimator_config import EstimatorConfig
-from harness.twin import Twin
+import analogrig.devices.estimator
+from analogrig.devices.reference import Twin
+from analogrig.protocol.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,
@@ -254,7 +254,7 @@ def statistics_in_doubt(
     valid = np.ones(n, bool)
     valid[at + np.flatnonzero(np.abs(np.diff(u[at:])) > 100.0)[0] + 1 + lag_n] = False
     twin = statistic_of_the_twin(config, u / 1000.0, y / 1000.0, valid)
-    estimator = harness.estimator.Estimator(config).run(u / 1000.0, y / 1000.0, valid)
+    estimator = analogrig.devices.estimator.Estimator(config).run(u / 1000.0, y / 1000.0, valid)
     return estimator.statistic[valid].astype(np.float64), twin[valid]
 
 

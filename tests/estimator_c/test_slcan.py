@@ -18,9 +18,9 @@ import pytest
 from can.interfaces.slcan import slcanBus as SlcanBus
 from can.util import CAN_FD_DLC
 
-from harness.catalogue import Alarm, unpack
-from harness.devices import HOST_PROGRAM
-from harness.links.wire import LIBRARY
+from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.links.wire import LIBRARY
+from analogrig.protocol.catalogue import Alarm, unpack
 from tests.estimator_c.shells import (
     EXTENDED,
     FD,

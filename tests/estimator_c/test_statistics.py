@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 
-from harness.plant import Plant, SampledPlant
+from analogrig.plant import Plant, SampledPlant
 from tests.estimator_c import performance
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import (
@@ -103,7 +103,7 @@ def test_plants_move_as_exact_steps_say(excitation: Excitation) -> None:
 
 
 def test_information_is_that_of_the_two_plants_from_one_state() -> None:
-    """Against the steps of harness.plant, sample by sample from the change on."""
+    """Against the steps of analogrig.plant, sample by sample from the change on."""
     onset, samples = 130, 145
     excitation = Excitation(half_period_n=60.0)
     played = simulate((FRONT, FRONT.scaled("M", 1.2)), np.array([onset]), excitation, samples, seed=5)

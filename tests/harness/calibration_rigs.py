@@ -18,13 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
-from harness.calibration.check import seen_lsb
-from harness.calibration.fit import Calibration, Pots, Stock, calibrate
-from harness.calibration.plan import Program, scenarios
-from harness.calibration.recordings import DISPLACEMENT, record
-from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from harness.scenario import PlantChoice, Scenario, Tweak
+from analogrig.hardware.calibration.check import seen_lsb
+from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
+from analogrig.hardware.calibration.plan import Program, scenarios
+from analogrig.hardware.calibration.recordings import DISPLACEMENT, record
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
 
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
 

@@ -14,10 +14,10 @@ from pathlib import Path
 def main(spec: str, out: str) -> None:
     from distributed import LocalCluster
 
-    from harness.campaign.conduct import Tally, conduct
-    from harness.campaign.plan import Plan
-    from harness.campaign.spec import CampaignSpec
-    from harness.campaign.workers import Dask
+    from analogrig.campaigns.conduct import Tally, conduct
+    from analogrig.campaigns.plan import Plan
+    from analogrig.campaigns.spec import CampaignSpec
+    from analogrig.campaigns.workers import Dask
 
     with LocalCluster(  # type: ignore[no-untyped-call]  # Dask is annotated in part
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"

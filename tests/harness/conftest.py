@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario
+from analogrig.bench import Bench
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
 
 
 @pytest.fixture(scope="session")

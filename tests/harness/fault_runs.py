@@ -24,25 +24,25 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.excitation import Excitation
-from harness.bench import Bench
-from harness.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
-from harness.devices import InprocDevice
-from harness.dut import Dut, Replies
-from harness.errors import AnalogrigError
-from harness.estimator_config import EstimatorConfig
-from harness.links.can_bus import CanBus
-from harness.links.can_device import MemoryBus
-from harness.links.can_link import CanLink
-from harness.links.faulty_bus import FaultyBus
-from harness.links.faulty_wire import FaultyWire
-from harness.links.link import FramedLink, Link
-from harness.links.wire import MemoryWire, Wire
-from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
-from harness.rigs.rig import Block, Hindsight, Performance
-from harness.run import CHANNELS, Channel, Run
-from harness.scenario import Scenario
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.devices.devices import InprocDevice
+from analogrig.errors import AnalogrigError
+from analogrig.judging.verdict import judge
+from analogrig.links.can_bus import CanBus
+from analogrig.links.can_device import MemoryBus
+from analogrig.links.can_link import CanLink
+from analogrig.links.faulty_bus import FaultyBus
+from analogrig.links.faulty_wire import FaultyWire
+from analogrig.links.link import FramedLink, Link
+from analogrig.links.wire import MemoryWire, Wire
+from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.protocol.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
+from analogrig.protocol.dut import Dut, Replies
+from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.rigs.rig import Block, Hindsight, Performance
+from analogrig.run import CHANNELS, Channel, Run
+from analogrig.scenario import Scenario
+from analogrig_emulator.excitation import Excitation
 
 N = 60
 MOST_N = 480

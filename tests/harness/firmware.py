@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.devices import FIRMWARE, QEMU
+from analogrig.devices.devices import FIRMWARE, QEMU
 
 CORES = ("m3", "m4", "m7")
 """Those that QEMU has a board of."""

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator import Excitation, SuspensionComputer
-from emulator.excitation import TICKS_PER_SAMPLE, Edges
-from emulator.opamp import preset
-from harness.rigs.ni_daqmx import LEVELS_PER_SAMPLE
+from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE
+from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.opamp import preset
 
 
 class Error(Exception):

@@ -1,4 +1,4 @@
-"""Turns of the pots at instants that nobody told, on emulated machines of real components, for ``harness.onset``."""
+"""Turns of the pots at instants that nobody told, on emulated machines of real components."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator import Excitation
-from harness import config, information
-from harness.onset.jump import NoOnset, Onset, onset
-from harness.onset.turn import SlowTurn, turn
-from harness.onset.two_filter import Signals
-from harness.plant import PARAMETERS, Plant, SampledPlant
-from harness.rigs.by_hand import Tweak as Told
-from harness.rigs.emulator import EmulatorDescription, EmulatorRig
-from harness.rigs.rig import Rig
-from harness.scenario import PLANTS, Scenario, Tweak
+from analogrig import config
+from analogrig.hardware.by_hand import Tweak as Told
+from analogrig.hardware.onset.jump import NoOnset, Onset, onset
+from analogrig.hardware.onset.turn import SlowTurn, turn
+from analogrig.hardware.onset.two_filter import Signals
+from analogrig.judging import information
+from analogrig.plant import PARAMETERS, Plant, SampledPlant
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import PLANTS, Scenario, Tweak
+from analogrig_emulator import Excitation
 
 FRONT = PLANTS["front"]
 
@@ -121,7 +122,8 @@ class Trial:
 
     def width_bound(self) -> int:
         """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the
-        information between the courses that the displacement then takes is below ln 20, as in harness.information."""
+        information between the courses that the displacement then takes is below ln 20, as in
+        analogrig.judging.information."""
         first = max(0, self.sample - 400)
         samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
         courses_m = self._courses(first, samples)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from harness.plant import Plant
-from harness.run import Run
-from harness.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
+from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
+from analogrig.plant import Plant
+from analogrig.run import Run
 from tests.harness.runs import M_PER_CODE, N_PER_CODE, made_run
 
 SAMPLES = 1800

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.advice import advice
-from harness.plant import Plant
-from harness.run import Run
-from harness.verdict import judge
+from analogrig.judging.advice import advice
+from analogrig.judging.verdict import judge
+from analogrig.plant import Plant
+from analogrig.run import Run
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)

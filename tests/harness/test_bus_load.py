@@ -10,7 +10,7 @@ import can
 import pytest
 from anycrc import Model
 
-from harness.links.bus_load import (
+from analogrig.links.bus_load import (
     Stream,
     exchange_load,
     frame_bits,

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from harness.links.wire import VirtualClock
-from harness.onset.two_filter import Signals
-from harness.plant import Plant
-from harness.rigs.by_hand import ByHand, Tweak, doubts
-from harness.scenario import Tweak as PlayedTweak
+from analogrig.hardware.by_hand import ByHand, Tweak, doubts
+from analogrig.hardware.onset.two_filter import Signals
+from analogrig.links.wire import VirtualClock
+from analogrig.plant import Plant
+from analogrig.scenario import Tweak as PlayedTweak
 from tests.harness.onsets import FRONT, Clock, Several, played, scenario_of
 
 RATE_HZ = 20e3

@@ -14,12 +14,14 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
-from emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
-from harness import config
-from harness.calibration.fit import Calibration, Pots, Stock, calibrate
-from harness.calibration.model import Model, _taken_late
-from harness.calibration.plan import check_scenario, scenarios
-from harness.calibration.recordings import (
+from analogrig import config
+from analogrig.cli import main
+from analogrig.cli.calibrate import _said
+from analogrig.errors import ConfigurationError, RigError
+from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
+from analogrig.hardware.calibration.model import Model, _taken_late
+from analogrig.hardware.calibration.plan import check_scenario, scenarios
+from analogrig.hardware.calibration.recordings import (
     DISPLACEMENT,
     FORCE,
     Recording,
@@ -28,14 +30,12 @@ from harness.calibration.recordings import (
     record,
     rounding,
 )
-from harness.cli import main
-from harness.cli.calibrate import _said
-from harness.errors import ConfigurationError, RigError
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from harness.rigs.rig import Block, Hindsight, Performance
-from harness.run import CHANNELS, MEASURED, Channel
-from harness.scenario import PlantChoice
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from analogrig.rigs.rig import Block, Hindsight, Performance
+from analogrig.run import CHANNELS, MEASURED, Channel
+from analogrig.scenario import PlantChoice
+from analogrig_emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
 from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
 
 LSB_V = 20.0 / 4096
@@ -252,7 +252,7 @@ def test_the_command_keeps_a_twin_that_opens_as_a_rig(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr("harness.cli.terminal._PROGRESS_S", 0.0)
+    monkeypatch.setattr("analogrig.cli.terminal._PROGRESS_S", 0.0)
     out = tmp_path / "twin.toml"
     assert ran(described(tmp_path), out, "--json") == 0
     said = capsys.readouterr()

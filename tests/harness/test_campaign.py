@@ -17,27 +17,27 @@ from pathlib import Path
 
 import pytest
 
-from harness.bench import Bench
-from harness.campaign import players
-from harness.campaign.conduct import Tally, conduct, journal_of
-from harness.campaign.journal import Journal
-from harness.campaign.plan import Chunk, Plan, one_worker_only, rig_table
-from harness.campaign.results import Results, Summary, text
-from harness.campaign.rows import row
-from harness.campaign.spec import CampaignSpec
-from harness.campaign.trial import close_devices, play_chunk
-from harness.campaign.workers import MOST_DEATHS, Processes, ThisProcess
-from harness.cli import main
-from harness.devices import DeviceDescription, describe
-from harness.dut import Dut, connect, open_dut
-from harness.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
-from harness.links.wire import LIBRARY
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.run import Run
-from harness.scenario import Scenario, Tweak
-from harness.statistics import ConfidenceSequence
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.campaigns import players
+from analogrig.campaigns.conduct import Tally, conduct, journal_of
+from analogrig.campaigns.journal import Journal
+from analogrig.campaigns.plan import Chunk, Plan, one_worker_only, rig_table
+from analogrig.campaigns.results import Results, Summary, text
+from analogrig.campaigns.rows import row
+from analogrig.campaigns.spec import CampaignSpec
+from analogrig.campaigns.trial import close_devices, play_chunk
+from analogrig.campaigns.workers import MOST_DEATHS, Processes, ThisProcess
+from analogrig.cli import main
+from analogrig.devices.devices import DeviceDescription, describe
+from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
+from analogrig.judging.statistics import ConfidenceSequence
+from analogrig.judging.verdict import judge
+from analogrig.links.wire import LIBRARY
+from analogrig.protocol.dut import Dut, connect, open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.run import Run
+from analogrig.scenario import Scenario, Tweak
 
 SPEC = """
 trials = 6
@@ -202,7 +202,7 @@ def started(spec: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
     command: list[str | Path] = [
         sys.executable,
         "-m",
-        "harness.cli",
+        "analogrig.cli",
         "campaign",
         spec,
         "--out",
@@ -682,7 +682,7 @@ def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Pa
     planned(tmp_path)
     out = tmp_path / "out.json"
     command = (
-        f"ulimit -f 4; exec {sys.executable} -m harness.cli campaign {tmp_path / 'spec.toml'} --out {out} --workers 1"
+        f"ulimit -f 4; exec {sys.executable} -m analogrig.cli campaign {tmp_path / 'spec.toml'} --out {out} --workers 1"
     )
     ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
@@ -721,7 +721,7 @@ def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("harness.dut.Dut.play", interrupted)
+        patched.setattr("analogrig.protocol.dut.Dut.play", interrupted)
         assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
     assert "interrupted: what is done is kept in" in capsys.readouterr().err
     assert journal_of(out).read_bytes().count(b"\n") == 1

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
-from harness.campaign.plan import Plan
-from harness.campaign.report import render, write_page
-from harness.campaign.results import Results
-from harness.campaign.rows import Row
-from harness.campaign.spec import CampaignSpec, Grid
+from analogrig.campaigns.plan import Plan
+from analogrig.campaigns.report import render, write_page
+from analogrig.campaigns.results import Results
+from analogrig.campaigns.rows import Row
+from analogrig.campaigns.spec import CampaignSpec, Grid
 from tests.browser import Watched
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import can
 import pytest
 
-from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.links.can_bus import PythonCanBus, completed
-from harness.links.line import CanLine
+from analogrig.errors import ConfigurationError, LinkClosed, LinkError
+from analogrig.links.can_bus import PythonCanBus, completed
+from analogrig.links.line import CanLine
 
 FRAME = can.Message(arbitration_id=0x18, is_extended_id=False, data=bytes(8))
 
@@ -201,7 +201,7 @@ def test_full_queue_is_waited_for(bus: PythonCanBus, monkeypatch: pytest.MonkeyP
 def test_queue_that_stays_full_is_named_with_what_may_be_the_cause(
     bus: PythonCanBus, error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harness.links.can_bus.WRITE_TIMEOUT_S", 0.02)
+    monkeypatch.setattr("analogrig.links.can_bus.WRITE_TIMEOUT_S", 0.02)
     monkeypatch.setattr(bus._bus, "send", failing(error, times=1000))
     with pytest.raises(LinkError, match=r"queue has been full for 0\.02 s: nobody acknowledges") as caught:
         bus.send(FRAME)

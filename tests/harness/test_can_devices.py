@@ -15,18 +15,18 @@ import can
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.catalogue import Counter
-from harness.cli import main
-from harness.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
-from harness.dut import Dut, connect, open_dut, reopen_dut
-from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.links.bus_load import load_of
-from harness.rigs.description import open_rig
-from harness.run import Run
-from harness.scenario import Scenario
-from harness.summary import summary
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.cli import main
+from analogrig.devices.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
+from analogrig.errors import ConfigurationError, LinkClosed, LinkError
+from analogrig.judging.verdict import judge
+from analogrig.links.bus_load import load_of
+from analogrig.protocol.catalogue import Counter
+from analogrig.protocol.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.reporting.summary import summary
+from analogrig.rigs.description import open_rig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
 from tests.harness.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import children

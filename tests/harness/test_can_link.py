@@ -7,15 +7,15 @@ from collections import deque
 import can
 import pytest
 
-from harness.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
-from harness.conversation import Conversation
-from harness.devices import InprocDevice
-from harness.dut import Dut
-from harness.errors import ConfigurationError, LinkError, LinkTimeout
-from harness.links.can_device import MemoryBus
-from harness.links.can_link import CanLink
-from harness.links.line import CanLine
-from harness.links.wire import VirtualClock
+from analogrig.devices.devices import InprocDevice
+from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
+from analogrig.links.can_device import MemoryBus
+from analogrig.links.can_link import CanLink
+from analogrig.links.line import CanLine
+from analogrig.links.wire import VirtualClock
+from analogrig.protocol.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
+from analogrig.protocol.conversation import Conversation
+from analogrig.protocol.dut import Dut
 
 SAMPLE = Sample(7, 0, 513, 1000, 2000)
 ESTIMATE = Estimate(3, 1, 513, 0.5)

@@ -17,19 +17,19 @@ import can
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.can_log import WRITTEN, CanLog, CapturedFrames, captured_run, retold
-from harness.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
-from harness.cli import main
-from harness.dut import open_dut
-from harness.errors import ConfigurationError, RecordingError
-from harness.estimator_config import EstimatorConfig
-from harness.rigs.description import open_rig
-from harness.rigs.recording import RecordingRig
-from harness.run import LOST, Run
-from harness.scenario import Scenario
-from harness.summary import summary
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.cli import main
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.judging.verdict import judge
+from analogrig.protocol.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
+from analogrig.protocol.dut import open_dut
+from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, captured_run, retold
+from analogrig.reporting.summary import summary
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.run import LOST, Run
+from analogrig.scenario import Scenario
 
 DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
 
@@ -144,8 +144,8 @@ def test_asammdf_is_not_imported_before_a_measurement_is_written(tmp_path: Path)
     told = """
 import sys
 from pathlib import Path
-from harness.links.python_can import can
-from harness.can_log import CanLog, CapturedFrames
+from analogrig.links.python_can import can
+from analogrig.recordings import CanLog, CapturedFrames
 frame = can.Message(arbitration_id=0x18, is_extended_id=False, data=b"12345678", is_rx=False)
 def is_there():
     return not {"asammdf", "pandas"}.isdisjoint(sys.modules)
@@ -475,7 +475,7 @@ def test_measurement_that_is_damaged_is_refused_in_one_line(
     whole = written(tmp_path / "whole.mf4", traffic[1]).read_bytes()
     cut = tmp_path / "cut.mf4"
     cut.write_bytes(whole[:3000])
-    words = ["-m", "harness.cli", "judge", str(cut), "--scenario", "thesis", "--out", str(tmp_path)]
+    words = ["-m", "analogrig.cli", "judge", str(cut), "--scenario", "thesis", "--out", str(tmp_path)]
     done = subprocess.run([sys.executable, *words], capture_output=True, check=False, timeout=60)
     assert done.returncode == 2
     assert done.stderr.decode().startswith(f"analogrig: {cut}: holds no run of a device: {cut} is damaged after 0 ")

@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.bench import Bench
-from harness.campaign.comparison import Difference, _worded, compare, permutation_p, sign_flip_p
-from harness.campaign.plan import rig_table
-from harness.campaign.rows import Row
-from harness.campaign.sides import load, matched
-from harness.campaign.trial import Count
-from harness.campaign.workers import Processes, ThisProcess
-from harness.certificate import Certificate, Question, certify, question_of
-from harness.cli import main
-from harness.devices import describe
-from harness.dut import open_dut
-from harness.errors import ConfigurationError, RecordingError
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario, Tweak
+from analogrig.bench import Bench
+from analogrig.campaigns.certificate import Certificate, Question, certify, question_of
+from analogrig.campaigns.comparison import Difference, _worded, compare, permutation_p, sign_flip_p
+from analogrig.campaigns.plan import rig_table
+from analogrig.campaigns.rows import Row
+from analogrig.campaigns.sides import load, matched
+from analogrig.campaigns.trial import Count
+from analogrig.campaigns.workers import Processes, ThisProcess
+from analogrig.cli import main
+from analogrig.devices.devices import describe
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario, Tweak
 
 # -------------------------------------------------------------------------------------------------------- certificates
 

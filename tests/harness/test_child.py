@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from harness.catalogue import CATALOGUE_HASH, Hello, Identify
-from harness.devices import host_wire
-from harness.errors import LinkClosed, LinkError
-from harness.links import child as child_module
-from harness.links.child import TETHER, Child, ChildWire
-from harness.links.link import FramedLink, Link
+from analogrig.devices.devices import host_wire
+from analogrig.errors import LinkClosed, LinkError
+from analogrig.links import child as child_module
+from analogrig.links.child import TETHER, Child, ChildWire
+from analogrig.links.link import FramedLink, Link
+from analogrig.protocol.catalogue import CATALOGUE_HASH, Hello, Identify
 from tests.harness.processes import LONG_S, children, ends
 
 
@@ -146,8 +146,9 @@ def test_of_a_program_that_never_stops_talking_the_last_words_are_kept() -> None
 @pytest.mark.parametrize("stopped", [False, True])
 def test_process_does_not_outlive_a_killed_parent(*, stopped: bool) -> None:
     parent = (
-        "import os, signal; from harness.devices import host_wire; from tests.harness.processes import children;"
-        " wire = host_wire(); (pid,) = children(wire.child.tether_pid); print(pid, flush=True);"
+        "import os, signal; from analogrig.devices.devices import host_wire;"
+        " from tests.harness.processes import children; wire = host_wire();"
+        " (pid,) = children(wire.child.tether_pid); print(pid, flush=True);"
         f" {stopped} and os.kill(pid, signal.SIGSTOP); os.kill(os.getpid(), signal.SIGKILL)"
     )
     out = subprocess.run([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, check=False)

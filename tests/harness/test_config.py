@@ -12,11 +12,11 @@ from typing import Literal
 
 import pytest
 
-from emulator.excitation import Excitation
-from harness import config
-from harness.errors import ConfigurationError
-from harness.rigs.description import open_rig
-from harness.scenario import Expectations, PlantChoice, Scenario, Statement, Tweak
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Expectations, PlantChoice, Scenario, Statement, Tweak
+from analogrig_emulator.excitation import Excitation
 
 SCENARIO = """
 samples = 100

@@ -16,7 +16,32 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.catalogue import (
+from analogrig.devices.devices import (
+    DeviceDescription,
+    HostDevice,
+    InprocDevice,
+    SerialDevice,
+    describe,
+    from_table,
+    host_wire,
+)
+from analogrig.devices.estimator import Estimator
+from analogrig.errors import (
+    CatalogueMismatch,
+    ConfigurationError,
+    DeviceError,
+    DeviceRefused,
+    LinkClosed,
+    LinkError,
+    LinkTimeout,
+)
+from analogrig.links import frame
+from analogrig.links.can_device import MemoryBus
+from analogrig.links.can_link import CanLink
+from analogrig.links.child import ChildWire
+from analogrig.links.link import CanListener, FramedLink, Link
+from analogrig.links.wire import MemoryWire, VirtualClock
+from analogrig.protocol.catalogue import (
     CATALOGUE_HASH,
     Alarm,
     Change,
@@ -39,34 +64,9 @@ from harness.catalogue import (
     pack,
     unpack_any,
 )
-from harness.devices import (
-    DeviceDescription,
-    HostDevice,
-    InprocDevice,
-    SerialDevice,
-    describe,
-    from_table,
-    host_wire,
-)
-from harness.dut import Dut, Replies, connect, open_dut, reopen_dut
-from harness.errors import (
-    CatalogueMismatch,
-    ConfigurationError,
-    DeviceError,
-    DeviceRefused,
-    LinkClosed,
-    LinkError,
-    LinkTimeout,
-)
-from harness.estimator import Estimator
-from harness.estimator_config import EstimatorConfig
-from harness.links import frame
-from harness.links.can_device import MemoryBus
-from harness.links.can_link import CanLink
-from harness.links.child import ChildWire
-from harness.links.link import CanListener, FramedLink, Link
-from harness.links.wire import MemoryWire, VirtualClock
-from harness.run import LOST
+from analogrig.protocol.dut import Dut, Replies, connect, open_dut, reopen_dut
+from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.run import LOST
 from tests.harness.processes import children
 
 N = 400

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.config import locate
-from harness.devices import HOST_PROGRAM
-from harness.plant import Plant
-from harness.run import Run
+from analogrig.config import locate
+from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.plant import Plant
+from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware
 from tests.harness.processes import descendants
 from tests.harness.runs import made_run
@@ -31,7 +31,7 @@ ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.starts
 
 
 def analogrig(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "harness.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "analogrig.cli", *map(str, arguments)]
     environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
     return subprocess.run(
         command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
@@ -285,7 +285,7 @@ def long_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """`analogrig run` in the middle of two million samples, and the pid of its device."""
     text = locate("scenarios", "healthy").read_text().replace("samples = 20000", "samples = 2000000")
     (folder / "long.toml").write_text(text)
-    command = [sys.executable, "-m", "harness.cli", "run", "--scenario", "long.toml"]
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--scenario", "long.toml"]
     environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -336,7 +336,7 @@ def test_killed_harness_leaves_no_device_behind(tmp_path: Path) -> None:
 
 
 def test_closed_pipe_does_not_turn_a_failed_verdict_into_success(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "harness.cli", "run", "--dut", "mean-between-faults"]
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "mean-between-faults"]
     environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
     reader, writer = os.pipe()
     os.close(reader)
@@ -349,7 +349,7 @@ def test_closed_pipe_does_not_turn_a_failed_verdict_into_success(tmp_path: Path)
 
 
 def test_run_whose_output_nobody_hears_is_kept_and_judged(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "harness.cli", "run", "--dut", "inproc", "--out", "kept"]
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", "kept"]
     environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
     reader, writer = os.pipe()
     os.close(reader)

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from harness import config
-from harness.catalogue import Configure, Configured, Identify, Key, Trigger
-from harness.errors import ConfigurationError
-from harness.estimator_config import EstimatorConfig
-from harness.links.link import FramedLink
-from harness.links.wire import MemoryWire
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.links.link import FramedLink
+from analogrig.links.wire import MemoryWire
+from analogrig.protocol.catalogue import Configure, Configured, Identify, Key, Trigger
+from analogrig.protocol.estimator_config import EstimatorConfig
 
 
 def test_defaults_are_those_of_the_device() -> None:

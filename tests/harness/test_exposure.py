@@ -7,19 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.catalogue import SteppedFlag
-from harness.devices import describe
-from harness.dut import open_dut
-from harness.exposure import exposure
-from harness.plant import Plant
-from harness.played import Played, rate_below
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.run import CHANNELS, Run
-from harness.scenario import Scenario
-from harness.trials import Trials
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.campaigns.trials import Trials
+from analogrig.devices.devices import describe
+from analogrig.judging.exposure import exposure
+from analogrig.judging.verdict import judge
+from analogrig.plant import Plant
+from analogrig.protocol.catalogue import SteppedFlag
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.run import CHANNELS, Run
+from analogrig.scenario import Scenario
+from analogrig.testing.played import Played, rate_below
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(294.0, 3021.0, 24500.0)

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from harness.devices import describe
-from harness.links.faulty_wire import FaultyWire
-from harness.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.devices.devices import describe
+from analogrig.links.faulty_wire import FaultyWire
+from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from tests.harness.fault_runs import (
     BACK_AT,
     FAULTY,

@@ -8,7 +8,8 @@ import random
 
 import pytest
 
-from harness.catalogue import (
+from analogrig.links import frame
+from analogrig.protocol.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     LAYOUTS,
@@ -23,7 +24,6 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.links import frame
 
 POLYNOMIAL = 0x82F63B78
 """Castagnoli's, reflected."""

@@ -11,8 +11,8 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 from scipy.signal import cont2discrete
 
-from harness import information
-from harness.plant import AT_REST, Plant, SampledPlant, physical_parameters
+from analogrig.judging import information
+from analogrig.plant import AT_REST, Plant, SampledPlant, physical_parameters
 from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)

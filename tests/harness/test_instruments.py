@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator import Excitation, SuspensionComputer
-from emulator.opamp import preset
-from harness.errors import ConfigurationError, RecordStale, RigRefused
-from harness.rigs.instrument import DRIVERS, Instrument, Record, Turn, located
-from harness.rigs.ni_daqmx import NiDaqmx
-from harness.rigs.red_pitaya import RedPitaya
-from harness.rigs.scpi_connection import ScpiConnection
-from harness.served.acquisition import AcquisitionFaults
-from harness.served.description import InstrumentDescription
-from harness.served.inputs import InputFaults
-from harness.served.red_pitaya import ServedRedPitaya
-from harness.served.scpi import Interpreter
-from harness.served.table import Amplifier, Booster, Wiring
+from analogrig.errors import ConfigurationError, RecordStale, RigRefused
+from analogrig.hardware.instrument import DRIVERS, Instrument, Record, Turn, located
+from analogrig.hardware.ni_daqmx import NiDaqmx
+from analogrig.hardware.red_pitaya import RedPitaya
+from analogrig.hardware.scpi_connection import ScpiConnection
+from analogrig.hardware.simulator.acquisition import AcquisitionFaults
+from analogrig.hardware.simulator.description import InstrumentDescription
+from analogrig.hardware.simulator.inputs import InputFaults
+from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
+from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
+from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_emulator.opamp import preset
 from tests.harness.ni_stand_in import Card, library
 
 SAMPLES = 400
@@ -188,7 +188,7 @@ def test_addresses_of_other_kinds_of_instruments_are_left_to_their_drivers(
         def is_address(cls, address: str) -> bool:
             return address.startswith(("ip:", "usb:"))
 
-    monkeypatch.setattr("harness.rigs.ni_daqmx.NiDaqmx", Adalm2000)
+    monkeypatch.setattr("analogrig.hardware.ni_daqmx.NiDaqmx", Adalm2000)
     assert located(f"nidaqmx://{address}") == (Adalm2000, address)
 
 

@@ -13,7 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from harness.catalogue import (
+from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.errors import ConfigurationError, LinkClosed, LinkError
+from analogrig.links import frame
+from analogrig.links.link import FramedLink
+from analogrig.links.wire import MemoryWire, PortWire
+from analogrig.protocol.catalogue import (
     CATALOGUE_HASH,
     Command,
     Control,
@@ -24,11 +29,6 @@ from harness.catalogue import (
     Stepped,
     pack,
 )
-from harness.devices import HOST_PROGRAM
-from harness.errors import ConfigurationError, LinkClosed, LinkError
-from harness.links import frame
-from harness.links.link import FramedLink
-from harness.links.wire import MemoryWire, PortWire
 
 LONG_S = 20.0
 """For what comes at once unless something is broken."""
@@ -121,7 +121,7 @@ def test_other_end_that_hangs_up_is_told_from_silence(link: FramedLink, terminal
 
 
 def test_line_that_takes_nothing_is_an_error_not_a_hang(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("harness.links.wire.WRITE_TIMEOUT_S", 0.05)
+    monkeypatch.setattr("analogrig.links.wire.WRITE_TIMEOUT_S", 0.05)
     link = at_port(terminal.path)
     with pytest.raises(LinkError, match="takes nothing"):
         link.send([Identify(0)] * 100_000)
@@ -184,7 +184,7 @@ def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monke
     absent = tmp_path / "absent.so"
     with pytest.raises(ConfigurationError, match=r"absent\.so: cannot be loaded as a library of a device"):
         MemoryWire(1, library=absent)
-    monkeypatch.setattr("harness.links.wire.LIBRARY", absent)
+    monkeypatch.setattr("analogrig.links.wire.LIBRARY", absent)
     with pytest.raises(LinkError, match="make setup"):
         MemoryWire(1, library=absent)
 

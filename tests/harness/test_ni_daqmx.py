@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import Excitation
-from harness.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
-from harness.rigs.description import open_rig
-from harness.rigs.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
-from harness.scenario import Scenario
+from analogrig.errors import ConfigurationError, RecordIncomplete, RigClosed, RigError, RigRefused, RigTimeout
+from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+from analogrig_emulator import Excitation
 from tests.harness.ni_stand_in import Card, DaqError, Error, library
 
 RIG = """\
@@ -119,7 +119,7 @@ def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypat
     instrument = NiDaqmx(library(card), "Dev1", 1.0)
     instrument.set_inputs([(0, "10V"), (1, "10V")])
     instrument.set_excitation(SCENARIO.excitation)
-    monkeypatch.setattr("harness.rigs.ni_daqmx._bits", lambda _: 12)
+    monkeypatch.setattr("analogrig.hardware.ni_daqmx._bits", lambda _: 12)
     with pytest.raises(RigError, match=r"instrument Dev1: gave the code \d+, which its 12 bits do not have"):
         instrument.record(100)
 

@@ -12,11 +12,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator import COMPONENTS, Excitation, SuspensionComputer
-from harness.onset.jump import NoOnset, Onset, Problem, colour, interval, onset
-from harness.onset.turn import SlowTurn, turn
-from harness.onset.two_filter import ANYWHERE, Backwards, Columns, EdgePlace, Forwards, Model, Signals, joined
-from harness.plant import Plant, SampledPlant
+from analogrig.hardware.onset.jump import NoOnset, Onset, Problem, colour, interval, onset
+from analogrig.hardware.onset.turn import SlowTurn, turn
+from analogrig.hardware.onset.two_filter import (
+    ANYWHERE,
+    Backwards,
+    Columns,
+    EdgePlace,
+    Forwards,
+    Model,
+    Signals,
+    joined,
+)
+from analogrig.plant import Plant, SampledPlant
+from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 from tests.harness.onsets import FRONT, Trial, played, scenario_of, still
 
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01

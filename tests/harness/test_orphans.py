@@ -48,7 +48,7 @@ def gone(mark: str) -> bool:
 def harness(dut: str, folder: Path) -> Iterator[str]:
     """`analogrig run` of a long scenario, killed at the end; yields the mark of all that it starts."""
     mark = str(uuid.uuid4())
-    command = [sys.executable, "-m", "harness.cli", "run", "--scenario", "healthy", "--dut", dut]
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--scenario", "healthy", "--dut", dut]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "ANALOGRIG_TEST_MARK": mark}
     with subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL) as process:
         yield mark

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from harness import cli
-from harness.advice import advice
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.report import render
-from harness.rigs.description import open_rig
-from harness.rigs.recording import RecordingRig
-from harness.run import Run
-from harness.scenario import Scenario
-from harness.summary import summary
-from harness.verdict import as_json, judge
+from analogrig import cli
+from analogrig.bench import Bench
+from analogrig.judging.advice import advice
+from analogrig.judging.verdict import as_json, judge
+from analogrig.protocol.dut import open_dut
+from analogrig.reporting import render
+from analogrig.reporting.summary import summary
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
 from tests.harness.reported import Page, reported_run, reported_verdict
 
 OVERLOADING = """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.cli import main
+from analogrig.cli import main
 
 CHECKOUT = Path(__file__).parents[2]
 README = CHECKOUT / "harness" / "README.md"

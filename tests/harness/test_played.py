@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from harness.plant import Plant
-from harness.played import Played, rate_below
+from analogrig.plant import Plant
+from analogrig.testing.played import Played, rate_below
 from tests.harness.runs import made_run
 
 FRONT = Plant(294.0, 3021.0, 24500.0)

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from harness import config
-from harness.errors import ConfigurationError, RigError
-from harness.rigs.pots import NoPots, OperatorPots, Pots, PotsDescription
+from analogrig import config
+from analogrig.errors import ConfigurationError, RigError
+from analogrig.hardware.pots import NoPots, OperatorPots, Pots, PotsDescription
 from tests.harness.processes import ends
 
 DIALS = {"K": 0.6380, "B": 0.8152}

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator import COMPONENTS, Excitation, SuspensionComputer
-from harness import config
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.rigs.instrument import Instrument, Taken
-from harness.rigs.ni_daqmx import NiDaqmx
-from harness.rigs.real import RealRig
-from harness.rigs.wiring import RealDescription
-from harness.run import Run
-from harness.scenario import Scenario
-from harness.scenario import Tweak as Asked
-from harness.verdict import judge
+from analogrig import config
+from analogrig.bench import Bench
+from analogrig.hardware.instrument import Instrument, Taken
+from analogrig.hardware.ni_daqmx import NiDaqmx
+from analogrig.hardware.real import RealRig
+from analogrig.hardware.wiring import RealDescription
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import open_dut
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from analogrig.scenario import Tweak as Asked
+from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 
 SAMPLES, ASKED_AT = 10_000, 3000
 INSTANTS = (3215, 3311)

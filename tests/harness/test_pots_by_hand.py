@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.rigs.description import open_rig
-from harness.run import Run
-from harness.scenario import Scenario, Tweak
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.run import Run
+from analogrig.scenario import Scenario, Tweak
 from tests.harness.served import Served, served
 
 PROGRAM = """\

@@ -10,20 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import PROGRAMS, SuspensionComputer
-from harness import cli, information
-from harness.bench import Bench
-from harness.cli import options
-from harness.dut import open_dut
-from harness.errors import ConfigurationError
-from harness.netlist import netlist
-from harness.plant import Plant, SampledPlant
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.rigs.recording import RecordingRig
-from harness.run import Run, Segment
-from harness.scenario import PlantChoice, Scenario, Tweak
-from harness.verdict import as_json, judge
+from analogrig import cli
+from analogrig.bench import Bench
+from analogrig.cli import options
+from analogrig.errors import ConfigurationError
+from analogrig.judging import information
+from analogrig.judging.verdict import as_json, judge
+from analogrig.plant import Plant, SampledPlant
+from analogrig.protocol.dut import open_dut
+from analogrig.reporting.netlist import netlist
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.run import Run, Segment
+from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig_emulator import PROGRAMS, SuspensionComputer
 from tests.harness.runs import made_run
 
 FRONT, SOFT = Plant(115.0, 3021.0, 24500.0), Plant(115.0, 3021.0, 18000.0)

@@ -15,17 +15,17 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-import harness.properties.experiments
-import harness.report  # noqa: F401 - these two for the runs in this process, which forgets what they import themselves
-from emulator.excitation import Excitation
-from harness import cli, config
-from harness.bench import Bench
-from harness.devices import host_child, of_scenario
-from harness.dut import open_dut
-from harness.errors import ConfigurationError
-from harness.experiment import Play, judged
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario, Statement
+import analogrig.reporting  # these two for the runs in this process, which forgets what they import themselves
+import analogrig.testing.properties.experiments  # noqa: F401
+from analogrig import cli, config
+from analogrig.bench import Bench
+from analogrig.devices.devices import host_child, of_scenario
+from analogrig.errors import ConfigurationError
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario, Statement
+from analogrig.testing.experiment import Play, judged
+from analogrig_emulator.excitation import Excitation
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 
@@ -260,7 +260,7 @@ def test_command_of_a_play_names_files_as_the_user_does_and_says_nothing_when_no
     user.makepyfile(
         """
         import dataclasses
-        from harness.scenario import Scenario
+        from analogrig.scenario import Scenario
 
         def test_it(play):
             played = play("short.toml", seed=5)
@@ -394,7 +394,7 @@ def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
     heavy = "{'numpy', 'hypothesis', 'scipy', 'can'}"
     collect = "pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider', '/dev/null'])"
     script = f"import sys, pytest; {collect}; print(sorted({heavy} & set(sys.modules)))"
-    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "harness.pytest_plugin"}
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "analogrig.testing.plugin"}
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment, cwd="/"
     )
@@ -433,7 +433,7 @@ def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(use
 def test_property_that_failed_with_every_seed_is_tried_with_every_seed_again(user: pytest.Pytester) -> None:
     user.makepyfile(
         """
-        from harness.properties import with_some_seed
+        from analogrig.testing.properties import with_some_seed
 
         def test_it(play):
             assert with_some_seed(play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
@@ -516,7 +516,7 @@ import pathlib, sys
 
 from hypothesis import given
 
-from harness.strategies import profile, seeds
+from analogrig.testing.strategies import profile, seeds
 
 @profile()
 @given(seed=seeds())

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from harness.bench import Bench
-from harness.config import names
-from harness.devices import (
+from analogrig.bench import Bench
+from analogrig.config import names
+from analogrig.devices.devices import (
     KINDS,
     DeviceDescription,
     HostDevice,
@@ -26,11 +26,11 @@ from harness.devices import (
     describe,
     from_table,
 )
-from harness.dut import Dut, connect, reopen_dut
-from harness.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
-from harness.rigs.description import open_rig
-from harness.run import Run
-from harness.scenario import Scenario
+from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
+from analogrig.protocol.dut import Dut, connect, reopen_dut
+from analogrig.rigs.description import open_rig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
 from tests.harness.firmware import CORES, FOLDER, needs_firmware
 from tests.harness.processes import descendants
 

@@ -12,20 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness import rare
-from harness.campaign.plan import rig_table
-from harness.campaign.workers import Processes, ThisProcess
-from harness.certificate import certify, estimate_once, question_of
-from harness.cli import main
-from harness.devices import DeviceDescription, describe
-from harness.errors import ConfigurationError
-from harness.estimator import Estimator
-from harness.rare import PLAY_N, false_alarm_rate
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.scenario import Scenario
-from harness.statistics import mean_bounds
-from harness.trials import Trials
+from analogrig.campaigns import rare
+from analogrig.campaigns.certificate import certify, estimate_once, question_of
+from analogrig.campaigns.plan import rig_table
+from analogrig.campaigns.rare import PLAY_N, false_alarm_rate
+from analogrig.campaigns.trials import Trials
+from analogrig.campaigns.workers import Processes, ThisProcess
+from analogrig.cli import main
+from analogrig.devices.devices import DeviceDescription, describe
+from analogrig.devices.estimator import Estimator
+from analogrig.errors import ConfigurationError
+from analogrig.judging.statistics import mean_bounds
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.scenario import Scenario
 
 SURELY = 5.3
 """Standard errors; a normal variable is farther off once in ten million times."""
@@ -80,7 +80,9 @@ def test_rate_does_not_depend_on_how_loud_the_branches_are(monkeypatch: pytest.M
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer branches, within this process."""
-    monkeypatch.setattr("harness.certificate.false_alarm_rate", functools.partial(false_alarm_rate, branches=200))
+    monkeypatch.setattr(
+        "analogrig.campaigns.certificate.false_alarm_rate", functools.partial(false_alarm_rate, branches=200)
+    )
 
 
 @pytest.mark.usefixtures("quick")

@@ -16,22 +16,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.excitation import Excitation
-from harness import config
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
-from harness.rigs.description import described as described_rig
-from harness.rigs.description import open_rig
-from harness.rigs.instrument import PotBox, Turn
-from harness.rigs.plan import LEAD_N, records
-from harness.rigs.real import RealRig
-from harness.rigs.red_pitaya import RedPitaya
-from harness.rigs.rig import Performance
-from harness.rigs.wiring import RealDescription
-from harness.run import Run
-from harness.scenario import PlantChoice, Scenario, Tweak
-from harness.verdict import judge
+from analogrig import config
+from analogrig.bench import Bench
+from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
+from analogrig.hardware.instrument import PotBox, Turn
+from analogrig.hardware.plan import LEAD_N, records
+from analogrig.hardware.real import RealRig
+from analogrig.hardware.red_pitaya import RedPitaya
+from analogrig.hardware.wiring import RealDescription
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import described as described_rig
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.rig import Performance
+from analogrig.run import Run
+from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig_emulator.excitation import Excitation
 from tests.harness.processes import LONG_S
 from tests.harness.served import RIG, ROOT, Served, served
 
@@ -327,7 +327,7 @@ def test_run_that_is_ended_leaves_the_generator_off(number: signal.Signals, stat
     with served(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
         file.write_text(file.read_text().replace("timeout_s = 2.0", "timeout_s = 60.0"))
-        command = [sys.executable, "-m", "harness.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
+        command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
         with subprocess.Popen(
             [*command, "--rig", str(file)], cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         ) as process:
@@ -472,7 +472,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
         result = subprocess.run(
             [
                 *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0"),
-                *("--pyargs", "harness.properties", "--rig", "bench", "--dut", "inproc"),
+                *("--pyargs", "analogrig.testing.properties", "--rig", "bench", "--dut", "inproc"),
                 *("--runs-dir", str(tmp_path / "runs")),
             ],
             cwd=tmp_path,

@@ -7,18 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.catalogue import BLOCK_SAMPLES, Sample
-from harness.devices import DeviceDescription, HostDevice, InprocDevice
-from harness.dut import Dut, connect
-from harness.errors import ConfigurationError
-from harness.links.line import SerialLine
-from harness.links.link import FramedLink
-from harness.links.wire import MemoryWire, VirtualClock
-from harness.rigs.description import open_rig
-from harness.run import UNREPORTED, Run
-from harness.scenario import Scenario
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.devices.devices import DeviceDescription, HostDevice, InprocDevice
+from analogrig.errors import ConfigurationError
+from analogrig.judging.verdict import judge
+from analogrig.links.line import SerialLine
+from analogrig.links.link import FramedLink
+from analogrig.links.wire import MemoryWire, VirtualClock
+from analogrig.protocol.catalogue import BLOCK_SAMPLES, Sample
+from analogrig.protocol.dut import Dut, connect
+from analogrig.rigs.description import open_rig
+from analogrig.run import UNREPORTED, Run
+from analogrig.scenario import Scenario
 
 PERIOD_S = 5e-5
 THESIS = Scenario.load("thesis")

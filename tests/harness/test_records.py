@@ -9,14 +9,14 @@ from typing import Any, Self
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.rigs.description import open_rig
-from harness.rigs.recording import RecordingRig
-from harness.rigs.rig import Block, Hindsight, Performance, Rig
-from harness.run import Run, Segment
-from harness.scenario import Scenario, Tweak
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
+from analogrig.run import Run, Segment
+from analogrig.scenario import Scenario, Tweak
 
 RECORD_N = 700
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.errors import RecordingError
-from harness.report import page, render, write_report
-from harness.run import Run
-from harness.verdict import Outcome, judge
+from analogrig.errors import RecordingError
+from analogrig.judging.verdict import Outcome, judge
+from analogrig.reporting import page, render, write_report
+from analogrig.run import Run
 from tests.harness.reported import (
     CLIPPED,
     FALSE_ALARM,

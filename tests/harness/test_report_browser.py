@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser
 
-from harness.report import write_report
-from harness.run import Run
-from harness.verdict import Verdict, judge
+from analogrig.judging.verdict import Verdict, judge
+from analogrig.reporting import write_report
+from analogrig.run import Run
 from tests.browser import Watched
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
 from tests.harness.runs import with_fault

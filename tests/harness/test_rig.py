@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness import config
-from harness.errors import ConfigurationError
-from harness.rigs.description import open_rig
-from harness.rigs.recording import RecordingRig
-from harness.rigs.rig import Block, Rig
-from harness.run import CHANNELS
-from harness.scenario import Scenario, Tweak
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.rig import Block, Rig
+from analogrig.run import CHANNELS
+from analogrig.scenario import Scenario, Tweak
 
 
 def blocks(rig: Rig, scenario: Scenario, seed: int) -> list[Block]:

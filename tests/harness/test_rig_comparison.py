@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from harness.bench import Bench
-from harness.cli import main
-from harness.dut import open_dut
-from harness.plant import Plant
-from harness.rig_comparison import RigComparison, compare_rigs, signal_difference
-from harness.rigs.emulator import CardDescription, EmulatorDescription, EmulatorRig
-from harness.run import CHANNELS, Run
-from harness.scenario import Scenario
-from harness.statistics import mean_interval
+from analogrig.bench import Bench
+from analogrig.cli import main
+from analogrig.hardware.rig_comparison import RigComparison, compare_rigs, signal_difference
+from analogrig.judging.statistics import mean_interval
+from analogrig.plant import Plant
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.emulator import CardDescription, EmulatorDescription, EmulatorRig
+from analogrig.run import CHANNELS, Run
+from analogrig.scenario import Scenario
 from tests.harness.runs import made_run
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator import Capacitor, OpAmp, Resistor
-from harness import config
-from harness.errors import ConfigurationError
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.run import CHANNELS
-from harness.scenario import Scenario, Tweak
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.run import CHANNELS
+from analogrig.scenario import Scenario, Tweak
+from analogrig_emulator import Capacitor, OpAmp, Resistor
 
 NEEDED = "[card.range_v]"
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.catalogue import Change
-from harness.errors import RecordingError
-from harness.plant import Plant
-from harness.run import Run
+from analogrig.errors import RecordingError
+from analogrig.plant import Plant
+from analogrig.protocol.catalogue import Change
+from analogrig.run import Run
 from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)

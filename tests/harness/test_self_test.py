@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter, step
 from scipy.stats import chi2
 
-from harness.cli import main
-from harness.errors import ConfigurationError, RigError, SelfTestError
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from harness.rigs.rig import Block, Performance, Rig
-from harness.rigs.self_test.conduct import self_test
-from harness.rigs.self_test.findings import Check, Findings
-from harness.rigs.self_test.response import SecondOrder
-from harness.rigs.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
-from harness.run import CHANNELS
-from harness.scenario import Scenario
+from analogrig.cli import main
+from analogrig.errors import ConfigurationError, RigError, SelfTestError
+from analogrig.hardware.self_test.conduct import self_test
+from analogrig.hardware.self_test.findings import Check, Findings
+from analogrig.hardware.self_test.response import SecondOrder
+from analogrig.hardware.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import CHANNELS
+from analogrig.scenario import Scenario
 
 WIDE = {"force": (-1.0, 11.0), "displacement": (-1.0, 9.0), "velocity": (-10.0, 10.0), "net_force": (-12.5, 12.5)}
 BIPOLAR = dict.fromkeys(CHANNELS, (-12.5, 12.5))

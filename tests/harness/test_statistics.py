@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from harness.statistics import (
+from analogrig.judging.statistics import (
     ConfidenceSequence,
     Decision,
     Design,

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 
-from emulator.excitation import Excitation
-from harness import config
-from harness.devices import InprocDevice
-from harness.information import detectable, predicted_bounds
-from harness.played import Played
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorDescription, EmulatorRig
-from harness.scenario import PLANTS, PlantChoice, Scenario, Tweak
-from harness.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
-from harness.trials import Trials
-from harness.verdict import judge
+from analogrig import config
+from analogrig.campaigns.trials import Trials
+from analogrig.devices.devices import InprocDevice
+from analogrig.judging.information import detectable, predicted_bounds
+from analogrig.judging.verdict import judge
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
+from analogrig.scenario import PLANTS, PlantChoice, Scenario, Tweak
+from analogrig.testing.played import Played
+from analogrig.testing.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
+from analogrig_emulator.excitation import Excitation
 from tests.harness.runs import made_run
 
 quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])

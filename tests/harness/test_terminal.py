@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from harness.cli.terminal import ProgressLine, progress_line
+from analogrig.cli.terminal import ProgressLine, progress_line
 
 
 class Clock:
@@ -42,7 +42,7 @@ def test_what_is_done_at_once_shows_no_progress(capsys: pytest.CaptureFixture[st
 def test_progress_is_for_those_who_watch(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert progress_line() is None
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr("harness.cli.terminal._PROGRESS_S", 0.0)
+    monkeypatch.setattr("analogrig.cli.terminal._PROGRESS_S", 0.0)
     show = progress_line("recordings")
     assert show is not None
     show(3, 12)

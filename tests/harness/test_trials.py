@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.devices import describe
-from harness.dut import open_dut
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.scenario import Scenario
-from harness.trials import BLOCK_SAMPLES, Trials, are_possible
-from harness.verdict import judge
+from analogrig.bench import Bench
+from analogrig.campaigns.trials import BLOCK_SAMPLES, Trials, are_possible
+from analogrig.devices.devices import describe
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.scenario import Scenario
 
 
 def emulator(name: str) -> EmulatorRig:

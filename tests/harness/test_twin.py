@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from harness.errors import ConfigurationError
-from harness.estimator import Estimator, StepStatus
-from harness.estimator_config import EstimatorConfig
-from harness.twin import Twin
+from analogrig.devices.estimator import Estimator, StepStatus
+from analogrig.devices.reference import Twin
+from analogrig.errors import ConfigurationError
+from analogrig.protocol.estimator_config import EstimatorConfig
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from harness.catalogue import Change
-from harness.plant import Plant
-from harness.run import LOST
-from harness.verdict import DiagnosisVerdict, as_json, judge
+from analogrig.judging.verdict import DiagnosisVerdict, as_json, judge
+from analogrig.plant import Plant
+from analogrig.protocol.catalogue import Change
+from analogrig.run import LOST
 from tests.harness.runs import ESTIMATOR, made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from harness.campaign.rows import row
-from harness.catalogue import Change
-from harness.errors import RecordingError
-from harness.plant import Plant
-from harness.played import Played
-from harness.pytest_plugin.playing import _latency
-from harness.report.page import render
-from harness.run import Run, Segment
-from harness.summary import summary
-from harness.verdict import Verdict, as_json, judge
+from analogrig.campaigns.rows import row
+from analogrig.errors import RecordingError
+from analogrig.judging.verdict import Verdict, as_json, judge
+from analogrig.plant import Plant
+from analogrig.protocol.catalogue import Change
+from analogrig.reporting.page import render
+from analogrig.reporting.summary import summary
+from analogrig.run import Run, Segment
+from analogrig.testing.played import Played
+from analogrig.testing.plugin.playing import _latency
 from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)

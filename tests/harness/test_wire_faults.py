@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from harness.catalogue import Sample, pack
-from harness.devices import describe
-from harness.errors import ConfigurationError, LinkClosed
-from harness.links import frame
-from harness.links.faulty_wire import FaultyWire
-from harness.links.wire import VirtualClock
-from harness.links.wire_faults import WireFault, WireFaults
+from analogrig.devices.devices import describe
+from analogrig.errors import ConfigurationError, LinkClosed
+from analogrig.links import frame
+from analogrig.links.faulty_wire import FaultyWire
+from analogrig.links.wire import VirtualClock
+from analogrig.links.wire_faults import WireFault, WireFaults
+from analogrig.protocol.catalogue import Sample, pack
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from hypothesis import Phase, settings
 
-from harness import strategies
+from analogrig.testing import strategies
 
 settings.register_profile("analogrig-ci", parent=strategies.profile("ci"), phases=[Phase.explicit, Phase.generate])

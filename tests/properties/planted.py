@@ -40,7 +40,7 @@ class Defect:
     before: str
     after: str
     property: str
-    """The test of harness.properties that finds it."""
+    """The test of analogrig.testing.properties that finds it."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def tried(library: Path, name: str, folder: Path, *, shrunk: bool) -> Found:
     runs = folder / "runs"
     command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
-        *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "--pyargs", "harness.properties", "-k", name),
+        *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "--pyargs", "analogrig.testing.properties", "-k", name),
         *("--dut", f"inproc:{library}", "--runs-dir", runs),
         *(() if shrunk else ("-p", FOUND_ONLY)),
     ]

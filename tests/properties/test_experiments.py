@@ -9,15 +9,15 @@ from typing import Any, cast
 
 import pytest
 
-from harness.bench import Bench
-from harness.devices import InprocDevice
-from harness.dut import connect
-from harness.estimator_config import EstimatorConfig
-from harness.experiment import Play
-from harness.properties.experiments import false_alarms_at_most, false_alarms_of_plants_rarer
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario
-from harness.statement import Finding
+from analogrig.bench import Bench
+from analogrig.devices.devices import InprocDevice
+from analogrig.protocol.dut import connect
+from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+from analogrig.testing.experiment import Play
+from analogrig.testing.properties.experiments import false_alarms_at_most, false_alarms_of_plants_rarer
+from analogrig.testing.statement import Finding
 
 
 @dataclasses.dataclass

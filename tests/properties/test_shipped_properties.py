@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.bench import Bench
-from harness.dut import open_dut
-from harness.properties.test_detection import SINGLY
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario
-from harness.statistics import Decision, SequentialTest
+from analogrig.bench import Bench
+from analogrig.judging.statistics import Decision, SequentialTest
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
+from analogrig.testing.properties.test_detection import SINGLY
 from tests.harness.firmware import needs_firmware
 
 pytestmark = pytest.mark.timeout(300)
@@ -39,7 +39,7 @@ DIFFERING, MISS = 7e-4, 1e-3
 def run(folder: Path, dut: str, *arguments: str) -> str:
     command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
-        *("-p", "no:xdist", "--pyargs", "harness.properties", "--dut", dut, *arguments),
+        *("-p", "no:xdist", "--pyargs", "analogrig.testing.properties", "--dut", dut, *arguments),
     ]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("ANALOGRIG_", "PYTEST_"))}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)

@@ -69,7 +69,7 @@ class Client:
 @contextmanager
 def serving(*options: str) -> Iterator[Served]:
     """On any free port, until the end of the block."""
-    command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--json", *options]
+    command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--json", *options]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None:

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.suspension import SuspensionComputer
-from harness.served.description import InstrumentDescription
-from harness.served.red_pitaya import ServedRedPitaya
-from harness.served.scpi import Interpreter
+from analogrig.hardware.simulator.description import InstrumentDescription
+from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
+from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig_emulator.suspension import SuspensionComputer
 
 SEQUENCE = (
     "GEN:RST",

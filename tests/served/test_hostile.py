@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.served.scpi import MOST_ERRORS
+from analogrig.hardware.simulator.scpi import MOST_ERRORS
 from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
 from tests.served.serving import LONG_S, Served, ended, serving
 from tests.served.talk import SEQUENCE, asking, interpreter, record, say

@@ -9,8 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
-from harness import config
-from harness.served.description import InstrumentDescription
+from analogrig import config
+from analogrig.hardware.simulator.description import InstrumentDescription
 from tests.served.serving import LONG_S, serving
 from tests.served.talk import interpreter
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.excitation import Excitation
-from emulator.suspension import SuspensionComputer
-from harness.served.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
-from harness.served.description import InstrumentDescription
-from harness.served.inputs import InputFaults
-from harness.served.red_pitaya import MOST_SCHEDULED, ServedRedPitaya
-from harness.served.scpi import DropOut, Interpreter
-from harness.served.table import Amplifier, Booster, Wiring
+from analogrig.hardware.simulator.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
+from analogrig.hardware.simulator.description import InstrumentDescription
+from analogrig.hardware.simulator.inputs import InputFaults
+from analogrig.hardware.simulator.red_pitaya import MOST_SCHEDULED, ServedRedPitaya
+from analogrig.hardware.simulator.scpi import DropOut, Interpreter
+from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
+from analogrig_emulator.excitation import Excitation
+from analogrig_emulator.suspension import SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14

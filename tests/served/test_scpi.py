@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from harness.served.scpi import (
+from analogrig.hardware.simulator.scpi import (
     MOST_ARGUMENTS,
     MOST_ERRORS,
     VOLTS,

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import pyvisa
 
-from emulator.excitation import Excitation
-from harness.cli import main
-from harness.rigs.description import open_rig
-from harness.rigs.emulator import EmulatorRig
-from harness.scenario import Scenario
-from harness.served.rig import ServedDescription
-from harness.served.scpi import Interpreter
+from analogrig.cli import main
+from analogrig.hardware.simulator.rig import ServedDescription
+from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.scenario import Scenario
+from analogrig_emulator.excitation import Excitation
 from tests.served.serving import LONG_S, Served, ended, serving
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
 
@@ -111,7 +111,7 @@ def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named(
 
 
 def test_the_line_says_what_is_served_and_where() -> None:
-    command = [sys.executable, "-m", "harness.cli", "serve", "--port", "0", "--plant", "shock", "--seed", "7"]
+    command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--plant", "shock", "--seed", "7"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()

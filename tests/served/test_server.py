@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from harness.served.acquisition import AcquisitionFaults
-from harness.served.description import InstrumentDescription
-from harness.served.red_pitaya import ServedRedPitaya
-from harness.served.scpi import Call, Command, Response
-from harness.served.server import BUFFERED_BYTES, MOST_CLIENTS, Servable, Server
+from analogrig.hardware.simulator.acquisition import AcquisitionFaults
+from analogrig.hardware.simulator.description import InstrumentDescription
+from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
+from analogrig.hardware.simulator.scpi import Call, Command, Response
+from analogrig.hardware.simulator.server import BUFFERED_BYTES, MOST_CLIENTS, Servable, Server
 from tests.served.serving import LONG_S
 from tests.served.talk import SEQUENCE, front
 

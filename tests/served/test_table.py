@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from emulator.errors import EmulatorError
-from emulator.excitation import Excitation
-from harness.served.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
+from analogrig.hardware.simulator.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
+from analogrig_emulator.errors import EmulatorError
+from analogrig_emulator.excitation import Excitation
 from tests.served.talk import front
 
 RATE_HZ = 20e3

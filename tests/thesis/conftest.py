@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from harness.cli import main
-from harness.thesis.reproduction import CLAIMS
+from analogrig.cli import main
+from analogrig_thesis.reproduction import CLAIMS
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,6 @@
 """What a sample costs with each of the thesis's schemes: instructions of the C on x86-64, counted by callgrind.
 
-    .venv/bin/python -m tests.thesis.cost       # some four minutes; writes harness/thesis/cost.json
+    .venv/bin/python -m tests.thesis.cost       # some four minutes; writes harness/analogrig_thesis/cost.json
 
 Counted are the instructions of a whole process that runs the samples of Fig. 5.7 once, and of one that runs them a
 hundred times over: the difference is the estimator and some ten instructions of copying a sample. The figures depend on
@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.estimator import Estimator
-from harness.thesis.circuit import NOISY, SEED, TRACKING, circuit_schemes, codes
+from analogrig.devices.estimator import Estimator
+from analogrig_thesis.circuit import NOISY, SEED, TRACKING, circuit_schemes, codes
 
-RESULT = Path("harness/thesis/cost.json")
+RESULT = Path("harness/analogrig_thesis/cost.json")
 REPEATS = 100
 
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.bench import Bench
-from harness.devices import DeviceDescription, InprocDevice
-from harness.dut import connect, open_dut
-from harness.plant import PARAMETERS
-from harness.rigs.description import open_rig
-from harness.scenario import Scenario
-from harness.verdict import SegmentEstimate, Verdict, judge
+from analogrig.bench import Bench
+from analogrig.devices.devices import DeviceDescription, InprocDevice
+from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
+from analogrig.plant import PARAMETERS
+from analogrig.protocol.dut import connect, open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)

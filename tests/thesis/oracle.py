@@ -1,6 +1,6 @@
 """The thesis's experiments once more, with numpy and scipy in double precision: what claims.json is held against.
 
-Nothing of harness.thesis is used here, nor the C: plants come from scipy's discretisation, the recursion is Equ 3.19
+Nothing of analogrig_thesis is used here, nor the C: plants come from scipy's discretisation, the recursion is Equ 3.19
 and 3.20 as they are printed, the triggers follow sections 4.4.2 and 4.4.3.
 """
 

@@ -15,12 +15,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, cont2discrete, freqz, lfilter
 
-from harness.cli import main
-from harness.config import fixtures
-from harness.run import Run
-from harness.thesis.chapter4 import THESIS_SCHEMES
-from harness.thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
-from harness.twin import Twin
+from analogrig.cli import main
+from analogrig.config import fixtures
+from analogrig.devices.reference import Twin
+from analogrig.run import Run
+from analogrig_thesis.chapter4 import THESIS_SCHEMES
+from analogrig_thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
 from tests.thesis.oracle import (
     CHANGES,
     PERIOD_S,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser
 
-from harness.thesis.reproduction import PAGE
+from analogrig_thesis.reproduction import PAGE
 from tests.browser import Watched
 
 DRAWN = """(canvas) => {

@@ -10,8 +10,8 @@ from typing import Any
 
 import can
 
-from harness.devices import HOST_PROGRAM
-from harness.links.child import Child
+from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.links.child import Child
 
 VIRTUAL = "vcan0"
 CONTROLLERS = ("can0", "can1", "can2")

@@ -9,13 +9,13 @@ from collections.abc import Callable
 import can
 import pytest
 
-from harness.bench import Bench
-from harness.catalogue import LAYOUTS, Sample, unpack
-from harness.dut import open_dut
-from harness.errors import LinkError, LinkTimeout
-from harness.rigs.description import open_rig
-from harness.run import Run
-from harness.scenario import Scenario
+from analogrig.bench import Bench
+from analogrig.errors import LinkError, LinkTimeout
+from analogrig.protocol.catalogue import LAYOUTS, Sample, unpack
+from analogrig.protocol.dut import open_dut
+from analogrig.rigs.description import open_rig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
 from .test_port import FOREIGN

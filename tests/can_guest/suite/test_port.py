@@ -9,7 +9,9 @@ from collections.abc import Callable
 import can
 import pytest
 
-from harness.catalogue import (
+from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.links.child import Child
+from analogrig.protocol.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     RUN_SHIFT,
@@ -28,8 +30,6 @@ from harness.catalogue import (
     pack,
     unpack,
 )
-from harness.devices import HOST_PROGRAM
-from harness.links.child import Child
 from tests.harness.processes import LONG_S, children
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan

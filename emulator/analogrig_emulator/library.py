@@ -1,0 +1,71 @@
+"""The compiled half of the emulator (engine.c), found beside this file and loaded on first use."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
+from pathlib import Path
+
+from .errors import EngineError
+
+__all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "System", "load"]
+
+# The limits of engine.h.
+MAX_STATES = 32
+MAX_INPUTS = 8
+MAX_KINKS = 64
+MAX_OUTPUTS = 256
+MAX_UNKNOWNS = 256
+
+_HERE = Path(__file__).parent
+_BUILD = "make setup"
+
+
+class Counts(ctypes.Structure):
+    """struct engine_counts."""
+
+    _fields_ = tuple((name, c_int64) for name in ("samples", "events", "steps", "quiet", "modes_built"))
+
+
+class System(ctypes.Structure):
+    """struct engine_system."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
+
+
+_PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
+    ("engine_new", c_void_p, (c_int, c_int, c_int, c_int, c_double, c_int64)),
+    ("engine_free", None, (c_void_p,)),
+    ("engine_restart", None, (c_void_p,)),
+    ("engine_set_system", c_int, (c_void_p, POINTER(System))),
+    ("engine_get_state", None, (c_void_p, c_void_p)),
+    ("engine_set_state", c_int, (c_void_p, c_void_p)),
+    ("engine_run", c_int, (c_void_p, c_int64, c_int64, c_void_p, c_void_p, c_void_p, c_void_p)),
+    ("engine_play", c_int, (c_void_p, c_int64, POINTER(System), c_void_p, c_int64, *(c_void_p,) * 4)),
+    ("engine_watch", None, (c_void_p, c_int64)),
+    ("engine_get_overdue", None, (c_void_p, c_void_p)),
+    ("engine_get_counts", None, (c_void_p, POINTER(Counts))),
+    ("engine_solve", c_int, (c_int, c_int, c_void_p, c_void_p)),
+    ("engine_noise_gather", c_int, (c_int, c_double, *(c_void_p,) * 5)),
+    ("engine_noise_run", None, (c_int, c_int, c_int64, *(c_void_p,) * 6)),
+)
+
+
+@functools.cache
+def load() -> ctypes.CDLL:
+    """The library, with its prototypes declared. Raises EngineError saying how to build it when it is absent."""
+    paths = sorted(_HERE.glob("_engine*.so"))
+    if not paths:
+        raise EngineError(f"the circuit engine is not built in {_HERE}: run `pip install -e .`, or `{_BUILD}`")
+    try:
+        library = ctypes.CDLL(str(paths[0]))
+    except OSError as cause:
+        raise EngineError(
+            f"the circuit engine {paths[0]} does not load ({cause}): rebuild it with `{_BUILD}`"
+        ) from cause
+    for name, result, arguments in _PROTOTYPES:
+        function = getattr(library, name)
+        function.restype = result
+        function.argtypes = arguments
+    return library

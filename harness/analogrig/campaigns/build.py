@@ -1,0 +1,68 @@
+"""What plays, by its contents: two builds never play the trials of one campaign.
+
+A name says nothing of what stands behind it: a firmware, a library or analogrig itself may be another by the time that
+a campaign goes on, or elsewhere.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from importlib.metadata import version
+from pathlib import Path
+
+import analogrig
+import analogrig_emulator
+from analogrig.devices.devices import DeviceDescription
+from analogrig.errors import ConfigurationError
+from analogrig.links.wire import LIBRARY
+
+DIGITS = 16
+"""Of a SHA-256, which tell builds apart."""
+
+_PACKAGES = tuple(Path(str(package.__file__)).parent for package in (analogrig_emulator, analogrig))
+
+
+@functools.cache
+def of_analogrig() -> str:
+    """Its version and, behind a space, the contents of what decides what is played."""
+    sources = sorted(path for folder in _PACKAGES for kind in ("py", "so") for path in folder.rglob(f"*.{kind}"))
+    whole = hashlib.sha256()
+    for path in sources:
+        whole.update(path.read_bytes())
+    return f"{_version()} {whole.hexdigest()[:DIGITS]}"
+
+
+def _version() -> str:
+    return version("analogrig")
+
+
+def of_device(device: DeviceDescription) -> str:
+    """The contents of the file that it runs; "" if that is not of this computer.
+
+    :raises ConfigurationError: the file cannot be read.
+    """
+    if device.program is None:
+        return ""
+    try:
+        return hashlib.sha256(device.program.read_bytes()).hexdigest()[:DIGITS]
+    except OSError as error:
+        raise ConfigurationError(f"device {device.name}: {device.program}: {error.strerror or error}") from error
+
+
+def check_analogrig(planned: str) -> None:
+    """:raises ConfigurationError: the campaign was begun by another version. Its compilers may have been others: the
+    estimates are the same bits."""
+    own, begun_by = _version(), planned.partition(" ")[0]
+    if own != begun_by:
+        raise ConfigurationError(f"this worker has analogrig {own}, the campaign was begun by {begun_by}")
+
+
+def check_device(device: DeviceDescription, planned: str) -> None:
+    """:raises ConfigurationError: its file is another than when the campaign was begun. Analogrig's own library and
+    program may come from other compilers: the estimates are the same bits."""
+    is_own = device.program is not None and device.program.is_relative_to(LIBRARY.parent)
+    if not is_own and of_device(device) != planned:
+        raise ConfigurationError(
+            f"device {device.name}: {device.program} is another build than the one that the campaign was begun with"
+        )

@@ -1,0 +1,292 @@
+"""What the trials of a campaign are: its file with everything that it names read in.
+
+A *cell* is one combination of rig, device and values of the grid. Each cell has the same number of trials, with the
+same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* is some consecutive trials of one cell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analogrig import config
+from analogrig.campaigns import build
+from analogrig.campaigns.difference import differences, named
+from analogrig.campaigns.spec import AXES, MAX_CELLS, MAX_TRIALS, CampaignSpec
+from analogrig.devices.devices import DeviceDescription, describe, from_table
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import Scenario, Tweak
+
+_DRAWS = 20_000
+"""Of the seeds: the stream of the campaign's own draws, apart from those of the rig."""
+
+_CHANGES = {
+    "mass_factor": "mass_kg",
+    "damping_factor": "damping_n_s_per_m",
+    "stiffness_factor": "stiffness_n_per_m",
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination."""
+
+    rig: int
+    """Index in ``Plan.rigs``."""
+    device: int
+    values: Mapping[str, float]
+    """Of the grid's axes."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One trial, ready to be played."""
+
+    rig: Mapping[str, Any]
+    device: Mapping[str, Any]
+    scenario: Scenario
+    seed: int
+
+
+class Chunk(tuple[int, int]):
+    """(round, cell): the trials of one cell that are given to a worker at a time."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return f"cell {self.cell}, round {self.round}"
+
+    @property
+    def round(self) -> int:
+        return self[0]
+
+    @property
+    def cell(self) -> int:
+        return self[1]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign with everything that its file names read in: plain values, which any worker anywhere understands."""
+
+    spec: CampaignSpec
+    scenario: Mapping[str, Any]
+    rigs: tuple[Mapping[str, Any], ...]
+    devices: tuple[Mapping[str, Any], ...]
+    """With the ``build`` of each."""
+    analogrig: str
+    """The build of analogrig itself."""
+
+    def __post_init__(self) -> None:
+        for name, tables in (("rigs", self.rigs), ("devices", self.devices)):
+            if not tables or not all(isinstance(table.get("name"), str) for table in tables):
+                raise ValueError(f"{name} must be at least one, each with its name")
+
+    @property
+    def size(self) -> int:
+        """The number of cells."""
+        combinations = math.prod(len(values) for values in self.spec.grid.axes().values())
+        return len(self.rigs) * len(self.devices) * combinations
+
+    @classmethod
+    def of(cls, spec: CampaignSpec) -> Plan:
+        """:raises ConfigurationError: a rig, device or scenario is absent or wrong, or a cell cannot be played."""
+        scenario = Scenario.load(spec.scenario)
+        if spec.samples is not None:
+            scenario = dataclasses.replace(scenario, samples=spec.samples)
+        plan = cls(
+            spec=spec,
+            scenario=scenario.as_table(),
+            rigs=tuple(rig_table(name) for name in spec.rigs),
+            devices=tuple(device_table(name) for name in spec.devices),
+            analogrig=build.of_analogrig(),
+        )
+        plan._check()
+        return plan
+
+    @classmethod
+    def from_json(cls, text: str) -> Plan:
+        return config.build(cls, json.loads(text), "the plan of the campaign")
+
+    def as_table(self) -> dict[str, Any]:
+        """In plain values: all that decides the results, and nothing else."""
+        table = dataclasses.asdict(self)
+        table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
+        return table
+
+    def as_json(self) -> str:
+        """The same plan gives the same text."""
+        return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
+
+    def check_same(self, table: Any, where: str) -> None:
+        """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
+        found = list(differences(table, json.loads(self.as_json())))
+        if found:
+            raise ConfigurationError(f"{where} ({named(found, ('there', 'here'))}): choose another --out, or remove it")
+
+    def cells(self) -> list[Cell]:
+        """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
+        axes = self.spec.grid.axes()
+        combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+        return [
+            Cell(rig, device, values)
+            for rig, device, values in itertools.product(range(len(self.rigs)), range(len(self.devices)), combinations)
+        ]
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Round by round, so that all cells progress together."""
+        rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
+        return (Chunk((number, cell)) for number in range(rounds) for cell in range(cells))
+
+    def seeds(self, chunk: Chunk) -> range:
+        first = chunk.round * self.spec.chunk
+        return range(
+            self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
+        )
+
+    def drawn(self, seed: int) -> dict[str, float]:
+        """The values of a trial that are drawn, by their axes."""
+        rng = np.random.default_rng([seed, _DRAWS])
+        return {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+
+    def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
+        """:raises ConfigurationError: the values make no scenario."""
+        values = {**cell.values, **(self.drawn(seed) if drawn is None else drawn)}
+        try:
+            scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
+        except ValueError as error:
+            raise ConfigurationError(f"{_said(values)}: {error}" if values else str(error)) from error
+        rig = dict(self.rigs[cell.rig])
+        if "noise_lsb" in values:
+            rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
+        return Case(rig, self.devices[cell.device], scenario, seed)
+
+    def _check(self) -> None:
+        spec = self.spec
+        where = f"campaign {spec.name}"
+        if self.size > MAX_CELLS or self.size * spec.trials > MAX_TRIALS:
+            raise ConfigurationError(
+                f"{where}: {self.size} cells of {spec.trials} trials;"
+                f" at most {MAX_CELLS} cells and {MAX_TRIALS} trials in all"
+            )
+        axes = {*spec.grid.axes(), *spec.draw.axes()}
+        if axes & set(_CHANGES) and self.scenario.get("tweaks"):
+            raise ConfigurationError(f"{where}: the scenario {spec.scenario} has tweaks of its own: no factors besides")
+        if "noise_lsb" in axes and any("card" not in table for table in self.rigs):
+            raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
+        for cell in self.cells():
+            for drawn, opposite in (*itertools.permutations(spec.draw.corners(), 2), (self.drawn(spec.first_seed), {})):
+                problem = self._problem(cell, drawn)
+                if problem:
+                    raise ConfigurationError(f"{where}: {self._blamed(cell, drawn, opposite)}{problem}")
+
+    def _problem(self, cell: Cell, drawn: Mapping[str, float]) -> str:
+        """Why such a trial cannot be set up on an emulated rig; empty if it can."""
+        try:
+            case = self.case(cell, self.spec.first_seed, drawn)
+            rig = open_table(case.rig) if "card" in case.rig else None
+            if isinstance(rig, EmulatorRig):
+                rig.set_up(case.scenario, case.seed)
+        except ConfigurationError as error:
+            return str(error)
+        return ""
+
+    def _blamed(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
+        """Of the values at the ends of what is drawn, that which is wrong by itself; all, if none is; empty, if the
+        others are wrong as well."""
+        if not opposite or self._problem(cell, opposite):
+            return ""
+        alone = ({axis: value} for axis, value in corner.items())
+        return f"draw: {_said(next((each for each in alone if self._problem(cell, opposite | each)), corner))}: "
+
+
+def open_table(table: Mapping[str, Any]) -> Rig:
+    """The rig of a plan's table.
+
+    :raises ConfigurationError: it is wrong.
+    """
+    if "card" in table:
+        return EmulatorRig(config.build(EmulatorDescription, table, f"rig {table['name']}"))
+    return open_rig(table["name"])
+
+
+def device_table(name: str) -> Mapping[str, Any]:
+    """A device by its name, as plain values that ``device_of`` takes, with its ``build``.
+
+    :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read.
+    """
+    device = describe(name)
+    return {**device.as_table(), "build": build.of_device(device)}
+
+
+def device_of(table: Mapping[str, Any]) -> DeviceDescription:
+    """The device of such a table, whatever its build is by now."""
+    return from_table({key: value for key, value in table.items() if key != "build"}, f"device {table['name']}")
+
+
+def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
+    """As ``device_of``; of the build that the table names, if it does.
+
+    :raises ConfigurationError: it is another by now.
+    """
+    device = device_of(table)
+    if "build" in table:
+        build.check_device(device, table["build"])
+    return device
+
+
+def one_worker_only(*tables: Mapping[str, Any]) -> str:
+    """Of rigs and devices the name of the first of which there is only one, so that two workers cannot both have it; ""
+    if there is none."""
+    return next(filter(None, map(_only_one, tables)), "")
+
+
+def _only_one(table: Mapping[str, Any]) -> str:
+    if table.get("kind") == "real":
+        return str(table["name"])
+    return "" if "card" in table else device_of(table).only_one
+
+
+def rig_table(name: str) -> Mapping[str, Any]:
+    """A rig by its name, as plain values that ``open_table`` takes; a real one is opened by its name again.
+
+    :raises ConfigurationError: there is none, or it can play but one scenario.
+    """
+    with open_rig(name) as rig:
+        if isinstance(rig, RecordingRig):
+            raise ConfigurationError(
+                f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
+            )
+        described = _given(rig.description())
+        return described if isinstance(rig, EmulatorRig) else {"name": name, "kind": "real", "described": described}
+
+
+def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:
+    start: dict[str, Any] = {axis: values[axis] for axis in AXES[:3] if axis in values}
+    plant = dataclasses.replace(base.plant, **start)
+    before = vars(plant.plant())
+    changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
+    tweaks = (*base.tweaks, Tweak(spec.change_at, **changed)) if changed else base.tweaks
+    return dataclasses.replace(base, plant=plant, tweaks=tweaks)
+
+
+def _given(value: Any) -> Any:
+    """Plain values, without what is not given."""
+    if isinstance(value, Mapping):
+        return {key: _given(item) for key, item in value.items() if item is not None}
+    return [_given(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _said(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{axis} = {value:g}" for axis, value in values.items())

@@ -1,0 +1,209 @@
+"""False alarms too rare to be waited for: branches off a play, with louder noise, each weighed by how likely it was.
+
+Between two false alarms the trigger's statistic comes back to the ground, 0, again and again, and every alarm ends one
+climb from there. So the rate of alarms is the mean, over the samples of a play, of the chance that the statistic is on
+the ground, and climbs to an alarm from there without coming back. Branches find that chance: from states of the play in
+which the statistic is on the ground, drawn evenly, each goes on with noise of its own on the displacement, a few times
+as strong as the card's, up to an alarm or back to the ground. One that ends in an alarm counts as much as its noise
+was likelier to come from the card than from the louder ones. The mean is unbiased, however loud they are (importance
+sampling; Siegmund, Annals of Statistics 4, 1976, did so for sequential tests). With twice the noise the ratio of
+likelihoods is nearly the statistic itself, a CUSUM of "the variance has grown fourfold": all weights are about
+exp(-ceiling), and the mean of few branches is good, however rare the alarms are. A mixture of LOUDER keeps single
+weights from being large (the balance heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000). How
+good the mean is, plays of other seeds tell: ``statistics.mean_bounds``.
+
+Splitting by levels of the statistic is unbiased too, and was given up: one reading far off lifts the statistic by many
+levels at once, which a play of some thousand samples hardly ever sees (see harness/README.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.campaigns.trials import entered, flags_of
+from analogrig.devices.devices import DeviceDescription, InprocDevice
+from analogrig.devices.estimator import Estimator
+from analogrig.errors import ConfigurationError, DeviceError
+from analogrig.judging.exposure import Heard, exposed
+from analogrig.links.wire import LIBRARY
+from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.rig import Block, Performance
+from analogrig.run import CHANNELS
+from analogrig.scenario import Scenario
+
+BRANCHES_N = 2_000
+"""Off each play."""
+
+PLAY_N, TAIL_N = 20_000, 2_000
+"""Samples of a play from which branches go off; and after them, into which they may go."""
+
+LOUDER = np.array([1.6, 2.0, 2.6])
+"""How many times as strong the noise of the branches is, in turn."""
+
+_DISPLACEMENT = CHANNELS.index("displacement")
+
+LEAD_IN_N = 16
+"""Samples that fill the regressors before the first equation, for any model that a device can have."""
+
+_STRETCH_N = 32
+"""Samples that all branches go on at a time."""
+
+_BRANCHES = 1_000_003
+"""Sets the chance of branches apart from whatever else a seed gives."""
+
+
+class Estimate(NamedTuple):
+    """What one play gives."""
+
+    rate: float
+    """Alarms per sample; 0 if no branch came to one."""
+    alarms: int
+    """Branches that came to one."""
+    samples: int
+    """That the estimator took in."""
+
+
+class _Branches(NamedTuple):
+    """Branches on their way; a row for each."""
+
+    kept: NDArray[np.uint8]
+    """(b, size): what the estimator knows."""
+    following: NDArray[np.int64]
+    """(b,): the index of its next sample."""
+    louder: NDArray[np.float64]
+    """(b,): how many times as strong its noise is."""
+    log_ratios: NDArray[np.float64]
+    """(b, len(LOUDER)): how much likelier its noise is to come from each of the louder ones than from the card."""
+
+    def at(self, rows: NDArray[np.bool_]) -> _Branches:
+        return _Branches(self.kept[rows], self.following[rows], self.louder[rows], self.log_ratios[rows])
+
+    @property
+    def weights(self) -> list[float]:
+        """How much each counts: 1 over the mean of the ratios."""
+        weights: list[float] = (1.0 / np.exp(self.log_ratios).mean(axis=1)).tolist()
+        return weights
+
+
+def false_alarm_rate(
+    rig: EmulatorRig, device: DeviceDescription, scenario: Scenario, seed: int, branches: int = BRANCHES_N
+) -> Estimate:
+    """An estimate without bias of first alarms per sample of a warm estimator, from one play.
+
+    For rates well below 1 / PLAY_N: a play ends with its first alarm.
+
+    :param scenario: one without changes; its number of samples does not matter.
+    :raises ConfigurationError: the trigger has no ground to come back to; or as Trials.
+    :raises DeviceError: the statistic neither comes to an alarm nor back, or the device was not excited.
+    :raises LinkError: the library was not built.
+    """
+    settings = dataclasses.replace(device.estimator, force_zero=rig.force_zero)
+    if settings.trigger != "cusum":
+        raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
+    estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
+    first = settings.warm_up_n + LEAD_IN_N
+    played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
+    performance = rig.perform(played, seed, block_samples=played.samples)
+    return _Climbs(rig, settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])).estimate(
+        first, branches
+    )
+
+
+class _Climbs:
+    """From the ground of one play."""
+
+    def __init__(
+        self,
+        rig: EmulatorRig,
+        settings: EstimatorConfig,
+        estimator: Estimator,
+        performance: Performance,
+        rng: np.random.Generator,
+    ) -> None:
+        self._rig = rig
+        self._settings = settings
+        self._estimator = estimator
+        (self._play,) = performance.blocks
+        self._noise_lsb = performance.channels["force"].noise_lsb
+        self._rng = rng
+        self._samples = 0
+
+    def estimate(self, first: int, count: int) -> Estimate:
+        ground, length = self._ground(first)
+        if not len(ground):
+            return Estimate(0.0, 0, self._samples)
+        off = np.sort(self._rng.choice(ground, min(count, len(ground)), replace=False))
+        louder = LOUDER[self._rng.permutation(len(off)) % len(LOUDER)]
+        going = _Branches(self._kept_at(off), off + 1, louder, np.zeros((len(off), len(LOUDER))))
+        weights: list[float] = []
+        while len(going.kept):
+            arrived, going = self._go_on(going)
+            weights += arrived.weights
+        rate = len(ground) / length * math.fsum(weights) / len(off)
+        return Estimate(rate, len(weights), self._samples)
+
+    def _ground(self, first: int) -> tuple[NDArray[np.intp], int]:
+        """The samples after which the statistic is on the ground, up to the first alarm; and of how many that is."""
+        end = first + PLAY_N
+        self._estimator.restart()
+        steps = self._estimator.run(*(signal[:end] for signal in entered(self._play)))
+        self._samples += end
+        numbers = np.isfinite(steps.innovation) & np.isfinite(steps.statistic)
+        force = self._play.codes[:end, CHANNELS.index("force")]
+        heard = Heard(force, flags_of(steps.status), numbers, steps.alarms)
+        if fault := exposed(heard, self._settings.as_table(), self._noise_lsb).no_evidence:
+            raise DeviceError(fault)
+        alarms = steps.alarms[steps.alarms >= first]
+        end = int(alarms[0]) + 1 if len(alarms) else end
+        return first + np.flatnonzero(steps.statistic[first:end] <= 0.0), end - first
+
+    def _kept_at(self, samples: NDArray[np.intp]) -> NDArray[np.uint8]:
+        """What the estimator knows after each of these samples, in rising order."""
+        signals = entered(self._play)
+        kept, before = [], 0
+        self._estimator.restart()
+        for after in (samples + 1).tolist():
+            self._estimator.alarms(*(signal[before:after] for signal in signals))
+            kept.append(self._estimator.save())
+            before = after
+        self._samples += before
+        return np.stack(kept)
+
+    def _go_on(self, going: _Branches) -> tuple[_Branches, _Branches]:
+        """A stretch further: those that came to an alarm, and those that are neither there nor back on the ground."""
+        (u, y, valid), drawn = self._louder(going)
+        statistic, alarm, kept = self._estimator.branch(going.kept, u, y, valid)
+        self._samples += u.size
+        arrives, comes_back = _first_true(alarm), _first_true(statistic <= 0.0)
+        ratios = 0.5 * (1.0 - LOUDER**-2) * drawn[:, :, None] ** 2 - np.log(LOUDER)
+        log_ratios = going.log_ratios[:, None, :] + np.cumsum(ratios, axis=1)
+        last = np.minimum(arrives, _STRETCH_N - 1)
+        after = _Branches(kept, going.following + last + 1, going.louder, log_ratios[np.arange(len(last)), last])
+        arrived = (arrives < _STRETCH_N) & (arrives <= comes_back)
+        still = (arrives == _STRETCH_N) & (comes_back == _STRETCH_N)
+        return after.at(arrived), after.at(still)
+
+    def _louder(self, going: _Branches) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
+        """Force, displacement and what is valid of the next samples of each, and the numbers, normal for the card, of
+        which the noise of the displacement is made: (b, _STRETCH_N)."""
+        index = going.following[:, None] + np.arange(-1, _STRETCH_N)  # the card holds part of the sample before
+        if index[:, -1].max() >= len(self._play.volts):
+            raise DeviceError(f"the statistic neither came to an alarm nor back to zero within {TAIL_N} samples")
+        volts = self._play.volts[index].reshape(-1, len(CHANNELS))
+        normals = self._rng.standard_normal((*index.shape, len(CHANNELS)))
+        normals[:, :, _DISPLACEMENT] *= going.louder[:, None]
+        codes, clipped = self._rig.sampler(self._rng).sample(volts, normals.reshape(volts.shape))
+        signals = entered(Block(0, volts, codes, clipped))
+        return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, _DISPLACEMENT]
+
+
+def _first_true(found: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Of each row; its length if there is none."""
+    first: NDArray[np.intp] = np.where(found.any(axis=1), found.argmax(axis=1), found.shape[1])
+    return first

@@ -1,0 +1,162 @@
+"""The page of a campaign: its table, and maps of latency and miss rate over two axes of the grid."""
+
+from __future__ import annotations
+
+import html
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from analogrig.campaigns.results import COLUMNS, CONFIDENCE, Results, Summary, label
+from analogrig.errors import ConfigurationError
+from analogrig.reporting.page import FOLDER, assembled
+from analogrig.storage import replacing
+
+_TEMPLATE = FOLDER / "campaign.html"
+
+_MARK = b'data-page="analogrig-campaign"'
+"""By which a page is known for one of a campaign."""
+
+_WIDTH, _HEIGHT, _LEFT, _TOP = 74, 34, 110, 26
+_DEEPEST = (0, 114, 178)
+"""The blue of Okabe and Ito; a value of zero is white."""
+
+MOST_MAPS = 40
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a map shows."""
+
+    title: str
+    of: Callable[[Summary], float | None]
+    form: str
+
+
+QUANTITIES = (
+    Quantity("Mean latency [samples]", lambda summary: summary.latency_n, ".1f"),
+    Quantity("Miss rate", lambda summary: summary.missed / summary.visible if summary.visible else None, ".1%"),
+)
+
+
+def page_of(out: Path) -> Path:
+    """The place of the page beside the results.
+
+    :raises ConfigurationError: something else stands there, or the results themselves would.
+    """
+    if not out.name or (out.exists() and not out.is_file()):
+        raise ConfigurationError(f"--out {out}: is no file that results could be written to")
+    page = out.with_suffix(".html")
+    if page == out:
+        raise ConfigurationError(f"--out {out}: the page of the results is to be called so: choose another name")
+    try:
+        is_free = not page.exists() or _MARK in page.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{page}: {error.strerror or error}") from error
+    if not is_free:
+        raise ConfigurationError(f"{page}: is no page of a campaign: choose another --out, or remove it")
+    return page
+
+
+def write_page(results: Results, path: Path) -> None:
+    """Write the page: either all of it or nothing. The same results give the same bytes.
+
+    :raises RecordingError: the page cannot be written.
+    """
+    with replacing(path) as file:
+        file.write(render(results).encode("utf-8", "replace"))
+
+
+def render(results: Results) -> str:
+    """The page as text."""
+    spec, total = results.plan.spec, results.total()
+    scenario = str(results.plan.scenario["name"])
+    return assembled(
+        _TEMPLATE,
+        (FOLDER / "page.css",),
+        (),
+        title=html.escape(f"campaign {spec.name}"),
+        outcome=results.outcome(),
+        heading=html.escape(f"Campaign {spec.name}: {results.outcome().upper()}"),
+        sentence=html.escape(
+            f"{scenario}: {total.trials:,} trials in {len(results.rows):,} cells, {total.samples:,} samples;"
+            f" {total.missed:,} of {total.visible:,} visible changes missed, {total.false_alarms:,} false alarms,"
+            f" {total.inconclusive:,} trials inconclusive."
+        ),
+        maps=_maps(results),
+        table=_table(results),
+    )
+
+
+def _maps(results: Results) -> str:
+    """One map of each quantity for every combination of what is not on the axes."""
+    axes = [axis for axis, values in results.plan.spec.grid.axes().items() if len(values) > 1][:2]
+    if not axes:
+        return ""
+    across, down = axes[0], axes[1] if len(axes) > 1 else None
+    cells = [(label(results.plan, cell), summary) for cell, summary in results.cells()]
+    rest = [tuple((name, value) for name, value in names.items() if name not in axes) for names, _ in cells]
+    sections = []
+    for group in list(dict.fromkeys(rest))[:MOST_MAPS]:
+        found = {
+            (names[across], names[down] if down else ""): summary
+            for (names, summary), other in zip(cells, rest, strict=True)
+            if other == group
+        }
+        where = ", ".join(f"{name} {value}" for name, value in group)
+        maps = "".join(_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES)
+        sections.append(f'<div class="maps">{maps}</div>')
+    return f'<section aria-labelledby="maps"><h2 id="maps">Maps</h2>{"".join(sections)}</section>'
+
+
+def _map(quantity: Quantity, found: dict[tuple[str, str], Summary], axes: tuple[str, str], where: str) -> str:
+    columns, rows = (list(dict.fromkeys(key[i] for key in found)) for i in range(2))
+    values = {key: quantity.of(summary) for key, summary in found.items()}
+    most = max((value for value in values.values() if value is not None), default=0.0)
+    parts = [_words(_LEFT + (i + 0.5) * _WIDTH, _TOP - 8, name) for i, name in enumerate(columns)]
+    parts += [_words(_LEFT - 8, _TOP + (j + 0.6) * _HEIGHT, name, "end") for j, name in enumerate(rows)]
+    for (i, column), (j, row) in itertools.product(enumerate(columns), enumerate(rows)):
+        parts.append(_square(i, j, values[column, row], most, quantity.form))
+    width, height = _LEFT + len(columns) * _WIDTH + 2, _TOP + len(rows) * _HEIGHT + 2
+    title = f"{quantity.title}{f' ({where})' if where else ''}"
+    caption = f"{title}; across: {axes[0]}{f', down: {axes[1]}' if axes[1] else ''}"
+    return (
+        f'<figure><figcaption>{html.escape(caption)}</figcaption><div class="scroll">'
+        f'<svg role="img" aria-label="{html.escape(caption)}; the numbers are in the table below"'
+        f' width="{width}" height="{height}" font-size="13">{"".join(parts)}</svg></div></figure>'
+    )
+
+
+def _square(i: int, j: int, value: float | None, most: float, form: str) -> str:
+    share = 0.0 if value is None or most == 0.0 else value / most
+    colour = "#" + "".join(f"{round(255 + share * (deep - 255)):02x}" for deep in _DEEPEST)
+    x, y = _LEFT + i * _WIDTH, _TOP + j * _HEIGHT
+    text = "–" if value is None else format(value, form)
+    ink = "#ffffff" if share > 0.85 else "#1a1a1a"
+    return (
+        f'<rect x="{x}" y="{y}" width="{_WIDTH}" height="{_HEIGHT}" fill="{"#d5d5d5" if value is None else colour}"'
+        f' stroke="#8a8a8a"/>{_words(x + 0.5 * _WIDTH, y + 0.62 * _HEIGHT, text, colour=ink)}'
+    )
+
+
+def _words(x: float, y: float, text: str, anchor: str = "middle", colour: str = "currentColor") -> str:
+    return f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}" fill="{colour}">{html.escape(text)}</text>'
+
+
+def _table(results: Results) -> str:
+    cells = [(label(results.plan, cell), summary) for cell, summary in results.cells()]
+    names = list(cells[0][0])
+    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in names)
+    head += "".join(f'<th scope="col" class="number">{column.title}</th>' for column in COLUMNS)
+    rows = "".join(f"<tr>{_row(list(each.values()), summary)}</tr>" for each, summary in cells)
+    caption = f"Bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency and bound in samples from the change"
+    return (
+        f'<div class="scroll"><table class="numbers"><caption>{caption}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _row(names: Sequence[str], summary: Summary) -> str:
+    cells = "".join(f'<th scope="row">{html.escape(name)}</th>' for name in names)
+    return cells + "".join(f'<td class="number">{column.cell(summary, "–")}</td>' for column in COLUMNS)

@@ -1,0 +1,155 @@
+"""What is kept of a trial, in plain values, and what is counted in many of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from analogrig.judging.exposure import exposure
+from analogrig.judging.statistics import ConfidenceSequence
+from analogrig.judging.verdict import TweakVerdict, Verdict
+from analogrig.plant import PARAMETERS
+from analogrig.run import Run
+from analogrig.scenario import MAX_SAMPLES
+
+Row = dict[str, Any]
+"""Of one trial, in plain values; see ``row``."""
+
+
+class Change(NamedTuple):
+    """One change of the plant, and how it was noticed; samples from it."""
+
+    latency_n: int | None
+    bound_n: int | None
+    """None: it could not be seen."""
+    missed: bool
+    late: bool
+
+    @classmethod
+    def of(cls, tweak: TweakVerdict) -> Change:
+        """At its likeliest instant; one that was not found in the samples is as one that nobody could see."""
+        if tweak.unseen:
+            return cls(None, None, missed=False, late=False)
+        return cls(tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late)
+
+
+def changes(row: Row) -> list[Change]:
+    """Of a trial."""
+    return [Change(*each) for each in row["changes"]]
+
+
+def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
+    """What is kept of a trial.
+
+    ``armed``: the samples in which the trigger was armed. ``changes``: the fields of ``Change`` of each. ``errors``:
+    relative errors of M, B, K at the end, or none. ``theta``: the first digits of the hash of all estimates, which
+    tells builds apart. ``why``: the first reason why it has not passed.
+    """
+    return _row(
+        run.conditions.seed,
+        verdict.outcome,
+        drawn,
+        why=verdict.reasons[0] if verdict.reasons else "",
+        samples=run.samples,
+        armed=exposure(run).armed,
+        false_alarms=len(verdict.false_alarms),
+        changes=[list(Change.of(tweak)) for tweak in verdict.tweaks],
+        errors=_errors(verdict),
+        theta=verdict.theta_hash[:16],
+    )
+
+
+def row_of_none(seed: int, drawn: Mapping[str, float], why: str) -> Row:
+    """Of a trial that could not be played."""
+    return _row(seed, "inconclusive", drawn, why=why)
+
+
+_NOTHING: Row = {"samples": 0, "armed": 0, "false_alarms": 0, "changes": [], "errors": [], "theta": ""}
+
+
+def _row(seed: int, outcome: str, drawn: Mapping[str, float] | None, *, why: str, **found: Any) -> Row:
+    said = {"drawn": dict(drawn or {}), "why": why}
+    return {"seed": seed, "outcome": outcome, **_NOTHING, **found} | {key: each for key, each in said.items() if each}
+
+
+def _errors(verdict: Verdict) -> list[float]:
+    """Of the last estimate; one of numbers beyond all measure is none."""
+    found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
+    return found if all(map(math.isfinite, found)) else []
+
+
+def check_row(row: Any) -> None:
+    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``row``."""
+    if row["outcome"] not in ("passed", "failed", "inconclusive"):
+        raise ValueError("a row without an outcome")
+    rising = [row[name] for name in ("false_alarms", "armed", "samples")]
+    if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
+        raise ValueError("a row whose counts cannot be")
+    if not all(map(_is_change, changes(row))):
+        raise ValueError("a change that is none")
+    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
+        raise ValueError("errors that are none")
+    if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
+        raise ValueError("a text that is none")
+    if not all(map(_is_number, row.get("drawn", {}).values())):
+        raise ValueError("a drawn value that is none")
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def _is_change(change: Change) -> bool:
+    latency_n, bound_n, *flags = change
+    times = all(value is None or type(value) is int for value in (latency_n, bound_n))
+    return times and all(type(flag) is bool for flag in flags)
+
+
+# ------------------------------------------------------------------------------------------------------------- of many
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How many of what could happen did; by their names in ``counts``."""
+
+    events: str
+    exposure: str
+    unit: str
+    """Of the exposure, in words."""
+    expected: float
+    """Where bounds of it are tightest."""
+
+    def known(self, counted: Mapping[str, int], confidence: float, around: float | None = None) -> ConfidenceSequence:
+        """What is known of it; ``around``: where the bounds shall be tightest instead."""
+        expected = self.expected if around is None else around
+        return ConfidenceSequence(confidence, expected, trials=counted[self.exposure], events=counted[self.events])
+
+
+RATES = {
+    rate.events: rate
+    for rate in (Rate("missed", "visible", "changes", 0.05), Rate("false_alarms", "armed", "samples", 1e-6))
+}
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """Of the valid trials: ``samples``, those in which the trigger was ``armed``, ``false_alarms``, ``visible``
+    changes, ``missed`` ones."""
+    sound = valid(rows)
+    visible = [change for each in sound for change in changes(each) if change.bound_n is not None]
+    return {
+        **{name: sum(each[name] for each in sound) for name in ("samples", "armed", "false_alarms")},
+        "visible": len(visible),
+        "missed": sum(change.missed for change in visible),
+    }
+
+
+def valid(rows: Sequence[Row]) -> list[Row]:
+    """Those that are."""
+    return list(filter(is_valid, rows))
+
+
+def is_valid(row: Row) -> bool:
+    """Whether it says anything."""
+    return bool(row["outcome"] != "inconclusive")

@@ -1,0 +1,138 @@
+"""The file of a campaign: TOML that says what shall be played."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.scenario import MAX_SAMPLES
+
+MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
+
+AXES = (
+    *("mass_kg", "damping_n_s_per_m", "stiffness_n_per_m"),
+    *("mass_factor", "damping_factor", "stiffness_factor"),
+    "noise_lsb",
+)
+"""What can be varied. The plant at the start; by what it is multiplied at the change; rms noise of the card."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The ``[grid]`` table: every combination of these values is a cell."""
+
+    mass_kg: tuple[float, ...] = ()
+    damping_n_s_per_m: tuple[float, ...] = ()
+    stiffness_n_per_m: tuple[float, ...] = ()
+    mass_factor: tuple[float, ...] = ()
+    damping_factor: tuple[float, ...] = ()
+    stiffness_factor: tuple[float, ...] = ()
+    noise_lsb: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for axis, values in vars(self).items():
+            if len(set(values)) != len(values):
+                raise ValueError(f"{axis} has a value twice")
+
+    def axes(self) -> dict[str, tuple[float, ...]]:
+        """Those that are given."""
+        return {axis: values for axis, values in vars(self).items() if values}
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The ``[draw]`` table: values drawn for each trial from its seed, evenly between the ends."""
+
+    mass_kg: tuple[float, float] | None = None
+    damping_n_s_per_m: tuple[float, float] | None = None
+    stiffness_n_per_m: tuple[float, float] | None = None
+    mass_factor: tuple[float, float] | None = None
+    damping_factor: tuple[float, float] | None = None
+    stiffness_factor: tuple[float, float] | None = None
+    noise_lsb: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for axis, ends in self.axes().items():
+            if not ends[0] < ends[1]:
+                raise ValueError(f"{axis} must be (low, high), not ({ends[0]:g}, {ends[1]:g})")
+
+    def axes(self) -> dict[str, tuple[float, float]]:
+        """Those that are given."""
+        return {axis: ends for axis, ends in vars(self).items() if ends is not None}
+
+    def corners(self) -> tuple[dict[str, float], ...]:
+        """All at their low ends, and all at their high ones: each pot, and the noise, are within what they are there,
+        for a parameter and its factor turn the same pot the same way."""
+        axes = self.axes()
+        return tuple({axis: ends[i] for axis, ends in axes.items()} for i in range(2 if axes else 0))
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The ``[stop]`` table: a cell ends when it is certain on which side of ``rate`` it is.
+
+    Certain in the sense of a confidence sequence, which may be looked at after every trial.
+    """
+
+    quantity: Literal["missed", "false_alarms"]
+    """``missed``: changes missed of those that could be seen; ``false_alarms``: per sample."""
+    rate: float
+    confidence: float = 0.99
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "confidence"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} must be between 0 and 1, not {getattr(self, name):g}")
+
+
+@dataclass(frozen=True)
+class CampaignSpec:
+    """A campaign's file."""
+
+    scenario: str = "healthy"
+    rigs: tuple[str, ...] = ("emulator",)
+    devices: tuple[str, ...] = ("inproc",)
+    trials: int = 100
+    """Of each cell, with the seeds from ``first_seed`` on."""
+    first_seed: int = 0
+    chunk: int = 10
+    """Trials that a worker is given at a time."""
+    samples: int | None = None
+    """Of each trial, instead of the scenario's."""
+    change_at: int = 1000
+    """The sample at which what a factor multiplies changes."""
+    grid: Grid = field(default_factory=Grid)
+    draw: Draw = field(default_factory=Draw)
+    stop: Stop | None = None
+    description: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.samples is not None and not 1 <= self.samples <= MAX_SAMPLES:
+            raise ValueError(f"samples must be 1 to {MAX_SAMPLES}, not {self.samples}")
+        for name in ("rigs", "devices"):
+            values = getattr(self, name)
+            if not values or len(set(values)) != len(values):
+                raise ValueError(f"{name} must name at least one, and each once")
+        for name, most in (("trials", MAX_TRIALS), ("chunk", MAX_TRIALS), ("change_at", 2**31)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be 1 to {most}, not {getattr(self, name)}")
+        if not 0 <= self.first_seed < 2**62:
+            raise ValueError(f"first_seed must be 0 to 2^62, not {self.first_seed}")
+        twice = set(self.grid.axes()) & set(self.draw.axes())
+        if twice:
+            raise ValueError(f"{', '.join(sorted(twice))}: in the grid and drawn as well")
+
+    @classmethod
+    def load(cls, name: str) -> CampaignSpec:
+        """A shipped campaign by name, or a user's .toml file.
+
+        :raises ConfigurationError: absent, not TOML, or no campaign; names the file and the key.
+        """
+        path = config.locate("campaigns", name)
+        spec = config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
+        if "/" in spec.name or spec.name in {"", ".", ".."} or not spec.name.isprintable():
+            raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
+        return spec

@@ -1,0 +1,173 @@
+"""Closed-loop trials without a line: circuit, card and the C estimator in this process, whole blocks at a time.
+
+A trial is what Bench plays with the device ``inproc``, to the bit: the same codes, the same estimates, the same alarms.
+Only what the messages around them say is lacking: isolation's diagnoses, and the flags RESTARTED and IDLE.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.devices.devices import DeviceDescription, InprocDevice
+from analogrig.devices.estimator import Estimator, Steps, StepStatus
+from analogrig.judging.exposure import Exposure, Heard, exposed
+from analogrig.links.wire import LIBRARY
+from analogrig.protocol.catalogue import SteppedFlag, Trigger
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.rig import Block, Performance, Rig
+from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
+from analogrig.scenario import Scenario
+
+BLOCK_SAMPLES = 16_384
+"""Samples that pass from the circuit to the card and on to the estimator at a time: they stay within the cache."""
+
+_FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
+
+_FLAGS = np.zeros(len(StepStatus), np.uint8)
+_FLAGS[StepStatus.MISSING] = SteppedFlag.MISSING
+_FLAGS[StepStatus.REFUSED] = SteppedFlag.REFUSED
+_FLAGS[StepStatus.GATHERING] = SteppedFlag.GATHERING
+
+
+def are_possible(rig: Rig, device: DeviceDescription) -> bool:
+    """Whether trials give what Bench gives: an emulated rig, and a device whose line does nothing to the samples."""
+    return (
+        isinstance(rig, EmulatorRig)
+        and isinstance(device, InprocDevice)
+        and device.link == "serial"
+        and not device.wire_faults
+        and device.report_interval_n == 1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Of a trial the alarms, and what their number is worth."""
+
+    alarms: NDArray[np.int64]
+    """(a,) samples."""
+    exposure: Exposure
+    missing: int
+    refused: int
+
+
+class Trials:
+    """An emulated rig and an estimator, for any number of trials, one after the other."""
+
+    def __init__(self, rig: EmulatorRig, device: DeviceDescription) -> None:
+        """:raises ConfigurationError: the estimator refuses its configuration.
+        :raises LinkError: the library was not built.
+        """
+        self._rig = rig
+        zero = rig.force_zero
+        self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
+        library = device.program if isinstance(device, InprocDevice) else LIBRARY
+        self._estimator = Estimator(self._device.estimator, library=library)
+        # Runs share their tables: to write them anew for each takes as long as to play a thousand samples.
+        self._tables = rig.description(), self._device.as_table()
+        self._scenario_table: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
+
+    def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
+        """The samples with an alarm, (a,), and nothing else: the fastest way.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        :raises RigError: the emulator failed.
+        """
+        self._estimator.restart()
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        found = [block.first + self._estimator.alarms(*entered(block)) for block in performance.blocks]
+        return np.concatenate(found)
+
+    def watched(self, scenario: Scenario, seed: int) -> Watched:
+        """As ``alarms``, with what they are worth."""
+        self._estimator.restart()
+        n = scenario.samples
+        force, status = np.empty(n, np.uint16), np.empty(n, np.uint8)
+        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
+        found = []
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        for block in performance.blocks:
+            u, y, valid = entered(block)
+            its = slice(block.first, block.first + len(u))
+            force[its] = u
+            found.append(
+                block.first
+                + self._estimator.alarms(
+                    u, y, valid, status=status[its], innovation=innovation[its], statistic=statistic[its]
+                )
+            )
+        flags, alarms = flags_of(status), np.concatenate(found)
+        shown = exposed(
+            Heard(force, flags, np.isfinite(innovation) & np.isfinite(statistic), alarms),
+            self._tables[1]["estimator"],
+            performance.channels["force"].noise_lsb,
+        )
+        missing, refused = (int(np.count_nonzero(flags & flag)) for flag in (SteppedFlag.MISSING, SteppedFlag.REFUSED))
+        return Watched(alarms, shown, missing, refused)
+
+    def run(self, scenario: Scenario, seed: int) -> Run:
+        """One trial, for ``judge``; errors as ``alarms``."""
+        self._estimator.restart()
+        performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
+        blocks: list[Block] = []
+        parts: list[Steps] = []
+        for block in performance.blocks:
+            blocks.append(block)
+            parts.append(self._estimator.run(*entered(block)))
+        return self._run(scenario, seed, performance, blocks, parts)
+
+    def _run(
+        self, scenario: Scenario, seed: int, performance: Performance, blocks: list[Block], parts: list[Steps]
+    ) -> Run:
+        statistic = np.concatenate([steps.statistic for steps in parts])
+        alarms = np.concatenate([block.first + steps.alarms for block, steps in zip(blocks, parts, strict=True)])
+        trigger = Trigger[self._device.estimator.trigger.replace("-", "_").upper()]
+        return Run(
+            conditions=self._conditions(scenario, seed, performance),
+            codes=np.concatenate([block.codes for block in blocks]),
+            clipped=np.concatenate([block.clipped for block in blocks]),
+            theta=np.concatenate([steps.theta for steps in parts]),
+            innovation=np.concatenate([steps.innovation for steps in parts]),
+            statistic=statistic,
+            flags=flags_of(np.concatenate([steps.status for steps in parts])),
+            alarm_index=alarms,
+            alarm_kind=np.full(len(alarms), trigger, np.uint8),
+            alarm_statistic=statistic[alarms],
+        )
+
+    def _conditions(self, scenario: Scenario, seed: int, performance: Performance) -> Conditions:
+        if self._scenario_table[0] is not scenario:
+            self._scenario_table = scenario, scenario.as_table()
+        rig, dut = self._tables
+        hindsight = performance.hindsight()
+        return Conditions(
+            seed=seed,
+            samples_asked=scenario.samples,
+            sample_period_s=performance.sample_period_s,
+            time_scale=performance.time_scale,
+            channels=performance.channels,
+            segments=hindsight.segments,
+            scenario=self._scenario_table[1],
+            rig=rig,
+            dut=dut,
+            link="none",
+            counters=self._estimator.counters,
+            faults=scenario.caveats,
+            overloads=hindsight.lamps,
+        )
+
+
+def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
+    return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)
+
+
+def flags_of(status: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """StepStatus as the flags of a Run; (n,) each."""
+    return _FLAGS.take(status)

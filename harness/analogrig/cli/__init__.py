@@ -1,0 +1,105 @@
+"""The command ``analogrig``: a module for each of its commands, and what they share.
+
+Everything heavy is imported inside the command that needs it, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from typing import NoReturn
+
+from analogrig.cli import (
+    calibrate,
+    campaign,
+    certify,
+    compare,
+    compare_rigs,
+    doctor,
+    effects,
+    emulate,
+    judge,
+    netlist,
+    replay,
+    run,
+    serve,
+    thesis,
+)
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
+
+_COMMANDS = (
+    run,
+    replay,
+    judge,
+    campaign,
+    certify,
+    compare,
+    thesis,
+    emulate,
+    serve,
+    doctor,
+    calibrate,
+    compare_rigs,
+    effects,
+    netlist,
+)
+"""Each has ``add(commands)``; in the order of ``--help``."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status. Every failure is one line on standard error."""
+    open_standard_streams()
+    try:
+        arguments = _parser().parse_args(argv)
+        return int(arguments.command(arguments))
+    except KeyboardInterrupt:
+        return complain("interrupted", INTERRUPTED)
+    except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
+        return _explain(error)
+
+
+def _explain(error: Exception) -> int:
+    """What ended a command, in one line."""
+    from analogrig.errors import AnalogrigError
+    from analogrig_emulator.errors import EmulatorError
+
+    if isinstance(error, AnalogrigError | EmulatorError):
+        return complain(str(error), USAGE)
+    if "ANALOGRIG_DEBUG" in os.environ:
+        raise error
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return complain(f"a fault of analogrig itself: {what} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="analogrig",
+        description="Hardware in the loop for embedded parameter estimators: a rig, a link, a device, a verdict.",
+        epilog="Exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted.",
+    )
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for command in _COMMANDS:
+        command.add(commands)
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE, f"analogrig: {message} (see {self.prog} --help)\n")
+
+
+class _Version(argparse.Action):
+    """Asks the installed distribution, and only when asked."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(option_strings, dest, nargs=0, help="show the version and exit")
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        show(f"analogrig {version('analogrig')}")
+        parser.exit()

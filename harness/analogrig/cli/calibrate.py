@@ -1,0 +1,195 @@
+"""``analogrig calibrate``: the emulator becomes the twin of a rig."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.options import add_rig, seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
+
+if TYPE_CHECKING:
+    from analogrig.hardware.calibration.fit import Calibration, Estimate
+    from analogrig.hardware.calibration.recordings import Recording
+    from analogrig.rigs.rig import Rig
+
+MOST_LSB = 1.0
+"""rms between rig and twin, on what the fit has not seen, beyond which it is none."""
+
+_SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, "LSB")}
+"""By the unit of an estimate."""
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("calibrate", help="fit the emulator to a rig's recordings, and keep it as its twin")
+    add_rig(command)
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("build/twin.toml"),
+        metavar="FILE.toml",
+        help="the twin, for --rig (default: %(default)s)",
+    )
+    command.add_argument(
+        "--program", choices=("front", "shock"), default="front", help="what is patched on it (%(default)s)"
+    )
+    command.add_argument("--op-amp", default="tl07x", choices=("tl07x", "741", "opa627", "ideal"), help="(%(default)s)")
+    command.add_argument(
+        "--components",
+        choices=("nominal", "polyester", "polypropylene"),
+        help="its capacitors (default: those that fit best)",
+    )
+    command.add_argument(
+        "--pots",
+        choices=("coefficient", "dial"),
+        help="what its pots are set by (default: coefficient, unless dial fits better)",
+    )
+    command.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="of what is drawn of an emulated rig (%(default)d)"
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.errors import ConfigurationError, RigError
+    from analogrig.hardware.calibration.check import difference_lsb
+    from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate
+    from analogrig.rigs.description import open_rig
+    from analogrig.storage import replacing
+
+    if arguments.out.suffix != ".toml":
+        raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    try:
+        with open_rig(arguments.rig) as rig:
+            recordings = _recorded(rig, arguments)
+        found = calibrate(
+            recordings[:-1],
+            op_amp=arguments.op_amp,
+            stocks=(arguments.components,) if arguments.components else STOCKS,
+            pots=(arguments.pots,) if arguments.pots else POTS,
+            progress=progress_line("fits"),
+        )
+        check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
+    except RigError as error:
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
+    if check_lsb <= MOST_LSB:
+        with replacing(arguments.out) as file:
+            file.write(_toml(found, arguments.rig, arguments.program, check_lsb).encode("utf-8"))
+    show(json.dumps(_as_json(found, check_lsb, arguments)) if arguments.json else _table(found, check_lsb, arguments))
+    return PASSED if check_lsb <= MOST_LSB else FAILED
+
+
+def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[Recording]:
+    """Those to be fitted, and one more to compare rig and twin on.
+
+    :raises RigError: the rig failed, or is not well.
+    """
+    from analogrig.hardware.calibration.plan import check_scenario, scenarios
+    from analogrig.hardware.calibration.recordings import record
+
+    asked, out = [*scenarios(arguments.program), check_scenario(arguments.program)], []
+    show_progress = progress_line("recordings")
+    for each in asked:
+        out.append(record(rig, each, arguments.seed))
+        if show_progress is not None:
+            show_progress(len(out), len(asked))
+    return out
+
+
+def _table(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> str:
+    kept = f"kept as {arguments.out}" if check_lsb <= MOST_LSB else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
+    lines = [f"{'':20} {'fitted':>10}    {'std error':>9}       stands for"]
+    lines += [f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates]
+    return "\n".join([*lines, "", *_said(found, check_lsb), kept])
+
+
+def _value(estimate: Estimate) -> str:
+    factor, unit = _SHOWN_AS[estimate.unit]
+    return f"{factor * estimate.value:10.4f} +- {factor * estimate.standard_error:9.4f} {unit:3}"
+
+
+def _said(found: Calibration, check_lsb: float) -> list[str]:
+    """How good it is and what it does not know, a line each."""
+    computer = found.twin.computer
+    others = [
+        f"{stock}, by {pots} {chi_square - found.chi_square:+.0f}"
+        for (stock, pots), chi_square in found.chi_squares.items()
+        if (stock, pots) != (computer.components, computer.pots)
+    ]
+    lines = [f"kept: {computer.components} capacitors, pots set by {computer.pots}: {_why_kept(found)}"]
+    lines += [f"chi-square of others: {'; '.join(others)}"] if others else []
+    lines += [f"hardly told apart: {a} and {b} (correlation {c:+.2f})" for a, b, c in found.alike]
+    lines += [f"known no better than by the datasheet: {', '.join(found.unseen)}"] if found.unseen else []
+    return [
+        *lines,
+        f"recordings: within {found.residual_lsb:.2f} LSB rms, chi-square {found.chi_square:.0f} of {found.freedom}",
+        *_caveats(found),
+        f"on a scenario that was not fitted: within {check_lsb:.2f} LSB rms",
+    ]
+
+
+def _why_kept(found: Calibration) -> str:
+    from analogrig.hardware.calibration.fit import OUT_OF_THE_QUESTION
+
+    if found.is_least:
+        return "of those tried the least chi-square"
+    return (
+        "the least chi-square but for dials, which have three unknowns more and gain less than"
+        f" {OUT_OF_THE_QUESTION:g} times what is left per degree of freedom"
+    )
+
+
+def _caveats(found: Calibration) -> list[str]:
+    """Why the twin may not be all that the rig is; a line each."""
+    if found.explains_all:
+        return []
+    deviation, wider = (2.0 * found.freedom) ** 0.5, (found.chi_square / found.freedom) ** 0.5
+    left = f"chi-square {found.chi_square:.0f} where noise leaves {found.freedom} +- {deviation:.0f}"
+    why = f"what no such machine does (nonlinearity, drift); the standard errors are {wider:.1f} times as wide for it"
+    return [f"caveat: {left}: the rig does {why}"]
+
+
+def _toml(found: Calibration, rig: str, program: str, check_lsb: float) -> str:
+    """The description, which ``open_rig`` gives back; what it is and how sure, as comments."""
+    from dataclasses import asdict, replace
+
+    from analogrig.config import to_toml
+
+    heading = [
+        f"Twin of the rig {rig!r}, program {program}: the emulator as analogrig calibrate fitted it.",
+        "A value stands for all that acts as it does; the parts that are not named are as in the diagram.",
+        *(f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates),
+        *_said(found, check_lsb),
+    ]
+    described = asdict(replace(found.twin, description=f"twin of {rig}"))
+    del described["name"]
+    return "".join(f"# {line}\n" for line in heading) + "\n" + to_toml(described)
+
+
+def _as_json(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> dict[str, Any]:
+    from math import isfinite
+
+    return {
+        "rig": arguments.rig,
+        "program": arguments.program,
+        "file": str(arguments.out) if check_lsb <= MOST_LSB else None,
+        "components": found.twin.computer.components,
+        "pots": found.twin.computer.pots,
+        "estimates": [
+            {**vars(each), "known_to": each.known_to if isfinite(each.known_to) else None} for each in found.estimates
+        ],
+        "chi_square": found.chi_square,
+        "freedom": found.freedom,
+        "caveats": _caveats(found),
+        "tried": [
+            {"components": stock, "pots": pots, "chi_square": value}
+            for (stock, pots), value in found.chi_squares.items()
+        ],
+        "alike": found.alike,
+        "unseen": found.unseen,
+        "residual_lsb": found.residual_lsb,
+        "check_lsb": check_lsb,
+    }

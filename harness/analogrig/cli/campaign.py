@@ -1,0 +1,128 @@
+"""``analogrig campaign``: many trials over plants, changes, noise, rigs and devices."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, watched
+
+if TYPE_CHECKING:
+    from analogrig.campaigns.conduct import Tally
+    from analogrig.campaigns.plan import Plan
+    from analogrig.campaigns.workers import Workers
+
+
+MOST_WORKERS = 16
+"""For each processor."""
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "campaign", help="many trials over plants, changes, noise, rigs and devices, to one file of results"
+    )
+    command.add_argument("spec", metavar="SPEC", help="a shipped name or a .toml file; see harness/README.md")
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", help="the results; beside them a page (default: build/campaign/NAME.json)"
+    )
+    add_workers(command)
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def add_workers(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes (default: one for each processor, or for a device of its own)",
+    )
+    command.add_argument(
+        "--cluster", metavar="URL", help="the scheduler of a Dask cluster that plays instead, such as tcp://host:8786"
+    )
+
+
+def begin(arguments: argparse.Namespace) -> None:
+    """Let the processes that will play be made while this one finds out what; most likely there will be several."""
+    from analogrig.campaigns.workers import prepare
+
+    if not arguments.cluster and arguments.workers != 1 and len(os.sched_getaffinity(0)) > 1:
+        prepare()
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    begin(arguments)
+    from analogrig.campaigns.conduct import conduct, journal_of, unreachable
+    from analogrig.campaigns.plan import Plan, one_worker_only
+    from analogrig.campaigns.report import page_of, write_page
+    from analogrig.campaigns.results import as_json, text
+    from analogrig.campaigns.spec import CampaignSpec
+    from analogrig.errors import WorkerError
+
+    plan = Plan.of(CampaignSpec.load(arguments.spec))
+    out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
+    page = page_of(out)
+    kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
+    try:
+        with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
+            lacking = {} if out.exists() or arguments.cluster else unreachable(plan)
+            if len(lacking) == len(plan.devices):
+                return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
+            for name, why in lacking.items():
+                complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
+            results = conduct(plan, crew, out, progress(plan))
+    except KeyboardInterrupt:
+        return complain(f"interrupted: {kept}", INTERRUPTED)
+    except WorkerError as error:
+        return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
+    write_page(results, page)
+    if arguments.json:
+        show(json.dumps({**as_json(results), "results": str(out), "page": str(page)}))
+    else:
+        show(f"{text(results)}\nresults: {out}\npage:    {page}")
+    return STATUS[results.outcome()]
+
+
+@contextlib.contextmanager
+def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
+    """Those that the command line asks for, by default at most as many as are useful.
+
+    ``alone``: a device that cannot be shared, or "".
+
+    :raises ConfigurationError: they would have to share it.
+    """
+    from analogrig.campaigns.workers import Dask, Processes, ThisProcess
+    from analogrig.errors import ConfigurationError
+
+    if alone and (arguments.cluster or (arguments.workers or 1) > 1):
+        raise ConfigurationError(f"{alone} is one device: it cannot be shared by several workers; say --workers 1")
+    if arguments.cluster:
+        with contextlib.closing(Dask(arguments.cluster)) as cluster:
+            yield cluster
+        return
+    processors = len(os.sched_getaffinity(0))
+    count = arguments.workers if arguments.workers is not None else min(processors, useful)
+    if not 1 <= count <= MOST_WORKERS * processors:
+        most = f"{MOST_WORKERS * processors} on these {processors} processors"
+        raise ConfigurationError(f"--workers must be 1 to {most}, not {count}")
+    yield ThisProcess() if alone or count == 1 else Processes(count)
+
+
+def progress(plan: Plan) -> Callable[[Tally], None] | None:
+    """None when nobody watches."""
+    line = watched()
+    if line is None:
+        return None
+    from analogrig.campaigns.results import anytime_text
+
+    most = len(plan.cells()) * plan.spec.trials
+
+    def tell(tally: Tally) -> None:
+        line.show(f"{tally.trials} of {most} trials; {anytime_text(tally.total())}", is_last=tally.trials == most)
+
+    return tell

@@ -1,0 +1,85 @@
+"""``analogrig compare``: what has changed between two campaigns, or two folders of runs, beyond chance."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+
+if TYPE_CHECKING:
+    from analogrig.campaigns.comparison import Comparison
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "compare", help="whether B is worse than A beyond chance: two campaigns or folders of runs"
+    )
+    command.add_argument("a", type=Path, metavar="A", help="results of a campaign, or a folder of recordings")
+    command.add_argument("b", type=Path, metavar="B", help="the same, of the newer build")
+    command.add_argument(
+        "--alpha", type=_probability, default=0.01, metavar="P", help="chance of any wrong word (%(default)g)"
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def _probability(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if 0.0 < value < 1.0:
+        return value
+    raise argparse.ArgumentTypeError(f"must be between 0 and 1, not {text[:40]!r}")
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from analogrig.campaigns.comparison import PAIRED, compare
+    from analogrig.campaigns.sides import load, matched
+
+    found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
+    show(json.dumps(asdict(found)) if arguments.json else _text(found))
+    if not found.differences:
+        return complain("INCONCLUSIVE: the two sides have nothing that can be compared", INCONCLUSIVE)
+    ours, theirs = found.inconclusive
+    if theirs > ours and not found.worse:
+        return complain(
+            f"INCONCLUSIVE: {theirs} trials of B were inconclusive, {ours} of A: nothing is said of them", INCONCLUSIVE
+        )
+    seeds = max(each.seeds for each in found.differences)
+    if not (found.worse or found.is_same) and found.differences[0].test == PAIRED and seeds < found.least_seeds:
+        return complain(
+            f"INCONCLUSIVE: too few seeds ({seeds}) to show anything at alpha {found.alpha:g}:"
+            f" at least {found.least_seeds}",
+            INCONCLUSIVE,
+        )
+    return FAILED if found.worse else PASSED
+
+
+def _text(found: Comparison) -> str:
+    same, both = found.identical
+    ours, theirs = found.inconclusive
+    lines = [
+        f"A: {found.trials[0]} valid trials, B: {found.trials[1]}; theta is the same to the bit in {same} of {both}",
+        *([f"inconclusive: {ours} of A, {theirs} of B"] if ours or theirs else []),
+        "",
+        differences_text(found),
+    ]
+    return "\n".join(lines)
+
+
+def differences_text(found: Comparison) -> str:
+    """The table of differences, and what may be said of it."""
+    lines = [f"  {'':14}{'A':>11}{'B':>11}  {'unit':24}{'seeds':>6}{'p':>10}{'adjusted':>10}  test"]
+    lines += [
+        f"  {each.quantity:14}{each.a:11.4g}{each.b:11.4g}  {each.unit:24}{each.seeds:6}{each.p:10.2g}"
+        f"{each.adjusted_p:10.2g}  {each.test}: {each.word.upper() if each.word == 'worse' else each.word}"
+        for each in found.differences
+    ]
+    lines += ["", f"  adjusted by Holm: the chance of any wrong word is at most {found.alpha:g}"]
+    return "\n".join(lines)

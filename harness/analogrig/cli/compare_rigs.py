@@ -1,0 +1,108 @@
+"""``analogrig compare-rigs``: how far two rigs differ, in signals and in verdicts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.options import RIG_NAMES, add_dut, changes_of_dut, count, seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
+
+if TYPE_CHECKING:
+    from analogrig.hardware.rig_comparison import RigComparison
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser(
+        "compare-rigs", help="how far rig B is from rig A, in LSB and in samples of latency, with confidence"
+    )
+    command.add_argument("a", metavar="A", help=f"a rig: {RIG_NAMES}")
+    command.add_argument("b", metavar="B", help="the other")
+    command.add_argument("--scenario", default="thesis", metavar="NAME", help="shipped or a .toml file (%(default)s)")
+    command.add_argument("--plays", type=count, default=10, metavar="N", help="on each of them (%(default)d)")
+    command.add_argument("--seed", type=seed, default=0, metavar="N", help="of the first play (%(default)d)")
+    command.add_argument("--confidence", type=float, default=0.95, metavar="P", help="of all bounds (%(default)g)")
+    command.add_argument("--most-lsb", type=float, metavar="LSB", help="fails if the rms difference may be more")
+    command.add_argument("--most-samples", type=float, metavar="N", help="fails if that of latencies may be more")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from analogrig.bench import Bench
+    from analogrig.errors import ConfigurationError
+    from analogrig.hardware.rig_comparison import RigComparison, compare_rigs
+    from analogrig.protocol.dut import open_dut
+    from analogrig.rigs.description import open_rig
+    from analogrig.scenario import Scenario
+
+    if not 0.5 < arguments.confidence < 1.0:
+        raise ConfigurationError(f"--confidence must be between 0.5 and 1, not {arguments.confidence:g}")
+    if arguments.plays < 2:
+        raise ConfigurationError(f"--plays must be 2 or more, not {arguments.plays}")
+    scenario = Scenario.load(arguments.scenario)
+    seeds = range(arguments.seed, arguments.seed + arguments.plays)
+    with (
+        open_rig(arguments.a) as a,
+        open_rig(arguments.b) as b,
+        open_dut(arguments.dut, **changes_of_dut(arguments)) as dut,
+    ):
+        bench_a, bench_b = (Bench(rig, dut, real_time=arguments.real_time) for rig in (a, b))
+        found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))
+    if not isinstance(found, RigComparison):
+        return complain(f"INCONCLUSIVE: nothing can be compared: {found[0]}", INCONCLUSIVE)
+    show(json.dumps(asdict(found) | {"sentence": found.sentence}) if arguments.json else _text(found))
+    return FAILED if _differ(found, arguments) else PASSED
+
+
+def _differ(found: RigComparison, arguments: argparse.Namespace) -> bool:
+    """Whether verdicts differ beyond chance, or more than was allowed."""
+    lsb = max(each.rms_most_lsb for each in found.signals)
+    latency_n = float("inf") if found.latency is None else found.latency.within_n
+    return (
+        any(each.shown for each in found.verdicts.differences)
+        or (arguments.most_lsb is not None and lsb > arguments.most_lsb)
+        or (arguments.most_samples is not None and latency_n > arguments.most_samples)
+    )
+
+
+def _text(found: RigComparison) -> str:
+    from analogrig.cli.compare import differences_text
+
+    lines = [found.sentence, "", *_signal_lines(found), *_latency_lines(found)]
+    for name, of in zip("AB", found.false_alarms, strict=True):
+        rates = f"{of.least:.2g} to {of.most:.2g} per sample"
+        lines.append(f"  false alarms on {name}: {of.alarms} in {of.samples} samples ({rates})")
+    lines += [f"  not compared: {why}" for why in found.invalid]
+    return "\n".join([*lines, "", differences_text(found.verdicts)])
+
+
+def _signal_lines(found: RigComparison) -> list[str]:
+    heads = ("rms", "at most", "mean", "largest", "at sample", "by noise", "noise")
+    lines = [f"  {'LSB of A':13}{''.join(f'{head:>11}' for head in heads)}"]
+    for each in found.signals:
+        numbers = (each.rms_lsb, each.rms_most_lsb, each.mean_lsb, each.largest_lsb)
+        texts = [*(f"{n:.3f}" for n in numbers), str(each.largest_at)]
+        texts += [f"{each.largest_noise_lsb:.3f}", f"{each.noise_lsb:.3f}"]
+        edges = f"  {each.edges_apart} samples at edges differ" if each.edges_apart else ""
+        lines.append(f"  {each.channel:13}{''.join(f'{text:>11}' for text in texts)}{edges}")
+    return lines
+
+
+def _latency_lines(found: RigComparison) -> list[str]:
+    late = found.latency
+    if late is None:
+        return ["  no change was noticed on both"]
+    bounds = f"{late.least_n:+.3f} to {late.most_n:+.3f}"
+    a, b = ("/".join(f"{n:.3g}" for n in quantiles) for quantiles in late.quantiles_n)
+    unequal = f"{late.unequal} of {late.changes} changes differ"
+    return [
+        "",
+        f"  latency, B less A: {late.mean_n:+.3f} samples ({bounds}), {late.seeds} seeds; {unequal}",
+        f"  latency, median/95 %/largest: {a} on A, {b} on B",
+    ]

@@ -1,0 +1,83 @@
+"""``analogrig doctor``: the self-test of a rig, with plain advice."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+from analogrig.cli.options import add_rig, seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+
+if TYPE_CHECKING:
+    from analogrig.hardware.self_test.findings import Check, Findings
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("doctor", help="what is wrong with a rig: leads, ranges, gains, skew, noise, clocks")
+    add_rig(command)
+    command.add_argument(
+        "--program",
+        choices=("front", "shock"),
+        help="what is wired on the computer (default: what the rig says, or front)",
+    )
+    command.add_argument("--seed", type=seed, default=0, metavar="N", help="of all that is random (%(default)d)")
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.errors import RigError
+    from analogrig.hardware.self_test.conduct import self_test
+    from analogrig.rigs.description import open_rig
+
+    with open_rig(arguments.rig, self_test=False) as rig:
+        program = arguments.program or str(rig.description().get("plant", "front"))
+        try:
+            findings = self_test(rig, arguments.seed, program)
+        except RigError as error:
+            return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
+    show(json.dumps(_as_json(findings, arguments.seed)) if arguments.json else _text(findings))
+    if findings.having("wrong"):
+        return FAILED
+    return PASSED if findings.well else INCONCLUSIVE
+
+
+def _text(findings: Findings) -> str:
+    wrong, unmeasured = (len(findings.having(state)) for state in ("wrong", "not measured"))
+    counts = [f"{count} {what}" for count, what in ((wrong, "WRONG"), (unmeasured, "NOT MEASURED")) if count]
+    lines = [f"self-test of {findings.rig}, program {findings.program}: {', '.join(counts) or 'all well'}", ""]
+    for check in findings.checks:
+        lines.append(_line(check))
+        if check.state != "well":
+            lines.append(f"{'':16}{check.what_to_do}")
+    return "\n".join(lines)
+
+
+def _line(check: Check) -> str:
+    if math.isnan(check.value):
+        return f"  {check.state:14}{check.title}"
+    digits = min(6, max(0, -math.floor(math.log10(check.error)))) if check.error else 3
+    value = f"{check.value:.{digits}f}" + (f" +- {check.error:.{digits}f}" if check.error else "")
+    note = f" ({check.note})" if check.note else ""
+    return f"  {check.state:14}{check.title:27}{value:23}{check.unit:16}{check.least:.3g} to {check.most:.3g}{note}"
+
+
+def _as_json(findings: Findings, seed: int) -> dict[str, Any]:
+    checks = [{"state": check.state, **_finite(vars(check))} for check in findings.checks]
+    return {
+        "rig": findings.rig,
+        "program": findings.program,
+        "seed": seed,
+        "well": findings.well,
+        "checks": checks,
+        "reasons": list(findings.reasons),
+    }
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no NaN: what was not measured is null."""
+    return {
+        key: value if not isinstance(value, float) or math.isfinite(value) else None for key, value in values.items()
+    }

@@ -1,0 +1,206 @@
+"""Options that mean the same in every command, and what they ask for."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from analogrig.rigs.rig import Rig
+    from analogrig.run import Run
+    from analogrig.scenario import Scenario
+
+DEFAULT_SCENARIO = "thesis"
+
+
+RIG_NAMES = "shipped name, that of a table of your rigs file, FILE.toml or FILE.toml:NAME"
+RIG_HELP = f"{RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)"
+
+
+def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
+    """``default``: when the environment names none."""
+    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar="NAME", help=words)
+
+
+def add_what_to_play(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--scenario",
+        metavar="NAME",
+        help=f"a shipped name or a .toml file (default: {DEFAULT_SCENARIO}, or that recorded)",
+    )
+    command.add_argument(
+        "--program", choices=PROGRAMS, help="what is wired on the computer, instead of the scenario's plant.set"
+    )
+    add_rig(
+        command, f"{RIG_NAMES}, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None
+    )
+    command.add_argument(
+        "--seed",
+        type=seed,
+        metavar="N",
+        help="of all that is random (default: that of the scenario or recording, else the same as ever)",
+    )
+
+
+PROGRAMS = ("front", "shock", "bump-stop", "two-mass")
+"""Those of analogrig_emulator.PROGRAMS, which would take a tenth of a second to ask."""
+
+
+def seed(text: str) -> int:
+    if text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 2**63:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
+
+
+def count(text: str) -> int:
+    if text.isascii() and text.isdecimal() and len(text) <= 9:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 999999999, not {text[:40]!r}")
+
+
+def factor(text: str) -> float:
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if 1e-3 <= factor <= 1e6:
+        return factor
+    raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
+
+
+def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
+    command.add_argument(
+        "--dut",
+        default=default,
+        metavar="NAME",
+        help="shipped name, .toml file, inproc[:LIBRARY], qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
+        f" can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
+    )
+    command.add_argument(
+        "--exchange",
+        choices=("sample", "block", "stream"),
+        help="how samples go to the device, instead of as described",
+    )
+    command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
+    command.add_argument(
+        "--bitrate", type=int, metavar="N", help="of a CAN bus; without a real one its time is reported"
+    )
+    command.add_argument(
+        "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
+    )
+    command.add_argument(
+        "--report-interval", type=int, metavar="N", help="the device reports its estimate every N samples"
+    )
+    command.add_argument(
+        "--real-time",
+        type=factor,
+        nargs="?",
+        const=1.0,
+        metavar="FACTOR",
+        help="samples go out as the machine takes them, or FACTOR times slower; a stream, unless --exchange is given",
+    )
+
+
+def add_can_log(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--can-log",
+        choices=("log", "blf", "asc", "mf4", "none"),
+        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz (default: log"
+        " on a CAN bus)",
+    )
+
+
+def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=default,
+        metavar="DIR",
+        help="where run.npz and report.html go (default: %(default)s)",
+    )
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+
+
+def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says about the device beyond its name."""
+    in_real_time = "stream" if arguments.real_time is not None else None
+    return {
+        "exchange": arguments.exchange or in_real_time,
+        "baud": arguments.baud,
+        "bitrate": arguments.bitrate,
+        "report_interval_n": arguments.report_interval,
+        "wire_faults": arguments.wire_faults,
+    }
+
+
+@contextlib.contextmanager
+def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
+    """The rig, the scenario and the seed that were asked for; what was not, as the scenario or the recording has it."""
+    from dataclasses import replace
+
+    from analogrig.rigs.description import DEFAULT_RIG, open_rig
+    from analogrig.rigs.recording import RecordingRig
+    from analogrig.scenario import DEFAULT_SEED, Scenario
+
+    asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG) as rig:
+        recording = rig if isinstance(rig, RecordingRig) else None
+        scenario = asked or (recording.scenario() if recording else Scenario.load(DEFAULT_SCENARIO))
+        if arguments.program is not None:
+            scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
+        recorded = None if recording is None else recording.run.conditions.seed
+        seeds = (arguments.seed, scenario.seed, recorded, DEFAULT_SEED)
+        yield rig, scenario, next(seed for seed in seeds if seed is not None)
+
+
+def add_capture(command: argparse.ArgumentParser) -> None:
+    """What a CAN log does not say itself."""
+    command.add_argument(
+        "--scenario", metavar="NAME", help="what was played: shipped name or .toml file; a run.npz says it itself"
+    )
+    add_rig(command, f"on which a CAN log was captured: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
+    command.add_argument(
+        "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
+    )
+    command.add_argument("--run", type=count, metavar="N", help="which of several runs in a CAN log, from 1")
+    command.add_argument(
+        "--most-lost", type=count, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
+    )
+
+
+def is_capture(path: Path) -> bool:
+    """Whether it is, by its name, no recording of ours."""
+    return path.suffix != ".npz"
+
+
+def recorded(arguments: argparse.Namespace) -> Run:
+    """The run in the file that is named.
+
+    :raises RecordingError: it cannot be read.
+    :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.
+    """
+    from analogrig.errors import ConfigurationError
+    from analogrig.recordings import captured_run, retold
+    from analogrig.rigs.description import open_rig
+    from analogrig.run import Run
+    from analogrig.scenario import Scenario
+
+    scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
+    if not is_capture(arguments.file):
+        run = Run.load(arguments.file)
+        return run if scenario is None else retold(run, scenario)
+    if scenario is None:
+        raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
+    with open_rig(arguments.rig) as rig:
+        return captured_run(
+            arguments.file,
+            scenario,
+            rig,
+            dbc=arguments.dbc,
+            number=arguments.run,
+            most_lost_n=arguments.most_lost,
+        )

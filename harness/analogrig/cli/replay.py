@@ -1,0 +1,36 @@
+"""``analogrig replay``: a recording, or the samples of a CAN log, through a device again."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from analogrig.cli.options import add_can_log, add_capture, add_dut, add_output, changes_of_dut, is_capture, recorded
+from analogrig.cli.playing import can_log, play, prepare
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("replay", help="play a recorded run through a device again, and judge it")
+    command.add_argument("file", type=Path, metavar="FILE", help="a recording (run.npz), or a CAN log")
+    add_capture(command)
+    add_dut(command, default=None, shown="that of the recording")
+    add_output(command, default=Path("build/replay"))
+    add_can_log(command)
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.errors import ConfigurationError
+    from analogrig.protocol.dut import open_dut, reopen_dut
+    from analogrig.rigs.recording import RecordingRig
+
+    named = arguments.dut
+    if named is None and is_capture(arguments.file):
+        raise ConfigurationError(f"{arguments.file}: does not say which device it was: say --dut")
+    with RecordingRig.of(recorded(arguments), arguments.file) as rig:
+        prepare(arguments.out, rig)
+        log = can_log(rig, arguments)
+        changes = {"listener": log, **changes_of_dut(arguments)}
+        with open_dut(named, **changes) if named else reopen_dut(rig.run.conditions.dut, **changes) as dut:
+            return play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments, log)

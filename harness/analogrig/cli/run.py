@@ -1,0 +1,31 @@
+"""``analogrig run``: play a scenario and judge."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from typing import Any
+
+from analogrig.cli.options import add_can_log, add_dut, add_output, add_what_to_play, changes_of_dut, opened
+from analogrig.cli.playing import can_log, play, prepare
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("run", help="play a scenario on a rig, through a device, and judge what it says")
+    add_what_to_play(command)
+    add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")
+    add_output(command)
+    add_can_log(command)
+    command.set_defaults(command=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.devices.devices import of_scenario
+    from analogrig.protocol.dut import open_dut
+
+    with opened(arguments) as (rig, scenario, seed):
+        device = of_scenario(scenario.dut, arguments.dut, "host")
+        prepare(arguments.out, rig)
+        log = can_log(rig, arguments)
+        with open_dut(device, listener=log, **changes_of_dut(arguments)) as dut:
+            return play(rig, dut, scenario, seed, arguments, log)

@@ -1,0 +1,228 @@
+"""Typed configuration: TOML files into frozen dataclasses, and the places where the named ones live.
+
+Every key is checked against the dataclass: an unknown key, a wrong type or a value out of range is one line that names
+the file, the table and the key. Nothing read from a file is ever executed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from analogrig.errors import ConfigurationError
+from analogrig_emulator.errors import EmulatorError
+
+T = TypeVar("T")
+
+Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
+
+MAX_FILE_BYTES = 1_000_000
+
+MOST_NUMBER = 1e30
+"""Of any quantity in any unit; beyond it even a product overflows."""
+
+MOST_INTEGER = 2**63 - 1
+
+MOST_SHOWN = 200
+
+
+def fixtures() -> Path:
+    """The folder of the shipped scenarios, rigs and devices: inside the installed package, or that of the checkout."""
+    installed = Path(__file__).parent / "fixtures"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "fixtures"
+
+
+def locate(kind: Kind, name: str) -> Path:
+    """The TOML file of a shipped ``name``, or of a user's own path.
+
+    :raises ConfigurationError: there is no such file.
+    """
+    if name.endswith(".toml") or "/" in name:
+        path = Path(name)
+        if _is_file(path):
+            return path
+        raise ConfigurationError(f"{_brief(name)}: {'is a directory' if path.is_dir() else 'no such file'}")
+    path = fixtures() / kind / f"{name}.toml"
+    if _is_file(path):
+        return path
+    known = ", ".join(names(kind))
+    raise ConfigurationError(f"no {kind[:-1]} is called {_shown(name)}: there are {known}, or give a .toml file")
+
+
+def _is_file(path: Path) -> bool:
+    """:raises ConfigurationError: the system will not even look."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise ConfigurationError(f"{_brief(str(path))}: {error.strerror or error}") from error
+
+
+def names(kind: Kind) -> list[str]:
+    """The shipped names of a kind, sorted."""
+    return sorted(path.stem for path in (fixtures() / kind).glob("*.toml"))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as plain values.
+
+    :raises ConfigurationError: it cannot be read, is too large, or is not TOML.
+    """
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ConfigurationError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
+        raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+
+
+def to_toml(table: Mapping[str, Any]) -> str:
+    """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out."""
+    return "\n".join(_toml_lines(table, ())) + "\n"
+
+
+def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    given = {key: value for key, value in table.items() if value is not None}
+    tables = {key: value for key, value in given.items() if isinstance(value, Mapping)}
+    lists = {key: value for key, value in given.items() if _is_tables(value)}
+    for key, value in given.items():
+        if key not in tables and key not in lists:
+            yield f"{_toml_key(key)} = {_toml_value(value)}"
+    for key, value in tables.items():
+        yield f"\n[{'.'.join(map(_toml_key, (*path, key)))}]"
+        yield from _toml_lines(value, (*path, key))
+    for key, values in lists.items():
+        for value in values:
+            yield f"\n[[{'.'.join(map(_toml_key, (*path, key)))}]]"
+            yield from _toml_lines(value, (*path, key))
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list | tuple) and bool(value) and all(isinstance(item, Mapping) for item in value)
+
+
+def _toml_key(key: str) -> str:
+    return key if key and all(c.isascii() and (c.isalnum() or c in "_-") for c in key) else json.dumps(key)
+
+
+def _toml_value(value: Any) -> str:
+    """Strings, numbers, truth values and arrays of them; what JSON writes of them is TOML too."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_value, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "nan" if math.isnan(value) else "inf" if value > 0.0 else "-inf"
+    return json.dumps(value)
+
+
+def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """``table`` as an instance of the dataclass ``cls``; ``where`` (file and table) leads every error.
+
+    Field types may be bool, int, float, str, Literal, a dataclass, Mapping[str, X], tuple[X, ...], and unions of these.
+
+    :raises ConfigurationError: unknown or lacking key, wrong type, or a value that ``cls`` refuses by ValueError.
+    """
+    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls)) if field.init}
+    hints = typing.get_type_hints(cls)
+    for key in table:
+        if key not in fields:
+            raise ConfigurationError(f"{where}: unknown key {key!r} (known: {', '.join(fields)})")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in table:
+            raise ConfigurationError(f"{where}: the key {name!r} is lacking")
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    try:
+        return cls(**values)
+    except (ValueError, ArithmeticError, EmulatorError) as error:
+        table_name = where.rpartition(": ")[2]
+        raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(arguments, value, where)
+    if origin is Literal:
+        if value in arguments:
+            return value
+        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {value!r}")
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
+    if origin is tuple:
+        return _convert_tuple(arguments, value, where)
+    if origin in (Mapping, dict):
+        table = _expect(dict, value, "a table", where)
+        return {key: _convert(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
+    if (kinds := _by_kind(arguments)) and isinstance(value, dict):
+        if "kind" not in value:
+            raise ConfigurationError(f"{where}: the key 'kind' is lacking")
+        kind = _convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
+        return _convert(kinds[kind], value, where)
+    problems = []
+    for argument in arguments:
+        if argument is types.NoneType:
+            continue
+        try:
+            return _convert(argument, value, where)
+        except ConfigurationError as error:
+            problems.append(str(error).removeprefix(f"{where}: "))
+    raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
+
+
+def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
+    """The tables of a union by what their ``kind`` must be; empty if that does not tell them apart."""
+    hints = [typing.get_type_hints(each).get("kind") for each in arguments if dataclasses.is_dataclass(each)]
+    if len(hints) < len(arguments) or not all(typing.get_origin(hint) is Literal for hint in hints):
+        return {}
+    return {kind: table for hint, table in zip(hints, arguments, strict=True) for kind in typing.get_args(hint)}
+
+
+def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    items = _expect(list, value, "an array", where)
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+    if len(items) != len(arguments):
+        raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
+    return tuple(
+        _convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
+    )
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is Any:
+        return value
+    if hint is float:
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER:
+            return float(value)
+        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_shown(value)}")
+    if hint is int and (isinstance(value, bool) or (isinstance(value, int) and abs(value) > MOST_INTEGER)):
+        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_shown(value)}")
+    words = {int: "a whole number", bool: "true or false", str: "a text"}
+    return _expect(hint, value, words[hint], where)
+
+
+def _expect(kind: type[T], value: Any, words: str, where: str) -> T:
+    if isinstance(value, kind):
+        return value
+    raise ConfigurationError(f"{where}: must be {words}, not {_shown(value)}")
+
+
+def _shown(value: Any) -> str:
+    """A value in an error, in one line of bounded length."""
+    return "a longer one" if isinstance(value, int) and abs(value) > MOST_INTEGER else _brief(repr(value))
+
+
+def _brief(text: str) -> str:
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."

@@ -1,0 +1,1 @@
+"""Devices: kinds of estimator under test and how each is reached."""

@@ -1,0 +1,176 @@
+"""The C estimator in this process, whole blocks at a time: no frames, no link, no device."""
+
+from __future__ import annotations
+
+import ctypes
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analogrig.errors import ConfigurationError
+from analogrig.links.wire import LIBRARY, load_library
+from analogrig.protocol.estimator_config import EstimatorConfig
+
+
+class StepStatus(enum.IntEnum):
+    """As est_status_t of est.h."""
+
+    UPDATED = 0
+    MISSING = 1
+    REFUSED = 2
+    GATHERING = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What each of n samples gave."""
+
+    theta: NDArray[np.float32]
+    """(n, p) after the sample."""
+    innovation: NDArray[np.float32]
+    """(n,) codes; 0 where there was no equation."""
+    statistic: NDArray[np.float32]
+    """(n,)"""
+    status: NDArray[np.uint8]
+    """(n,) StepStatus."""
+    alarms: NDArray[np.int64]
+    """Indices of the samples with an alarm."""
+
+
+class _Out(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("theta", "innovation", "statistic", "status", "alarm")]
+
+
+_COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromkeys(
+    ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes"), ctypes.c_uint16
+)
+"""The fields of est_counters_t."""
+
+
+class _Counters(ctypes.Structure):
+    _fields_ = list(_COUNTERS.items())
+
+
+_FUNCTIONS = ("size", "init", "set", "start", "run", "theta_count", "counters")
+"""Of estimator_c/ports/library/library.h."""
+
+
+def _loaded(library: Path) -> ctypes.CDLL:
+    c = load_library(library, (f"library_{does}" for does in _FUNCTIONS))
+    c.library_size.restype = c.library_run.restype = ctypes.c_size_t
+    c.library_run.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *(ctypes.c_void_p,) * 3, ctypes.POINTER(_Out)]
+    c.library_start.restype = ctypes.c_bool
+    c.library_theta_count.restype = ctypes.c_uint8
+    c.library_counters.restype = _Counters
+    return c
+
+
+class Estimator:
+    """One estimator; the samples of a run may come in blocks of any length."""
+
+    def __init__(self, config: EstimatorConfig | None = None, *, library: Path = LIBRARY) -> None:
+        """Ready for the first sample.
+
+        :raises ConfigurationError: the estimator refuses the configuration, or a user's own library is none.
+        :raises LinkError: the library was not built.
+        """
+        self._c = _loaded(library)
+        self._state = ctypes.create_string_buffer(self._c.library_size())
+        self._c.library_init(self._state)
+        for key, value in (config or EstimatorConfig()).settings():
+            if self._c.library_set(self._state, int(key), ctypes.c_float(value)):
+                raise ConfigurationError(f"the estimator refuses {key.name.lower()} = {value:g}")
+        self.restart()
+
+    def restart(self) -> None:
+        """The next sample is the first.
+
+        :raises ConfigurationError: the fields of the configuration do not go together.
+        """
+        if not self._c.library_start(self._state):
+            raise ConfigurationError("the estimator refuses this configuration: its fields do not go together")
+
+    @property
+    def parameters(self) -> int:
+        """The number of elements of theta."""
+        return int(self._c.library_theta_count(self._state))
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Since the start, by the names of est_counters_t."""
+        counters = self._c.library_counters(self._state)
+        return {name: int(getattr(counters, name)) for name in _COUNTERS}
+
+    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Steps:
+        """Enter n samples and keep everything.
+
+        :param u: (n,) codes of force.
+        :param y: (n,) codes of displacement.
+        :param valid: (n,) false where the sample is missing.
+        """
+        n = np.size(u)
+        theta = np.empty((n, self.parameters), np.float32)
+        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
+        status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
+        out = _Out(*(array.ctypes.data for array in (theta, innovation, statistic, status, alarm)))
+        self._enter(u, y, valid, out)
+        return Steps(theta, innovation, statistic, status, np.flatnonzero(alarm))
+
+    def alarms(
+        self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, **filled: NDArray[Any]
+    ) -> NDArray[np.int64]:
+        """As run(), for the alarms alone: several times as fast.
+
+        :param filled: arrays of the names, shapes and dtypes of ``Steps`` that are filled as well.
+        """
+        alarm = np.empty(np.size(u), np.uint8)
+        out = _Out(alarm=alarm.ctypes.data, **{name: array.ctypes.data for name, array in filled.items()})
+        return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
+
+    def save(self) -> NDArray[np.uint8]:
+        """All that it knows after the last sample, for ``branch`` of this very estimator."""
+        return np.frombuffer(bytes(self._state), np.uint8).copy()
+
+    def branch(
+        self, saved: NDArray[np.uint8], u: ArrayLike, y: ArrayLike, valid: ArrayLike
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8]]:
+        """Goes on from several saved states, each with samples of its own.
+
+        :param saved: (b, size), rows of ``save``.
+        :param u: (b, n); y and valid likewise, as of ``run``.
+
+        :return: statistic and alarm, (b, n), and the states afterwards, (b, size).
+        """
+        u, y = (np.ascontiguousarray(x, dtype=np.float32) for x in (u, y))
+        mask, after = np.ascontiguousarray(valid, dtype=np.uint8), np.array(saved, order="C")
+        statistic, alarm = np.empty(u.shape, np.float32), np.empty(u.shape, np.bool_)
+        state, size, n = ctypes.addressof(self._state), len(self._state), u.shape[1]
+        rows = [(x.ctypes.data, x.strides[0]) for x in (after, u, y, mask, statistic, alarm)]
+        for i in range(len(after)):
+            kept, u_i, y_i, mask_i, statistic_i, alarm_i = (start + i * stride for start, stride in rows)
+            ctypes.memmove(state, kept, size)
+            out = _Out(statistic=statistic_i, alarm=alarm_i)
+            self._c.library_run(state, n, u_i, y_i, mask_i, ctypes.byref(out))
+            ctypes.memmove(kept, state, size)
+        return statistic, alarm, after
+
+    def _enter(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None, out: _Out) -> int:
+        inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
+        mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
+        shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
+        if len(shapes) != 1 or inputs[0].ndim != 1:
+            raise ValueError("u, y and valid must be one-dimensional and of one length")
+        return int(
+            self._c.library_run(
+                self._state,
+                len(inputs[0]),
+                *(x.ctypes.data for x in inputs),
+                None if mask is None else mask.ctypes.data,
+                ctypes.byref(out),
+            )
+        )

@@ -1,0 +1,1 @@
+"""Real rigs: drivers, wiring, pots, self-test, dating of changes, calibration, simulator."""

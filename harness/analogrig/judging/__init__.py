@@ -1,0 +1,1 @@
+"""Verdicts: judge a run against its scenario, with the information bound and exposure."""

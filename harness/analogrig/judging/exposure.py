@@ -1,0 +1,144 @@
+"""In which samples a false alarm could have come: the exposure, of which every rate of false alarms is one.
+
+A device that is warming up, is held off after an alarm, has no equation for want of the samples before, or is not
+excited, raises no alarm whatever it is worth: its silence is no evidence.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.protocol.catalogue import SteppedFlag
+from analogrig.run import CHANNELS, LOST, Run
+
+EDGE_NOISES = 9.0
+"""Of the noise of the force: less is no edge, whatever the device takes for one. By chance two samples differ as much
+once in 5e9 times."""
+
+_QUANTISATION_LSB = 12.0**-0.5
+
+_FORCE = CHANNELS.index("force")
+
+_NOT_HEARD = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Of one run."""
+
+    samples: int
+    armed: int
+    """Samples in which the trigger was armed."""
+    unexcited: int
+    """Samples before the force had moved, or after its edges had ceased."""
+    numberless: int
+    """Samples after which estimate, innovation or statistic was no number, without an alarm."""
+    estimator: Mapping[str, Any]
+    """The device's settings, as ``EstimatorConfig.as_table`` gives them."""
+
+    @property
+    def no_evidence(self) -> str:
+        """Why its silence is no evidence of anything, in one line; empty if it is."""
+        if self.numberless:
+            return f"in {self.numberless} of {self.samples} samples what the device estimated was no number"
+        return "" if self.armed else f"no alarm could come in any of {self.samples} samples: {self._because()}"
+
+    def _because(self) -> str:
+        if self.estimator.get("trigger") == "none":
+            return "the device has no trigger"
+        if 2 * self.unexcited <= self.samples:
+            return f"its warm-up takes {self.estimator.get('warm_up_n', 0)}"
+        edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
+        return (
+            f"in {self.unexcited} it was not excited (the force had no edge of {edge_codes:g} codes, or none for"
+            f" {idle_n} samples)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What is known of one record of n samples, from the first on."""
+
+    force: NDArray[np.uint16]
+    """(n,) codes."""
+    flags: NDArray[np.uint8]
+    """(n,) as of a Run."""
+    are_numbers: NDArray[np.bool_]
+    """(n,): estimate, innovation and statistic are numbers."""
+    alarms: NDArray[np.int64]
+    """(a,) the samples with an alarm; each was armed, whatever else is known of it."""
+
+
+def exposure(run: Run) -> Exposure:
+    """Of all records, each of which is a run of its own to the device."""
+    estimator, noise_lsb = run.conditions.dut["estimator"], run.conditions.channels["force"].noise_lsb
+    numbers = np.isfinite(run.innovation) & np.isfinite(run.statistic) & np.isfinite(run.theta).all(axis=1)
+    parts = [
+        exposed(
+            Heard(
+                run.codes[start:end, _FORCE],
+                run.flags[start:end],
+                numbers[start:end],
+                run.alarm_index[(run.alarm_index >= start) & (run.alarm_index < end)] - start,
+            ),
+            estimator,
+            noise_lsb,
+        )
+        for start, end in run.records
+    ]
+    armed, unexcited, numberless = (
+        sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "numberless")
+    )
+    return Exposure(run.samples, armed, unexcited, numberless, estimator)
+
+
+def exposed(heard: Heard, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
+    """Of one record; ``noise_lsb`` is that of the force."""
+    known = (heard.flags & _NOT_HEARD) == 0
+    edge_codes = float(estimator.get("edge_codes", 0.0))
+    if edge_codes:
+        edge_codes = max(edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
+    excited = _excited(heard.force, known, edge_codes, int(estimator.get("idle_n", 0)))
+    excited &= (heard.flags & SteppedFlag.IDLE) == 0
+    watched = _watched(known & ((heard.flags & SteppedFlag.GATHERING) == 0), heard.alarms, estimator)
+    armed = watched & excited & heard.are_numbers & (estimator.get("trigger") != "none")
+    armed[heard.alarms] = True
+    numberless = ~heard.are_numbers
+    numberless[heard.alarms] = False  # which is what it should say of them
+    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(numberless.sum()), estimator)
+
+
+def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: float, idle_n: int) -> NDArray[np.bool_]:
+    """(n,): the force has moved by what is an edge, and the last edge was not too long ago."""
+    codes = force.astype(np.int32)
+    edges = np.flatnonzero((np.abs(np.diff(codes)) >= edge_codes) & heard[1:] & heard[:-1]) + 1
+    excited = np.ones(len(codes), np.bool_)
+    if len(edges):
+        excited[: edges[0]] = False
+    else:
+        known = codes[heard]
+        excited[heard] = np.maximum.accumulate(known) - np.minimum.accumulate(known) >= edge_codes
+    for edge, following in itertools.pairwise([0, *edges.tolist(), len(codes)]):
+        if idle_n and following - edge > idle_n:
+            excited[edge:following] &= np.cumsum(heard[edge:following]) - heard[edge] < idle_n
+    return excited
+
+
+def _watched(
+    equations: NDArray[np.bool_], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
+) -> NDArray[np.bool_]:
+    """(n,): of the samples with an equation those beyond warm-up and hold-off, which count equations."""
+    count = np.cumsum(equations, dtype=np.int32)
+    watched = equations & (count > int(estimator.get("warm_up_n", 0)))
+    hold_off_n = int(estimator.get("hold_off_n", 0))
+    if hold_off_n and len(alarms):
+        last = np.searchsorted(alarms, np.arange(len(count))) - 1  # of the alarms before the sample
+        watched &= (last < 0) | (count > count[alarms[last]] + hold_off_n)
+    return watched

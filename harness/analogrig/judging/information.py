@@ -1,0 +1,215 @@
+"""How soon a change can be seen at all, and how soon it can be told what has changed.
+
+No detector whose mean time between false alarms is ARL0 can, to first order, raise the alarm before the information
+
+    I(n) = sum over the first n samples of (y_changed - y_unchanged)^2 / (2 sigma^2)
+
+between the plant as it was and the plant as it has become reaches ln ARL0 (Lorden 1971; Moustakides 1986; Lai 1998).
+It depends on where in the excitation the change fell, so it is computed for that very change in that very run.
+
+Which parameter has changed can be told, with 95 % confidence, once the same information between the plant as it has
+become and the likeliest plant in which another parameter alone had changed reaches ln 20.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State
+from analogrig.run import Run
+from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.suspension import PROGRAMS
+
+if TYPE_CHECKING:
+    from analogrig.scenario import Scenario
+
+QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
+
+
+LN_CERTAIN = math.log(20.0)
+
+ISOLATION_HORIZON_N = 300
+"""A change that cannot be told from others within so many samples counts as one that never can."""
+
+_RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 221))
+"""Magnitudes of a rival; the best is interpolated."""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """One change of the plant in a run."""
+
+    before: Plant
+    after: Plant
+    steps: Sequence[SampledPlant]
+    """The plant in each of the sample periods after it."""
+    state: State
+    """In which it finds the plant."""
+    force_n: Sequence[float]
+    """(n,) as it was measured."""
+    weight: NDArray[np.float64]
+    """(n,) of a squared metre of displacement, after each of these forces: information; 0 for a missing sample."""
+
+
+def changes(run: Run) -> list[NDArray[np.float64]]:
+    """For each change of the plant in ``run``: I(1), I(2), ... up to the next change or the end.
+
+    Both plants start from the state in which the change finds the true one and feel the force that was measured.
+    Samples that the device could not use carry no information.
+    """
+    period_s = run.conditions.sample_period_problem_s
+    return [_information(change, period_s) for change in _changes(run)]
+
+
+def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
+    """I(1), I(2), ... of one change."""
+    unchanged = [SampledPlant.of(change.before, period_s)] * len(change.steps)
+    difference_m = _course(change, change.steps) - _course(change, unchanged)
+    return np.cumsum(difference_m**2 * change.weight)
+
+
+def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
+    """Whether every change of a scenario can be seen before the next: I(n) reaches ln ARL0 there.
+
+    Told beforehand, from plant and excitation as the scenario has them (its own phase, though one be drawn), for a
+    displacement channel with that noise (rms) and resolution; a run's bounds come from the force that was measured.
+    """
+    return all(bound is not None for bound in predicted_bounds(scenario, arl0, noise_lsb=noise_lsb, lsb_v=lsb_v))
+
+
+def predicted_bounds(
+    scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096, rate_hz: float = 20e3
+) -> list[int | None]:
+    """For each change of a scenario the samples after which it can be seen; None: not before the next or the end."""
+    scales = PROGRAMS[scenario.plant.set].scales
+    lsb_m = lsb_v / scales.volts("displacement")
+    weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
+    volts = _levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
+    force_n = (volts / scales.volts("force")).tolist()
+    segments = scenario.segments()
+    stretches = [
+        (segment.start, following, segment.plant)
+        for segment, following in zip(
+            segments, [*(segment.start for segment in segments[1:]), scenario.samples], strict=True
+        )
+    ]
+    ramps_n = {segment.start: segment.ramp_n for segment in segments}
+    period_s = scales.time / rate_hz
+    return [
+        first_reaching(_information(change, period_s), math.log(arl0))
+        for change in _courses_of(stretches, ramps_n, force_n, weight, period_s)
+    ]
+
+
+def _levels(edges: Edges, samples: int) -> NDArray[np.float64]:
+    """(n,) volts in the period after each sample, on average."""
+    ticks = np.append(edges.ticks, samples * TICKS_PER_SAMPLE).astype(np.float64) / TICKS_PER_SAMPLE
+    integral = np.interp(np.arange(samples + 1), ticks, np.append(0.0, np.cumsum(edges.levels_v * np.diff(ticks))))
+    return np.asarray(np.diff(integral))
+
+
+def isolation_bounds(run: Run) -> list[int | None]:
+    """For each change of the plant in ``run``: the samples after which it can be told from a change of any other one
+    parameter, be it by the factor that looks most like it; None: not before the next change or the end.
+    """
+    period_s = run.conditions.sample_period_problem_s
+    out = []
+    for change in _changes(run):
+        changed = tuple(change.before.changes_to(change.after))
+        course = _course(change, change.steps)[:ISOLATION_HORIZON_N]
+        least = np.full(len(course), np.inf)
+        for name in PARAMETERS:
+            if changed != (name,):
+                rivals = [change.before.scaled(name, factor) for factor in _RIVAL_FACTORS]
+                apart = (_courses(change, rivals, period_s) - course) ** 2 * change.weight[: len(course)]
+                least = np.minimum(least, _least(np.cumsum(apart, axis=1)))
+        out.append(first_reaching(least, LN_CERTAIN))
+    return out
+
+
+def _changes(run: Run) -> Iterator[_Change]:
+    conditions = run.conditions
+    force_n = run.channel("force").tolist()
+    displacement = conditions.channels["displacement"]
+    variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
+    weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
+    ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
+    return _courses_of(
+        run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s, records=conditions.records
+    )
+
+
+def _courses_of(
+    stretches: Iterable[tuple[int, int, Plant]],
+    ramps_n: Mapping[int, int],
+    force_n: Sequence[float],
+    weight: NDArray[np.float64],
+    period_s: float,
+    records: Sequence[int] = (0,),
+) -> Iterator[_Change]:
+    """The changes between stretches (start, end, plant) under a force; with each of the records it begins at rest."""
+    state = AT_REST
+    before: Plant | None = None
+    for start, end, plant in stretches:
+        if start in records:
+            state = AT_REST
+        steps = _steps(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
+        if before is not None:
+            yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
+        if end < len(force_n):
+            for step, force in zip(steps, force_n[start:end], strict=True):
+                state = step.next(state, force)
+        before = plant
+
+
+def _steps(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
+    """The plant in each of the sample periods after a change; on a ramp that of the period's middle."""
+    turning = [
+        SampledPlant.of(before.on_the_way(after, (k + 0.5) / ramp_n), period_s) for k in range(min(ramp_n, samples))
+    ]
+    return turning + [SampledPlant.of(after, period_s)] * (samples - len(turning))
+
+
+def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
+    """The first n with I(n) >= level, or None."""
+    reached = np.flatnonzero(np.asarray(information) >= level)
+    return int(reached[0]) + 1 if len(reached) else None
+
+
+def _course(change: _Change, steps: Sequence[SampledPlant]) -> NDArray[np.float64]:
+    """(n,) metres, after each of the n forces."""
+    state = change.state
+    out = np.empty(len(steps))
+    for k, (step, force) in enumerate(zip(steps, change.force_n, strict=True)):
+        state = step.next(state, force)
+        out[k] = state[0]
+    return out
+
+
+def _courses(change: _Change, plants: Sequence[Plant], period_s: float) -> NDArray[np.float64]:
+    """(p, n) metres, of each of p plants, up to the horizon."""
+    sampled = [SampledPlant.of(plant, period_s) for plant in plants]
+    xx, xv, vx, vv = np.array([each.transition for each in sampled]).T
+    xf, vf = np.array([each.response for each in sampled]).T
+    x, v = (np.full(len(plants), value) for value in change.state)
+    forces = change.force_n[:ISOLATION_HORIZON_N]
+    out = np.empty((len(plants), len(forces)))
+    for k, force in enumerate(forces):
+        x, v = xx * x + xv * v + xf * force, vx * x + vv * v + vf * force
+        out[:, k] = x
+    return out
+
+
+def _least(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(f, n) at evenly spaced f: the least over f (n,), by a parabola through the three lowest."""
+    at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
+    low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))
+    curvature = low + high - 2.0 * mid
+    dip = np.divide((high - low) ** 2, 8.0 * curvature, out=np.zeros_like(mid), where=curvature > 0.0)
+    return np.asarray(np.maximum(np.minimum(mid, mid - dip), 0.0))

@@ -1,0 +1,171 @@
+"""Messages as frames on a CAN bus, on which others may speak too.
+
+The identifier of a frame is that of the message in estimator_c/catalogue/analogrig.dbc. Whatever else is on the bus is
+counted and passed over; somebody else who speaks with the harness's own identifiers ends the run.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+from analogrig.errors import LinkError
+from analogrig.links.bus_load import CLASSIC_BYTES
+from analogrig.links.can_bus import CanBus
+from analogrig.links.link import CanListener
+from analogrig.links.python_can import can
+from analogrig.protocol.catalogue import LAYOUTS, Message, pack, unpack_any
+
+_OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
+_DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}
+
+# As include/uapi/linux/can/error.h has them, which python-can hands on from SocketCAN: the identifier is a set of them.
+TRANSMIT_TIMEOUT, LOST_ARBITRATION, CONTROLLER, VIOLATION, TRANSCEIVER = 0x01, 0x02, 0x04, 0x08, 0x10
+NOT_ACKNOWLEDGED, BUS_OFF, BUS_ERROR, RESTARTED = 0x20, 0x40, 0x80, 0x100
+_WORDS = {
+    TRANSMIT_TIMEOUT: "transmission timed out",
+    LOST_ARBITRATION: "arbitration lost",
+    CONTROLLER: "controller",
+    VIOLATION: "protocol violated",
+    TRANSCEIVER: "transceiver",
+    NOT_ACKNOWLEDGED: "not acknowledged",
+    BUS_OFF: "bus-off",
+    BUS_ERROR: "bus error",
+    RESTARTED: "restarted",
+}
+RECEIVE_OVERFLOW, PASSIVE, ACTIVE = 0x01, 0x30, 0x40
+"""Bits of byte 1 of a frame about the controller."""
+
+
+class CanLink:
+    """Messages over a bus; they come in the order in which they were sent."""
+
+    def __init__(self, bus: CanBus) -> None:
+        """Take over ``bus``."""
+        self.bus = bus
+        self.name = bus.name
+        self.clock = bus.clock
+        self.line = bus.line
+        self.line_s = 0.0
+        self.carries_blocks = bus.is_fd
+        self.unread_n = bus.unread_n
+        self._counted: Counter[str] = Counter()
+        self._state = ""
+        self._last_error = ""
+        self._sent: dict[int, bytes] = {}
+        """What was said last with each sequence number."""
+        self._listeners: list[CanListener] = []
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        dropped = self._counted["frames_dropped"] + self.bus.damaged
+        no = {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
+        return no | self._counted | {"frames_dropped": dropped}
+
+    @property
+    def trouble(self) -> str:
+        said = [f"the bus is {self._state}"] if self._state else []
+        if errors := self._counted["error_frames"]:
+            said.append(f"{errors} error frames (the last: {self._last_error})")
+        if foreign := self._counted["frames_foreign"]:
+            said.append(f"{foreign} frames of others")
+        return ", ".join(said)
+
+    def listen(self, listener: CanListener) -> bool:
+        self._listeners.append(listener)
+        return True
+
+    def send(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            frame = self._frame(message)
+            self._sent[message.seq] = bytes((frame.arbitration_id,)) + frame.data
+            self.bus.send(frame)
+            self._passed(frame, is_rx=False)
+
+    def receive(self, timeout_s: float) -> Message | None:
+        deadline_s = self.clock() + timeout_s
+        while True:
+            frame = self.bus.receive(max(0.0, deadline_s - self.clock()))
+            if frame is not None:
+                message = self._message(frame)
+                if message is not None:
+                    return message
+            if self.clock() >= deadline_s:
+                return None
+
+    def close(self) -> None:
+        self.bus.close()
+
+    def _frame(self, message: Message) -> can.Message:
+        """A classic one, unless it is too long for that."""
+        packet = pack(message)
+        is_fd = len(packet) > 1 + CLASSIC_BYTES
+        return can.Message(
+            arbitration_id=packet[0],
+            is_extended_id=False,
+            data=packet[1:],
+            is_fd=is_fd,
+            bitrate_switch=is_fd and self.line is not None and self.line.data_bitrate is not None,
+            is_rx=False,
+        )
+
+    def _message(self, frame: can.Message) -> Message | None:
+        """Of the device; None if it is none."""
+        if not self._is_echo(frame):
+            self._passed(frame, is_rx=True)
+        if frame.is_error_frame:
+            self._note_error(frame)
+        elif frame.is_extended_id or frame.arbitration_id not in _OURS | _DEVICES or frame.is_remote_frame:
+            self._counted["frames_foreign"] += 1
+        elif frame.arbitration_id in _OURS:
+            self._note_echo(frame)
+        else:
+            packet = bytes((frame.arbitration_id,)) + frame.data
+            message = unpack_any(packet) if self.carries_blocks or not frame.is_fd else None
+            self._counted["frames_dropped"] += message is None
+            return message
+        return None
+
+    def _is_echo(self, frame: can.Message) -> bool:
+        """Whether the system shows it because we sent it; not all interfaces say so."""
+        if not frame.is_rx:
+            return True
+        if frame.arbitration_id not in _OURS or frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame:
+            return False
+        packet = bytes((frame.arbitration_id,)) + frame.data
+        return len(packet) > 1 and self._sent.get(packet[1]) == packet
+
+    def _note_echo(self, frame: can.Message) -> None:
+        """:raises LinkError: it is not one of ours."""
+        if not self._is_echo(frame):
+            raise LinkError(
+                f"{self.name}: somebody else speaks with the harness's identifiers (frame {frame.arbitration_id:#05x}"
+                f" with {frame.data.hex() or 'no data'}): another harness on the same bus?"
+            )
+
+    def _note_error(self, frame: can.Message) -> None:
+        self._counted["error_frames"] += 1
+        classes = frame.arbitration_id
+        self._last_error = ", ".join(word for bit, word in _WORDS.items() if classes & bit) or f"{classes:#x}"
+        controller = frame.data[1] if classes & CONTROLLER and len(frame.data) > 1 else 0
+        if classes & BUS_OFF:
+            self._enter_state("bus-off")
+        elif classes & RESTARTED or controller & ACTIVE:
+            self._state = ""
+        elif controller & PASSIVE:
+            self._enter_state("error-passive")
+        if controller & RECEIVE_OVERFLOW:
+            self._counted["receive_overflows"] += 1
+
+    def _enter_state(self, state: str) -> None:
+        self._state = state
+        self._counted[state.replace("-", "_")] += 1
+
+    def _passed(self, frame: can.Message, *, is_rx: bool) -> None:
+        if self.line is not None:
+            self.line_s += self.line.frame_s(frame)
+        for listener in self._listeners:
+            told = copy.copy(frame)
+            told.timestamp, told.is_rx = self.clock(), is_rx
+            listener(told)

@@ -1,0 +1,1 @@
+"""Our message catalogue: messages, conversation and exchange of samples."""

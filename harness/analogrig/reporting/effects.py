@@ -1,0 +1,115 @@
+"""The table "what matters at 12 bits" as text, plain values, and a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+from analogrig.storage import replacing
+from analogrig_emulator.effects import SAMPLES, Effect, measured_effects
+
+__all__ = ["as_json", "measure", "text", "write_picture"]
+
+Table = Mapping[str, Sequence[Effect]]
+"""Rows by parameter set; each set has the same rows."""
+
+_COLOURS = ("#2b6cb0", "#c05621")
+_LEAST_LSB, _MOST_LSB = 1e-3, 1e3
+
+
+def measure(sets: Sequence[str]) -> Table:
+    """The table for these parameter sets, the largest effect first."""
+    found = {name: list(measured_effects(name)) for name in sets}
+    largest = [max(row.median_lsb for row in rows) for rows in zip(*found.values(), strict=True)]
+    order = sorted(range(len(largest)), key=lambda i: -largest[i])
+    return {name: [rows[i] for i in order] for name, rows in found.items()}
+
+
+def as_json(table: Table) -> dict[str, Any]:
+    """The table in plain values, for machines."""
+    return {
+        "samples": SAMPLES,
+        "unit": "LSB (10 V / 4096)",
+        "sets": {
+            name: [
+                {
+                    "effect": row.name,
+                    "median_lsb": row.median_lsb,
+                    "largest_lsb": row.largest_lsb,
+                    "draws": row.draws,
+                }
+                for row in rows
+            ]
+            for name, rows in table.items()
+        },
+    }
+
+
+def text(table: Table) -> str:
+    """The table for people."""
+    lines = [
+        f"Largest change of the displacement over {SAMPLES} samples, in LSB of 12 bits over 10 V",
+        "(of what is drawn: the median over draws)",
+        "",
+        f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
+    ]
+    for rows in zip(*table.values(), strict=True):
+        figures = "".join(f"{_rounded(row.median_lsb):>10}" for row in rows)
+        lines.append(f"{rows[0].name:34}{figures}{rows[0].draws:>8}")
+    return "\n".join(lines)
+
+
+def _rounded(lsb: float) -> str:
+    return f"{lsb:.2g}" if lsb < 10 else f"{lsb:.0f}"
+
+
+def write_picture(table: Table, path: Path) -> None:
+    """Bars on a logarithmic scale, as SVG.
+
+    :raises RecordingError: it cannot be written.
+    """
+    with replacing(path) as file:
+        file.write(_svg(table).encode("utf-8"))
+
+
+def _svg(table: Table) -> str:
+    row_px, top_px = 10 * len(table) + 8, 56
+    names = [row.name for row in next(iter(table.values()))]
+    height = top_px + row_px * len(names) + 30
+    bottom = height - 24
+    font = 'font-family="sans-serif" font-size="12"'
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="760" height="{height}" {font}>',
+        f'<rect width="760" height="{height}" fill="white"/>',
+        '<text x="16" y="22" font-size="15">What matters at 12 bits: change of the displacement, in LSB</text>',
+    ]
+    for i, name in enumerate(table):
+        parts.append(f'<rect x="{250 + 90 * i}" y="32" width="10" height="10" fill="{_COLOURS[i]}"/>')
+        parts.append(f'<text x="{265 + 90 * i}" y="41">{escape(name)}</text>')
+    for decade in range(round(math.log10(_LEAST_LSB)), round(math.log10(_MOST_LSB)) + 1):
+        x, bold = _x_px(10.0**decade), decade == 0
+        parts.append(f'<path d="M{x:.1f} {top_px - 6}V{bottom - 8}" stroke="{"#888" if bold else "#ddd"}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{bottom + 8}" text-anchor="middle">{10.0**decade:g}</text>')
+    for k, name in enumerate(names):
+        y = top_px + row_px * k
+        parts.append(f'<text x="240" y="{y + row_px / 2:.1f}" text-anchor="end">{escape(name)}</text>')
+        parts += [_bar(rows[k], y + 10 * i, _COLOURS[i]) for i, rows in enumerate(table.values())]
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _bar(effect: Effect, y: float, colour: str) -> str:
+    left, right = _x_px(_LEAST_LSB), _x_px(effect.median_lsb)
+    return (
+        f'<rect x="{left:.1f}" y="{y}" width="{right - left:.1f}" height="9" fill="{colour}">'
+        f"<title>{escape(effect.name)}: {effect.median_lsb:.3g} LSB</title></rect>"
+        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_rounded(effect.median_lsb)}</text>'
+    )
+
+
+def _x_px(lsb: float) -> float:
+    """Where a figure stands on the logarithmic axis; what is smaller than its left end stands there."""
+    span = math.log10(_MOST_LSB / _LEAST_LSB)
+    return 250.0 + 460.0 * min(max(math.log10(max(lsb, _LEAST_LSB) / _LEAST_LSB) / span, 0.0), 1.0)

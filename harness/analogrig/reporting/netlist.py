@@ -1,0 +1,44 @@
+"""The emulated computer as a SPICE deck: what a rig and a scenario make of it, for any other simulator."""
+
+from __future__ import annotations
+
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.emulator import EmulatorRig, SetUp
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import Scenario
+from analogrig_emulator import TICKS_PER_SAMPLE, Deck
+from analogrig_emulator.suspension import SOURCE
+
+
+def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
+    """The circuit as the scenario sets it, with the components that the seed draws, its excitation and its tweaks.
+
+    :raises ConfigurationError: the scenario cannot be played on this rig, or the rig has no circuit.
+    """
+    if not isinstance(rig, EmulatorRig):
+        raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
+    setup = rig.set_up(scenario, seed)
+    rate_hz = setup.computer.sample_rate_hz
+    return Deck(
+        setup.computer.circuit,
+        samples=scenario.samples,
+        sample_rate_hz=rate_hz,
+        edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
+        turns=_turns(setup, scenario.samples),
+        title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
+    )
+
+
+def _turns(setup: SetUp, samples: int) -> list[tuple[int, dict[str, float]]]:
+    """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
+    dials = setup.computer.dials
+    turns: list[tuple[int, dict[str, float]]] = []
+    for sample, goals, ramp_n in setup.computer.planned(setup.tweaks, samples):
+        for k in range(min(ramp_n, samples - sample)):
+            part = (k + 0.5) / ramp_n
+            between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}
+            turns.append((sample + k, setup.computer.machine.resting(between)))
+        if sample + ramp_n < samples:
+            turns.append((sample + ramp_n, goals))
+        dials |= goals
+    return turns

@@ -1,0 +1,90 @@
+"""The page as a whole: template, styles, scripts and data joined into one file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+
+from analogrig.errors import RecordingError
+from analogrig.judging.verdict import Verdict
+from analogrig.reporting import tables
+from analogrig.reporting.payload import as_script, payload
+from analogrig.run import Run
+from analogrig.storage import replacing
+
+FOLDER = Path(__file__).parent
+STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
+"""Of every page with plots."""
+SCRIPTS = (FOLDER / "uPlot.iife.min.js", FOLDER / "plots.js")
+"""So too."""
+
+
+def write_report(run: Run, verdict: Verdict, path: Path) -> None:
+    """Write the page: either all of it or nothing. The same run gives the same bytes.
+
+    :raises RecordingError: the page cannot be written, or the build has not put uPlot in its place.
+    """
+    page = render(run, verdict)
+    with replacing(path) as file:
+        file.write(page.encode("utf-8", "replace"))
+
+
+def render(run: Run, verdict: Verdict) -> str:
+    """The page as text.
+
+    :raises RecordingError: the build has not put uPlot in its place.
+    """
+    return assembled(
+        FOLDER / "page.html",
+        STYLES,
+        (*SCRIPTS, FOLDER / "page.js"),
+        data=as_script(payload(run, verdict)),
+        title=tables.title(run, verdict),
+        outcome=tables.outcome(run, verdict),
+        conditions=tables.conditions(run, verdict),
+        tweaks=tables.tweaks(verdict),
+        diagnoses=tables.diagnoses(verdict),
+        false_alarms=tables.false_alarms(run, verdict),
+        estimates=tables.estimates(verdict),
+        settings=tables.settings(run),
+        period=tables.period(run),
+    )
+
+
+def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
+    """A page that needs nothing but itself: ``template`` with its styles, scripts and texts; ``title`` is escaped.
+
+    :raises RecordingError: the build has not put uPlot in its place.
+    """
+    style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
+    head = Template(_part(FOLDER / "head.html")).substitute(
+        title=title, policy=_policy(style, script), styles="\n".join(f"<style>{each}</style>" for each in style)
+    )
+    return Template(_part(template)).substitute(
+        texts,
+        head=head.rstrip("\n"),
+        licence=_part(FOLDER / "licence.html").rstrip("\n"),
+        scripts="\n".join(f"<script>{each}</script>" for each in script),
+    )
+
+
+def _policy(styles: list[str], scripts: list[str]) -> str:
+    """A content security policy under which nothing is loaded and only these very styles and scripts work."""
+    return f"default-src 'none'; style-src {_hashes(styles)}; script-src {_hashes(scripts)}"
+
+
+def _hashes(sources: list[str]) -> str:
+    digests = (hashlib.sha256(source.encode("utf-8")).digest() for source in sources)
+    return " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+
+
+def _part(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise RecordingError(f"no report without {path}: build it with make setup, or pip install -e .") from None
+    except OSError as error:
+        raise RecordingError(f"no report without {path}: {error.strerror or error}") from error

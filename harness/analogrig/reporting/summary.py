@@ -1,0 +1,120 @@
+"""A run and its verdict as a table for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from analogrig.judging.advice import advice
+from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
+from analogrig.links.bus_load import BusLoad, load_of
+from analogrig.plant import UNITS
+from analogrig.run import Run
+
+SHOWN_ALARMS = 10
+
+
+def summary(run: Run, verdict: Verdict) -> str:
+    """Several lines, without a final newline."""
+    conditions = run.conditions
+    head = (
+        f"{conditions.scenario['name']} on {conditions.rig['name']}, device {conditions.dut['name']}"
+        f" over {conditions.link}, seed {conditions.seed}: {verdict.outcome.upper()}"
+    )
+    lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
+    if verdict.tweaks:
+        lines += ["  sample  change                                       latency  bound  (samples)"]
+        lines += [line for tweak in verdict.tweaks for line in _tweak_lines(tweak)]
+    diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
+    if diagnoses:
+        lines += [
+            "",
+            "  sample  named    right  extent   error  said after  bound  onset off by  (samples)",
+            *diagnoses,
+        ]
+    lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
+    if verdict.doubtful_alarms:
+        at = ", ".join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))
+        lines += [f"  false or not, depending on when the changes came: alarms at {at}"]
+    if verdict.missing_n:
+        lines += [f"  {missing_text(run)}: {verdict.missing_n} samples"]
+    if verdict.overloads:
+        lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
+    if seen := line_text(conditions.link_counters):
+        lines += [f"  on the line: {seen}"]
+    load = load_of(run)
+    if load is not None:
+        lines += [f"  bus: {load_text(load)}"]
+    lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
+    lines += [_segment_line(segment) for segment in verdict.estimates]
+    lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
+    return "\n".join(lines)
+
+
+def line_text(link_counters: Mapping[str, int]) -> str:
+    """What was on the line besides the device's messages: ``12 frames foreign, 1 error frames``."""
+    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in link_counters.items() if n)
+
+
+def lamps_text(overloads: Mapping[str, int]) -> str:
+    """The lamps that lit, in order of time: ``U1 from sample 51``."""
+    in_order = sorted(overloads.items(), key=lambda lamp: (lamp[1], lamp[0]))
+    return ", ".join(f"{amplifier} from sample {sample}" for amplifier, sample in in_order) or "none"
+
+
+def load_text(load: BusLoad) -> str:
+    """What the exchange asks of its CAN bus."""
+    faster = "" if load.data_bitrate is None else f", data {load.data_bitrate} bit/s"
+    late = "" if load.latency_s is None else f", answers within {load.latency_s * 1e3:.3g} ms"
+    fits = load.utilisation <= 1.0
+    used = f"{load.utilisation:.1%} of it" if fits else f"{load.utilisation:.3g} times what it carries,"
+    return f"{load.bitrate} bit/s{faster}: {used} in real time{late}; at most {load.most_samples_per_s:.5g} samples/s"
+
+
+def _false_alarms(verdict: Verdict) -> str:
+    alarms = verdict.false_alarms
+    if not alarms:
+        return "none"
+    first = ", ".join(map(str, alarms[:SHOWN_ALARMS]))
+    return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
+
+
+def _tweak_lines(tweak: TweakVerdict) -> list[str]:
+    bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
+    change = _change(tweak.before, tweak.after)
+    out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]
+    low, high = tweak.between
+    if low < high:
+        out += [f"          between {low} and {high}, the likeliest instant is shown: {tweak.result}"]
+    return out
+
+
+def latency_text(tweak: TweakVerdict) -> str:
+    """``4``, ``1-9`` where the instant is not known better, ``missed``, or ``-``."""
+    if tweak.result in {"missed", "not judged"}:
+        return {"missed": "missed", "not judged": "unknown"}[tweak.result]
+    if tweak.latencies_n is None:
+        return "-"
+    return "-".join(map(str, dict.fromkeys(tweak.latencies_n)))
+
+
+def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
+    extent = "-" if diagnosis.extent is None else f"{diagnosis.extent:.3f}"
+    error = "-" if diagnosis.extent_error is None else f"{diagnosis.extent_error:+.1%}"
+    bound = "none" if diagnosis.bound_n is None else str(diagnosis.bound_n)
+    right = "yes" if diagnosis.right else "NO"
+    return (
+        f"  {sample:6}  {diagnosis.named:7}  {right:>5}  {extent:>6}  {error:>6}"
+        f"  {diagnosis.delay_n:10}  {bound:>5}  {diagnosis.onset_error_n:+12}"
+    )
+
+
+def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {before[name]:g} -> {after[name]:g} {UNITS[name]}" for name in before)
+
+
+def _segment_line(segment: SegmentEstimate) -> str:
+    cells = [
+        f"{'-' if segment.estimate is None else format(segment.estimate[name], '.5g'):>8}  {segment.truth[name]:<9.5g}"
+        for name in UNITS
+    ]
+    return f"  {segment.start:5}-{segment.end - 1:<6}" + "  ".join(cells)

@@ -1,0 +1,286 @@
+"""The words and tables of the page. Every text that may come from a file is escaped here, in ``_text``."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from analogrig.judging.advice import advice
+from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
+from analogrig.links.bus_load import load_of
+from analogrig.plant import PARAMETERS, UNITS
+from analogrig.reporting.summary import lamps_text, latency_text, load_text
+from analogrig.run import Run
+
+_MAX_FALSE_ALARMS = 20
+"""Rows of their table; the plots mark them all."""
+
+_SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
+
+_SENTENCES = {
+    "passed": "The device did what the scenario expects.",
+    "failed": "The device did not do what the scenario expects.",
+    "inconclusive": (
+        "This run is not valid. It says nothing about the device, neither good nor bad:"
+        " do not read what follows as a result."
+    ),
+}
+
+
+def title(run: Run, verdict: Verdict) -> str:
+    """Title of the document, escaped."""
+    return f"{_text(verdict.outcome.upper())}: {_what_ran(run)}"
+
+
+def outcome(run: Run, verdict: Verdict) -> str:
+    """The banner: the outcome in words, the reasons, and what else to know."""
+    notes = (f"Note: {sentence}." for sentence in advice(run, verdict))
+    reasons = "".join(f"<li>{_text(sentence)}</li>" for sentence in (*verdict.reasons, *notes))
+    return (
+        f'<section class="outcome {verdict.outcome}" aria-labelledby="outcome">'
+        f'<h1 id="outcome"><span class="sign" aria-hidden="true">{_SIGNS[verdict.outcome]}</span>'
+        f" {_text(verdict.outcome.upper())}<small>{_what_ran(run)}</small></h1>"
+        f"<p>{_SENTENCES[verdict.outcome]}</p>"
+        f"{f'<ul>{reasons}</ul>' if reasons else ''}"
+        f"{_tally(run, verdict)}</section>"
+    )
+
+
+def conditions(run: Run, verdict: Verdict) -> str:
+    """What ran, and where."""
+    ran = run.conditions
+    description = ran.scenario.get("description")
+    load = load_of(run)
+    rows = [
+        ("Scenario", f"{ran.scenario['name']}{f': {description}' if description else ''}"),
+        ("Rig", ran.rig["name"]),
+        ("Device", ran.dut["name"]),
+        ("Firmware", _pairs(ran.dut.get("identity", {})) or "unknown"),
+        ("Link", ran.link),
+        ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
+        ("Seed", ran.seed),
+        ("Samples", _samples(run, verdict)),
+        ("Overload lamps", lamps_text(verdict.overloads)),
+        ("Theta hash", verdict.theta_hash),
+    ]
+    return _table("What ran, and where", "", (_named(name, value) for name, value in rows), kind="pairs")
+
+
+def tweaks(verdict: Verdict) -> str:
+    """Each change of the plant, and how it was noticed."""
+    if not verdict.tweaks:
+        return "<p>The plant did not change in this run.</p>"
+    assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
+    caption = f"Latency and bound in samples from the change; {assumed}"
+    if any(tweak.others for tweak in verdict.tweaks):
+        caption += "; where the instant was learned from the samples, from the earliest to the latest"
+    head = _row(
+        [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
+    )
+    return _table(caption, head, (_tweak_row(tweak) for tweak in verdict.tweaks))
+
+
+def diagnoses(verdict: Verdict) -> str:
+    """What the device said had changed, against the truth."""
+    said = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
+    if not said:
+        return "<p>The device did not say what had changed.</p>"
+    caption = (
+        "What the device said had changed; samples from the change, and the bound is that of telling it from others"
+    )
+    numbers = ("Extent", "Error", "Said after", "Bound", "Onset off by")
+    head = _row([_head("Sample"), _head("Changed"), _head("Named"), *map(_number_head, numbers), _head("Result")])
+    return _table(caption, head, (_diagnosis_row(*each) for each in said))
+
+
+def false_alarms(run: Run, verdict: Verdict) -> str:
+    """Every alarm that belongs to no change."""
+    count = len(verdict.false_alarms)
+    if not count and verdict.doubtful_alarms:
+        at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
+        return f"<p>None for certain; depending on when the changes came the alarms at {at} are such.</p>"
+    if not count:
+        return f"<p>None in {run.samples:,} samples.</p>"
+    statistics = dict(zip(run.alarm_index.tolist(), run.alarm_statistic.tolist(), strict=True))
+    shown = verdict.false_alarms[:_MAX_FALSE_ALARMS]
+    caption = f"{count:,} in {run.samples:,} samples" + (
+        f"; the first {len(shown)} are listed" if count > len(shown) else ""
+    )
+    rows = (_row([_zoom(index), _number(statistics.get(index))]) for index in shown)
+    return _table(caption, _row([_head("Sample"), _number_head("Statistic")]), rows)
+
+
+def estimates(verdict: Verdict) -> str:
+    """M, B and K at the end of each segment, against the truth."""
+    if not verdict.estimates:
+        return "<p>The rig does not know the truth about its plant.</p>"
+    groups = [f'<th scope="colgroup" colspan="3">{name} [{_text(UNITS[name])}]</th>' for name in PARAMETERS]
+    columns = [_number_head(name) for name in ("estimate", "truth", "error")] * len(PARAMETERS)
+    head = _row(['<th scope="col" rowspan="2">Samples</th>', *groups]) + _row(columns)
+    rows = (_segment_row(segment) for segment in verdict.estimates)
+    return _table("The estimate after the last sample of each segment", head, rows)
+
+
+def settings(run: Run) -> str:
+    """Everything that was set and counted, as it stands in the recording."""
+    ran = run.conditions
+    channels = {name: vars(channel) for name, channel in ran.channels.items()}
+    everything = {
+        "scenario": ran.scenario,
+        "rig": ran.rig,
+        "device": ran.dut,
+        "channel": channels,
+        "counter": ran.counters,
+    }
+    rows = (_named(key, value) for key, value in _flat(everything))
+    return _table("As recorded", "", rows, kind="pairs")
+
+
+def period(run: Run) -> str:
+    """How long one sample is."""
+    ran = run.conditions
+    problem_ms, machine_us = ran.sample_period_problem_s * 1e3, ran.sample_period_s * 1e6
+    return _text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
+
+
+def _what_ran(run: Run) -> str:
+    ran = run.conditions
+    return f"{_text(ran.scenario['name'])} on {_text(ran.rig['name'])}, device {_text(ran.dut['name'])}"
+
+
+def _tally(run: Run, verdict: Verdict) -> str:
+    """The figures in one sentence; none for a run that is not valid, since they would read like a result."""
+    if not verdict.valid:
+        return ""
+    noticed = sum(tweak.result in {"noticed", "late"} for tweak in verdict.tweaks)
+    count = len(verdict.tweaks)
+    changes = f"{noticed} of {_plural(count, 'change')} noticed" if count else "No change to notice"
+    false = _plural(len(verdict.false_alarms), "false alarm")
+    return f"<p>{changes}, {false}, in {_plural(run.samples, 'sample')}.</p>"
+
+
+def _plural(count: int, noun: str) -> str:
+    number = f"{count:,}" if count else "no"
+    return f"{number} {noun}{'' if count == 1 else 's'}"
+
+
+def _samples(run: Run, verdict: Verdict) -> str:
+    asked = run.conditions.samples_asked
+    played = f"{run.samples:,}" if run.samples == asked else f"{run.samples:,} of {asked:,} asked"
+    return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
+
+
+def _tweak_row(tweak: TweakVerdict) -> str:
+    change = ", ".join(
+        f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
+    )
+    exact = not tweak.others and tweak.latency_n is not None and tweak.bound_n
+    ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
+    word, kind = _result(tweak)
+    low, high = tweak.between
+    instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
+    cells = [instant, _cell(change, "text"), f"<td class='number'>{_latency(tweak)}</td>", _number(tweak.bound_n)]
+    return _row([*cells, _number(ratio, ".2f"), _cell(word, f"text {kind}")])
+
+
+def _diagnosis_row(tweak: TweakVerdict, diagnosis: DiagnosisVerdict) -> str:
+    word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
+    cells = [f'<th scope="row">{tweak.sample}</th>', _cell(tweak.what, "text"), _cell(diagnosis.named, "text")]
+    cells += [_number(diagnosis.extent, ".3f"), _number(diagnosis.extent_error, "+.1%")]
+    cells += [_number(diagnosis.delay_n), _number(diagnosis.bound_n), _number(diagnosis.onset_error_n, "+d")]
+    return _row([*cells, _cell(word, f"text {kind}")])
+
+
+def _latency(tweak: TweakVerdict) -> str:
+    return "–" if tweak.latencies_n is None else _text(latency_text(tweak)).replace("-", "–")
+
+
+def _result(tweak: TweakVerdict) -> tuple[str, str]:
+    """A word and a class of the style."""
+    return {
+        "missed": ("✗ MISSED", "bad"),
+        "late": (f"✗ LATE, after {tweak.deadline_n}", "bad"),
+        "unseeable": ("could not be seen", "neutral"),
+        "undecided": ("? depends on when it came", "neutral"),
+        "not judged": ("? not judged: not found in the samples", "neutral"),
+        "noticed": ("✓ noticed", "good"),
+    }[tweak.result]
+
+
+def _segment_row(segment: SegmentEstimate) -> str:
+    cells = [_zoom(segment.start, segment.end - 1)]
+    for name in PARAMETERS:
+        estimate = None if segment.estimate is None else segment.estimate[name]
+        cells += [_number(estimate, ".5g"), _number(segment.truth[name], ".6g"), _number(_error(segment, name), "+.2%")]
+    return _row(cells)
+
+
+def _error(segment: SegmentEstimate, name: str) -> float | None:
+    """Relative, to a hundredth of a percent; never a negative zero."""
+    error = segment.error.get(name)
+    return None if error is None else round(error, 4) + 0.0
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """``a.b.c`` and value of everything in nested tables."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
+            yield from _flat({str(i): item for i, item in enumerate(value)}, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _pairs(table: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key.replace('_', ' ')} {_shown(key, value)}" for key, value in table.items())
+
+
+def _shown(key: str, value: object) -> str:
+    """Hashes and nonces as people compare them."""
+    return f"{value:#010x}" if isinstance(value, int) and key.endswith(("hash", "nonce")) else str(value)
+
+
+def _table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers") -> str:
+    """``head`` and ``rows`` are finished rows; ``kind`` is a class of the style."""
+    return (
+        f'<div class="scroll"><table class="{kind}"><caption>{_text(caption)}</caption>'
+        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _head(name: str) -> str:
+    return f'<th scope="col">{_text(name)}</th>'
+
+
+def _number_head(name: str) -> str:
+    return f'<th scope="col" class="number">{_text(name)}</th>'
+
+
+def _named(name: str, value: object) -> str:
+    return _row([f'<th scope="row">{_text(name)}</th>', _cell(value, "text")])
+
+
+def _cell(value: object, kind: str) -> str:
+    return f'<td class="{kind}">{_text(value)}</td>'
+
+
+def _number(value: float | None, form: str = ".4g") -> str:
+    return f"<td class='number'>{'–' if value is None else _text(format(value, form))}</td>"
+
+
+def _zoom(first: int, last: int | None = None) -> str:
+    """A heading of a row that takes the plots to these samples."""
+    shown = str(first) if last is None else f"{first}–{last}"
+    until = "" if last is None else f' data-last="{last}"'
+    goal = f'data-first="{first}"{until}'
+    return f'<th scope="row"><button type="button" {goal} title="Show in the plots">{shown}</button></th>'
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value))

@@ -1,0 +1,102 @@
+"""Rigs by name: a shipped or own description, a table of a rigs file, or a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.hardware.real import RealRig
+from analogrig.hardware.wiring import RealDescription
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors
+from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.rig import Rig
+
+DEFAULT_RIG = "emulator"
+"""When neither the user nor the scenario says another."""
+
+RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
+"""The rigs of a laboratory: the file that the variable names, else that of the folder one is in."""
+
+
+def open_rig(name: str, *, self_test: bool = True) -> Rig:
+    """The rig of a shipped or own description, of a table ``[rig.NAME]`` of a rigs file, or ``recording:FILE``.
+
+    A name stands for a table of the file that ANALOGRIG_RIGS names, of rigs.toml in this folder, or for a shipped rig,
+    in this order; FILE.toml for a rig that is described there, and FILE.toml:NAME for one of several.
+
+    :param self_test: False: no rig tests itself before it plays, whatever its description says.
+    :raises ConfigurationError: there is none, or its description is wrong.
+    :raises RecordingError: the recording cannot be read.
+    """
+    kind, _, rest = name.partition(":")
+    if kind == "recording" and rest:
+        return RecordingRig.open(Path(rest))
+    table, where = described(name)
+    if table.get("kind", "emulator") == "real":
+        description = config.build(RealDescription, table, where)
+        try:
+            return RealRig(dataclasses.replace(description, self_test=description.self_test and self_test))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+    emulated = config.build(EmulatorDescription, table, where)
+    with emulator_errors(f"{where}: "):
+        return EmulatorRig(emulated)
+
+
+def described(name: str) -> tuple[Mapping[str, Any], str]:
+    """The table that describes the rig ``name``, its name included, and where it is.
+
+    :raises ConfigurationError: there is none.
+    """
+    file, _, wanted = name.rpartition(":")
+    if file.endswith(".toml"):
+        return _one_of(Path(file), config.read_toml(config.locate("rigs", file)), wanted)
+    own = _rigs_file()
+    if own is not None and "/" not in name and not name.endswith(".toml"):
+        table = config.read_toml(own)
+        if name in _named(own, table):
+            return _one_of(own, table, name)
+        if name not in config.names("rigs"):
+            there = ", ".join([*_named(own, table), *config.names("rigs")])
+            raise ConfigurationError(f"no rig is called {name!r} in {own}, nor is one shipped: there are {there}")
+    path = config.locate("rigs", name)
+    table = config.read_toml(path)
+    return _one_of(path, table, None) if "rig" in table else ({"name": path.stem, **table}, str(path))
+
+
+def _rigs_file() -> Path | None:
+    """:raises ConfigurationError: the one that the environment names is not there."""
+    if named := os.environ.get(RIGS_VARIABLE):
+        if not Path(named).is_file():
+            raise ConfigurationError(f"{RIGS_VARIABLE}: {named}: no such file")
+        return Path(named)
+    return Path(RIGS_FILE) if Path(RIGS_FILE).is_file() else None
+
+
+def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The rigs of a rigs file by name.
+
+    :raises ConfigurationError: it is none.
+    """
+    rigs = table.get("rig")
+    if not isinstance(rigs, dict) or not rigs or not all(isinstance(each, dict) for each in rigs.values()):
+        raise ConfigurationError(f"{path}: has no tables [rig.NAME]")
+    for key in table:
+        if key != "rig":
+            raise ConfigurationError(f"{path}: unknown key {key!r} beside the tables [rig.NAME]")
+    return rigs
+
+
+def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> tuple[Mapping[str, Any], str]:
+    rigs = _named(path, table)
+    if wanted is None and len(rigs) > 1:
+        raise ConfigurationError(f"{path}: holds {len(rigs)} rigs: say {path}:NAME, one of {', '.join(rigs)}")
+    name = wanted or next(iter(rigs))
+    if name not in rigs:
+        raise ConfigurationError(f"{path}: holds no rig {name!r}: there are {', '.join(rigs)}")
+    return {"name": name, **rigs[name]}, f"{path}: rig.{name}"

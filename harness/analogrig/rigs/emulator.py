@@ -1,0 +1,451 @@
+"""The emulated analogue computer and its card, as a rig; its description."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import enum
+import functools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import AnalogrigError, ConfigurationError, RigError
+from analogrig.plant import Plant
+from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
+from analogrig.run import CHANNELS, Channel, Segment
+from analogrig.scenario import Scenario
+from analogrig_emulator import (
+    CARDS,
+    COMPONENTS,
+    IDEAL,
+    OP_AMP_GRADES,
+    PROGRAMS,
+    Capacitor,
+    Card,
+    Components,
+    EmulatorError,
+    Excitation,
+    NoisySuspension,
+    OpAmp,
+    OpAmpGrade,
+    Pot,
+    RampedTweak,
+    RepeatedPlay,
+    Resistor,
+    Sampler,
+    SuspensionComputer,
+    acquired,
+    drawn_offsets_v,
+    is_repeatable,
+    probes_per_sample,
+)
+from analogrig_emulator.opamp import preset
+
+MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
+MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5
+MOST_DEVIATION = 0.9
+
+
+@dataclass(frozen=True)
+class MeasuredValues:
+    """The ``[computer.values]`` table: one machine as it was measured, by the names of its elements.
+
+    What is not named is as the diagram and the amplifiers' datasheet say; nothing is drawn. ``analogrig calibrate``
+    writes it.
+    """
+
+    deviation: Mapping[str, float] = field(default_factory=dict)
+    """Of a resistor, capacitor or track of a pot from the diagram's value, a fraction."""
+    offset_v: Mapping[str, float] = field(default_factory=dict)
+    """Of an amplifier."""
+    bandwidth: Mapping[str, float] = field(default_factory=dict)
+    """By which fraction an amplifier's is more than the model's."""
+    slew: Mapping[str, float] = field(default_factory=dict)
+    """Likewise."""
+
+    def __post_init__(self) -> None:
+        parts, amplifiers = _element_names()
+        for table, known, most in (
+            ("deviation", parts, MOST_DEVIATION),
+            ("offset_v", amplifiers, MOST_OFFSET_V),
+            ("bandwidth", amplifiers, MOST_DEVIATION),
+            ("slew", amplifiers, MOST_DEVIATION),
+        ):
+            for name, value in getattr(self, table).items():
+                if name not in known:
+                    raise ValueError(f"{table}: unknown key {name!r} (known: {', '.join(known)})")
+                if not abs(value) <= most:
+                    raise ValueError(f"{table}.{name} must be within +-{most:g}, not {value:g}")
+
+    def put_in(self, stock: Components) -> Components:
+        """The machine, of components that are otherwise those of the stock."""
+        given = {**self.deviation, **self.offset_v}
+        return dataclasses.replace(stock.undrawn(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew)
+
+
+@functools.cache
+def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Of the resistors, capacitors and pots, and of the amplifiers, of all programs, in the order of their diagrams."""
+    elements = [each for program in PROGRAMS.values() for each in program.netlist([IDEAL] * program.amplifiers)]
+    parts = dict.fromkeys(each.name for each in elements if isinstance(each, Resistor | Capacitor | Pot))
+    return tuple(parts), tuple(dict.fromkeys(each.name for each in elements if isinstance(each, OpAmp)))
+
+
+@dataclass(frozen=True)
+class ComputerDescription:
+    """The ``[computer]`` table: what the machine is built of, and how warm and old that is."""
+
+    op_amp: str = "tl07x"
+    offset_v: float = 0.0
+    """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
+    components: Literal["nominal", "polyester", "polypropylene"] = "nominal"
+    """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
+    specimen: int | None = None
+    """The seed from which the machine is drawn, whatever that of a run: all runs are of the same machine then."""
+    pots: Literal["coefficient", "dial"] = "coefficient"
+    """To what they are set: to the coefficient, read under the real load (pot-set mode), or to the dial at which those
+    of a nominal machine would pass it (digital pots)."""
+    values: MeasuredValues | None = None
+    """What was measured of the machine; then nothing of it is drawn."""
+    temperature_c: float = 25.0
+    age_h: float = 0.0
+    wiper_noise_ohm: float = 0.0
+    """By how much the resistance of a wiper rises at most while its pot is turned (``ramp_n``)."""
+    noise: bool = False
+    """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
+
+    def fitted(self, seed: int) -> Components:
+        """The components of the machine: as measured, or those that the seed gives.
+
+        :raises CircuitError: a value is out of range.
+        """
+        stock = dataclasses.replace(
+            COMPONENTS[self.components], temperature_c=self.temperature_c, age_h=self.age_h, seed=seed
+        )
+        if self.wiper_noise_ohm:
+            stock = dataclasses.replace(
+                stock, pots=dataclasses.replace(stock.pots, wiper_noise_ohm=self.wiper_noise_ohm)
+            )
+        graded = self.components != "nominal" and self.op_amp in OP_AMP_GRADES
+        stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
+        return stock if self.values is None else self.values.put_in(stock)
+
+    def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+        """The machine that the seed of a run gives, wired as a program, its pots as that has them.
+
+        :raises EmulatorError: it cannot be.
+        """
+        specimen = seed if self.specimen is None else self.specimen
+        return SuspensionComputer(
+            program,
+            opamp=preset(self.op_amp),
+            rng=Stream.COMPONENTS.generator(specimen),
+            offset_v=self.offset_v,
+            components=self.fitted(specimen),
+            sample_rate_hz=sample_rate_hz,
+        )
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
+            raise ValueError(f"offset_v must be 0 to {MOST_OFFSET_V:g}, not {self.offset_v:g}")
+        if self.specimen is not None and self.specimen < 0:
+            raise ValueError(f"specimen must be 0 to 2^63 - 1, not {self.specimen}")
+        if self.values is not None and (self.offset_v or self.specimen is not None):
+            raise ValueError("offset_v and specimen are for what is drawn: with values nothing is")
+
+
+@dataclass(frozen=True)
+class CardDescription:
+    """The ``[card]`` table. ``range_v`` gives the ends of each channel's range, by the channel's name."""
+
+    range_v: Mapping[str, tuple[float, float]]
+    bits: int = 12
+    rate_hz: float = 20e3
+    noise_lsb: float | Mapping[str, float] | None = None
+    """rms before quantisation, on every channel or by the channel's name; that of the model when it is not given."""
+    model: Literal["ideal", "dt2821", "skewed"] = "ideal"
+    faults: Mapping[str, Any] = field(default_factory=dict)
+    """Fields of ``analogrig_emulator.Card`` that differ from the model's: ``skew_s``, ``stuck_high``,
+    ``clock_drift_ppm``, ..."""
+
+    def __post_init__(self) -> None:
+        known = {field.name for field in dataclasses.fields(Card)} - {"bits", "rate_hz", "ranges_v", "noise_lsb"}
+        for fault in self.faults:
+            if fault not in known:
+                raise ValueError(f"faults: unknown key {fault!r} (known: {', '.join(sorted(known))})")
+        if set(self.range_v) != set(CHANNELS):
+            raise ValueError(f"range_v must give the channels {', '.join(CHANNELS)}, not {', '.join(self.range_v)}")
+        for name, (low, high) in self.range_v.items():
+            if not -MOST_VOLTS <= low < high <= MOST_VOLTS or high - low < LEAST_SPAN_V:
+                raise ValueError(
+                    f"range_v.{name} must be (low, high) within +-{MOST_VOLTS:g} V, not ({low:g}, {high:g})"
+                )
+        if not 1.0 <= self.rate_hz <= MOST_RATE_HZ:
+            raise ValueError(f"rate_hz must be 1 to {MOST_RATE_HZ:g}, not {self.rate_hz:g}")
+        if isinstance(self.noise_lsb, Mapping) and set(self.noise_lsb) != set(CHANNELS):
+            raise ValueError(f"noise_lsb must give the channels {', '.join(CHANNELS)}, not {', '.join(self.noise_lsb)}")
+        for noise_lsb in self._noises_lsb() or ():
+            if not 0.0 <= noise_lsb <= MOST_NOISE_LSB:
+                raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {noise_lsb:g}")
+
+    def _noises_lsb(self) -> tuple[float, ...] | None:
+        """Of each channel, if given."""
+        if isinstance(self.noise_lsb, Mapping):
+            return tuple(self.noise_lsb[channel] for channel in CHANNELS)
+        return None if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS)
+
+    def card(self) -> Card:
+        """:raises SamplerError: a value is out of range.
+        :raises ConfigurationError: a fault is of the wrong type.
+        """
+        model = CARDS[self.model]
+        noises_lsb = self._noises_lsb()
+        fields: dict[str, Any] = {
+            "bits": self.bits,
+            "rate_hz": self.rate_hz,
+            "ranges_v": tuple(self.range_v[channel] for channel in CHANNELS),
+            "noise_lsb": model.noise_lsb if noises_lsb is None else noises_lsb,
+        }
+        fields |= {name: tuple(value) if isinstance(value, list) else value for name, value in self.faults.items()}
+        try:
+            return dataclasses.replace(model, **fields)
+        except TypeError as error:
+            raise ConfigurationError(f"card: faults: {error}") from error
+
+
+@dataclass(frozen=True)
+class EmulatorDescription:
+    """``fixtures/rigs/*.toml``, or a user's own file."""
+
+    card: CardDescription
+    kind: Literal["emulator"] = "emulator"
+    computer: ComputerDescription = field(default_factory=ComputerDescription)
+    description: str = ""
+    name: str = ""
+
+
+class Stream(enum.IntEnum):
+    """Independent streams of random numbers that one seed gives: to draw more of one changes none of the others."""
+
+    EXCITATION = 0
+    COMPONENTS = 1
+    CARD = 2
+    APERTURE = 3
+    NOISE = 4
+
+    def generator(self, seed: int) -> np.random.Generator:
+        return np.random.default_rng([seed, int(self)])
+
+
+class SetUp(NamedTuple):
+    """A computer, and what is to be played on it."""
+
+    computer: SuspensionComputer
+    excitation: Excitation
+    tweaks: tuple[RampedTweak, ...]
+
+
+class _Prepared(NamedTuple):
+    """What the plays of one scenario share, whatever the seed."""
+
+    scenario: Scenario
+    computer: SuspensionComputer
+    play: RepeatedPlay | None
+    """None where more than offsets and phase depends on the seed."""
+    channels: Mapping[str, Channel]
+    segments: tuple[Segment, ...]
+
+    def serves(self, scenario: Scenario) -> bool:
+        """Whether another scenario differs in nothing that was worked out."""
+        own = self.scenario
+        return scenario is own or (
+            (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
+            == (own.samples, own.plant, own.tweaks, own.excitation)
+        )
+
+
+class EmulatorRig:
+    """The emulated analogue computer and its card."""
+
+    capabilities = frozenset({"tweak", "excite"})
+
+    def __init__(self, description: EmulatorDescription) -> None:
+        """:raises EmulatorError: the card or the amplifiers cannot be."""
+        self._description = description
+        self._card = description.card.card()
+        self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
+        self._last_prepared: _Prepared | None = None
+
+    def description(self) -> Mapping[str, Any]:
+        return dataclasses.asdict(self._description)
+
+    @property
+    def force_zero(self) -> float:
+        """The code of no force; it may lie outside the range."""
+        channel = CHANNELS.index("force")
+        return -self._card.ranges_v[channel][0] / float(self._card.lsb_v[channel])
+
+    def sampler(self, rng: np.random.Generator) -> Sampler:
+        """Its card, with noise of its own: to convert once more what the circuit has played."""
+        return Sampler(self._card, rng)
+
+    def set_up(self, scenario: Scenario, seed: int) -> SetUp:
+        """The machine as the scenario starts it, and what will be played on it.
+
+        :raises ConfigurationError: the scenario cannot be played on this rig.
+        """
+        with emulator_errors(f"scenario {scenario.name}: "):
+            computer = self._computer(scenario, seed)
+            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+        tweaks: list[RampedTweak] = []
+        for i, tweak in enumerate(scenario.tweaks):
+            with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
+                settings = self._settings(computer, tweak.given())
+                computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
+            tweaks.append((tweak.sample, settings, tweak.ramp_n))
+        return SetUp(computer, excitation, tuple(tweaks))
+
+    def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
+        """As Rig.perform; the length of the blocks changes nothing but speed.
+
+        What a scenario that fits in one block needs is prepared once for all seeds.
+        """
+        if scenario.samples <= block_samples:
+            prepared = self._prepared(scenario, seed)
+            if prepared.play is not None:
+                return self._repeated(prepared, prepared.play, scenario, seed)
+        computer, excitation, tweaks = self.set_up(scenario, seed)
+        with emulator_errors(f"scenario {scenario.name}: "):
+            machine = self._noisy(computer, seed) if self._description.computer.noise else computer
+            jitter = Stream.APERTURE.generator(seed)
+            volts = acquired(
+                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
+            )
+        return Performance(
+            sample_period_s=1.0 / self._card.rate_hz,
+            time_scale=computer.scales.time,
+            channels=self._channels(computer),
+            blocks=_sampled(volts, self.sampler(Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight(
+                scenario.segments(), _lit(computer.machine.lamps, probes_per_sample(self._card))
+            ),
+        )
+
+    def _prepared(self, scenario: Scenario, seed: int) -> _Prepared:
+        """The last one, if it serves."""
+        if self._last_prepared is None or not self._last_prepared.serves(scenario):
+            computer, excitation, tweaks = self.set_up(scenario, seed)
+            with emulator_errors(f"scenario {scenario.name}: "):
+                excitation.edges(0, 1, computer.sample_rate_hz)
+                able = self._draws_offsets_alone and is_repeatable(computer, tweaks)
+                play = RepeatedPlay(computer, scenario.samples, tweaks) if able else None
+            self._last_prepared = _Prepared(scenario, computer, play, self._channels(computer), scenario.segments())
+        return self._last_prepared
+
+    @property
+    def _draws_offsets_alone(self) -> bool:
+        drawn, card = self._description.computer, self._card
+        is_nominal = drawn.components == "nominal" and not drawn.wiper_noise_ohm and not drawn.noise
+        is_nominal &= drawn.specimen is None and drawn.values is None
+        return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
+
+    def _repeated(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
+        count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
+        offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
+        excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+        lit: dict[str, int] = {}
+
+        def volts() -> Iterator[NDArray[np.float64]]:
+            repeat = play.play(excitation, offsets_v)
+            lit.update(_lit(repeat.lamps, 1))
+            yield repeat.volts
+
+        return Performance(
+            sample_period_s=1.0 / self._card.rate_hz,
+            time_scale=prepared.computer.scales.time,
+            channels=prepared.channels,
+            blocks=_sampled(volts(), self.sampler(Stream.CARD.generator(seed))),
+            hindsight=lambda: Hindsight(prepared.segments, lit),
+        )
+
+    def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
+        rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
+        computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
+        start = settings_of(computer, scenario.plant.given())
+        computer.set(**self._turned({**computer.program.values, **start}, scenario.plant.set))
+        return computer
+
+    def _settings(self, computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+        return self._turned(settings_of(computer, given), computer.program.name)
+
+    def _turned(self, settings: dict[str, float], program: str) -> dict[str, float]:
+        """What an operator turns the pots to who wants those settings."""
+        if self._description.computer.pots == "coefficient":
+            return settings
+        dials = _nominal(program).dials_for(**settings)
+        return {f"{pot}_dial": dial for pot, dial in dials.items()}
+
+    def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
+        drawn = self._description.computer
+        grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
+        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c)
+
+    def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
+        return {
+            name: Channel(
+                low_v=self._card.ranges_v[i][0],
+                lsb_v=float(self._card.lsb_v[i]),
+                unit=CHANNEL_UNITS[name],
+                unit_per_v=1.0 / computer.scales.volts(name),
+                noise_lsb=self._card.noise_lsb[i],
+                codes=1 << self._card.bits,
+            )
+            for i, name in enumerate(CHANNELS)
+        }
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
+    """Lamps that are lit, with the card's sample; the machine takes `probes` for each of those."""
+    return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
+
+
+def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
+    first = 0
+    with emulator_errors(as_error=RigError):
+        for block in volts:
+            codes, clipped = sampler.sample(block)
+            yield Block(first, block, codes, clipped)
+            first += len(block)
+
+
+@contextlib.contextmanager
+def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = ConfigurationError) -> Iterator[None]:
+    """What the emulator raises becomes an error of the harness, here and nowhere else."""
+    try:
+        yield
+    except EmulatorError as error:
+        raise as_error(f"{prefix}{error}") from error
+
+
+@functools.cache
+def _nominal(program: str) -> SuspensionComputer:
+    """To be asked for dials, and never played."""
+    return SuspensionComputer(program, opamp="ideal")
+
+
+def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
+    """The scenario's names of the parameters as the program has them."""
+    names = {
+        field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
+    }
+    return {names[name]: value for name, value in given.items()}

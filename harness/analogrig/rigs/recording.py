@@ -1,0 +1,84 @@
+"""A recorded run, played again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
+from analogrig.run import CHANNELS, Run
+from analogrig.scenario import Scenario
+
+
+class RecordingRig:
+    """A recorded run, played again; it knows one scenario, its own."""
+
+    capabilities: frozenset[str] = frozenset()
+
+    def __init__(self, run: Run, path: Path) -> None:
+        self.run = run
+        self.path = path
+        self._name = f"recording:{path}"
+
+    @classmethod
+    def open(cls, path: Path) -> RecordingRig:
+        """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
+        return cls.of(Run.load(path), path)
+
+    @classmethod
+    def of(cls, run: Run, path: Path) -> RecordingRig:
+        """As ``open``, of what was read from ``path``."""
+        if run.samples == 0:
+            raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
+        return cls(run, path)
+
+    def description(self) -> Mapping[str, Any]:
+        return {**self.run.conditions.rig, "name": self._name}
+
+    def scenario(self) -> Scenario:
+        """The scenario that was recorded. If the recording ended before its time, so does what is played of it: its run
+        is then not valid either."""
+        scenario = Scenario.from_table(self.run.conditions.scenario, self._name)
+        return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked)
+
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        conditions = self.run.conditions
+        if scenario != self.scenario():
+            raise ConfigurationError(f"{self._name}: holds the scenario {self.scenario().name!r} and can play no other")
+        if seed != conditions.seed:
+            raise ConfigurationError(f"{self._name}: was recorded with seed {conditions.seed}, not {seed}")
+        return Performance(
+            conditions.sample_period_s,
+            conditions.time_scale,
+            conditions.channels,
+            self._blocks(),
+            hindsight=lambda: Hindsight(conditions.segments, conditions.overloads),
+        )
+
+    def _blocks(self) -> Iterator[Block]:
+        for record, (start, end) in enumerate(self.run.records):
+            for first in range(start, end, BLOCK_SAMPLES):
+                samples = slice(first, min(first + BLOCK_SAMPLES, end))
+                codes = self.run.codes[samples]
+                yield Block(first, self._volts(codes), codes, self.run.clipped[samples], record)
+
+    def _volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """(n, 4), of codes of that shape."""
+        channels = self.run.conditions.channels
+        unmeasured = np.full(len(codes), np.nan)
+        volts = [
+            channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(CHANNELS)
+        ]
+        return np.stack(volts, axis=1)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass

@@ -1,0 +1,251 @@
+"""A scenario: what is played to the plant, and when its pots are tweaked. The device never sees the tweaks."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from analogrig import config
+from analogrig.plant import Plant
+from analogrig.run import Segment
+from analogrig_emulator.excitation import Excitation
+from analogrig_emulator.suspension import PROGRAMS
+
+MAX_RAMP_N = 100_000
+
+DEFAULT_SEED = 1995
+"""When neither the user nor the scenario says another."""
+
+_MASS_DAMPER_SPRING = ("front", "shock")
+"""The programs that are one, which is what the harness's plant, its bounds and its estimates describe."""
+
+PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
+"""The parameters with which each program of the computer starts."""
+
+MOST_SEED = 2**63
+
+MAX_SAMPLES = 10_000_000
+"""A run is kept in memory, some 70 bytes a sample."""
+
+Limit = bool | int | float | str
+"""Of a statement."""
+
+MISSING = "clipped and missing for the device"
+"""What the samples are that count as missing."""
+
+
+@dataclass(frozen=True)
+class PlantChoice:
+    """The program on the computer and where its pots stand at the start."""
+
+    set: Literal["front", "shock", "bump-stop", "two-mass"] = "front"
+    mass_kg: float | None = None
+    damping_n_s_per_m: float | None = None
+    stiffness_n_per_m: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive(self)
+
+    def given(self) -> dict[str, float]:
+        """The parameters that do not stand where the set has them, under their names in Plant."""
+        return _given(self)
+
+    def plant(self) -> Plant:
+        return _changed(PLANTS[self.set], self)
+
+
+@dataclass(frozen=True)
+class Tweak:
+    """Pots that jump at the instant of one sample; the next sample is the first that can tell.
+
+    With ramp_n they turn evenly from that instant on, and arrive ramp_n samples later.
+    """
+
+    sample: int
+    mass_kg: float | None = None
+    damping_n_s_per_m: float | None = None
+    stiffness_n_per_m: float | None = None
+    ramp_n: int = 0
+
+    def __post_init__(self) -> None:
+        _check_positive(self)
+        if self.sample < 1:
+            raise ValueError(f"sample must be at least 1, not {self.sample}")
+        if not 0 <= self.ramp_n <= MAX_RAMP_N:
+            raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
+        if not _given(self):
+            raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
+
+    def given(self) -> dict[str, float]:
+        """The parameters it sets, under their names in Plant."""
+        return _given(self)
+
+
+@dataclass(frozen=True)
+class Expectations:
+    """What a scenario asks of the device; its ``[expect]`` table."""
+
+    missed: int = 0
+    """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
+    false_alarms: int = 0
+    """At most so many in the whole run."""
+    arl0: float = 1e5
+    """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
+    late_information_ratio: float = 4.0
+    """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
+    late_slack_n: int = 15
+    """... so many samples ago."""
+    max_missing_fraction: float = 0.25
+    """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
+
+    def __post_init__(self) -> None:
+        if not self.arl0 > 1.0:
+            raise ValueError(f"arl0 must be more than 1 sample, not {self.arl0:g}")
+        if not self.late_information_ratio >= 1.0:
+            raise ValueError(f"late_information_ratio must be at least 1, not {self.late_information_ratio:g}")
+        if not 0.0 <= self.max_missing_fraction <= 1.0:
+            raise ValueError(f"max_missing_fraction must be in 0 .. 1, not {self.max_missing_fraction:g}")
+        for name in ("missed", "false_alarms", "late_slack_n"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative")
+
+    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+        """Why a run of which so many samples were missing is not valid; empty if it is."""
+        if missing <= self.max_missing_fraction * samples:
+            return []
+        allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
+        return [f"{missing} of {samples} samples were {words}, {allowed}"]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The ``[statement]`` table of a scenario: what a test asserted of it, and did not find."""
+
+    name: str
+    limits: Mapping[str, Limit] = field(default_factory=dict)
+    """By which it judged."""
+    tries: int = 1
+    """Seeds, one after the other, with one of which it must hold; an experiment has its own."""
+    test: str = ""
+    """That asserted it; for people."""
+
+    def __post_init__(self) -> None:
+        if self.tries < 1:
+            raise ValueError(f"tries must be at least 1, not {self.tries}")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """``fixtures/scenarios/*.toml``, or a user's own file."""
+
+    samples: int
+    excitation: Excitation
+    plant: PlantChoice = field(default_factory=PlantChoice)
+    tweaks: tuple[Tweak, ...] = ()
+    expect: Expectations = field(default_factory=Expectations)
+    random_phase: bool = False
+    """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
+    seed: int | None = None
+    """Of all that is random, unless the user says another."""
+    rig: str = ""
+    """The rig that plays it, unless the user says another; a .toml file is meant from the scenario's own folder."""
+    dut: str = ""
+    """The device that it is for, likewise."""
+    statement: Statement | None = None
+    """What a test asserted of it, and did not find; None: what is expected is what counts."""
+    description: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.seed is not None and not 0 <= self.seed < MOST_SEED:
+            raise ValueError(f"seed must be 0 to 2^63 - 1, not {self.seed}")
+        if not 1 <= self.samples <= MAX_SAMPLES:
+            raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
+        instants = [tweak.sample for tweak in self.tweaks]
+        if instants != sorted(set(instants)):
+            raise ValueError(f"tweaks must come in the order of their samples, each sample once, not {instants}")
+        if instants and instants[-1] >= self.samples:
+            raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {self.samples} samples")
+        for tweak, following in itertools.pairwise(self.tweaks):
+            if tweak.sample + tweak.ramp_n > following.sample:
+                raise ValueError(
+                    f"the tweak at sample {tweak.sample} lasts {tweak.ramp_n} samples,"
+                    f" beyond the next one at {following.sample}"
+                )
+
+    @classmethod
+    def load(cls, name: str) -> Scenario:
+        """A shipped scenario by name, or a user's .toml file.
+
+        :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
+        """
+        path = config.locate("scenarios", name)
+        scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
+        rig, dut = (
+            str(path.parent / each) if each.endswith(".toml") else each for each in (scenario.rig, scenario.dut)
+        )
+        return dataclasses.replace(scenario, rig=rig, dut=dut)
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:
+        """From TOML values; ``where`` leads every error."""
+        return config.build(cls, {"name": default_name, **table}, where)
+
+    def as_table(self) -> dict[str, Any]:
+        """The same as plain values, so that ``from_table`` gives an equal scenario again."""
+        return _plain(dataclasses.asdict(self))
+
+    def excitation_drawn(self, rng: np.random.Generator) -> Excitation:
+        """The excitation of one run: its phase drawn if the scenario asks for it."""
+        if not self.random_phase:
+            return self.excitation
+        return dataclasses.replace(self.excitation, phase=float(rng.uniform()))
+
+    @property
+    def caveats(self) -> tuple[str, ...]:
+        """Why runs of it are not judged; none for the programs of a mass, a damper and a spring."""
+        program = self.plant.set
+        if program in _MASS_DAMPER_SPRING:
+            return ()
+        return (f"the program {program} is not one mass, damper and spring, of which bounds and estimates speak",)
+
+    def segments(self) -> tuple[Segment, ...]:
+        """The truth: the plant from the start and after each tweak; with two masses, the sprung one's."""
+        out = [Segment(0, self.plant.plant())]
+        for tweak in self.tweaks:
+            changed = _changed(out[-1].plant, tweak)
+            if changed == out[-1].plant:
+                continue  # a pot set to where it stood changes nothing, and nothing can be detected
+            out.append(Segment(tweak.sample, changed, tweak.ramp_n))
+        return tuple(out)
+
+
+def _given(change: PlantChoice | Tweak) -> dict[str, float]:
+    values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _changed(plant: Plant, change: PlantChoice | Tweak) -> Plant:
+    return dataclasses.replace(plant, **_given(change))
+
+
+def _check_positive(change: PlantChoice | Tweak) -> None:
+    for name, value in _given(change).items():
+        if not value > 0.0:
+            raise ValueError(f"{name} must be more than 0, not {value:g}")
+
+
+def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
+    """As TOML has it: arrays are lists, and what is not given is not there."""
+    return {key: _plain_value(value) for key, value in table.items() if value is not None}
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _plain(value)
+    return [_plain_value(item) for item in value] if isinstance(value, list | tuple) else value

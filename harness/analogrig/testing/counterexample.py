@@ -1,0 +1,167 @@
+"""What is left of a play that failed: files of scenario, rig and device, the recording, and the one line that repeats
+it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from analogrig import config
+from analogrig.devices.devices import recorded
+from analogrig.run import Run
+from analogrig.scenario import Statement
+
+SCENARIO_FILE, RIG_FILE, DEVICE_FILE = "scenario.toml", "rig.toml", "dut.toml"
+RUN_FILE, REPORT_FILE = "run.npz", "report.html"
+
+
+@dataclasses.dataclass(frozen=True)
+class Counterexample:
+    """A play for which a statement does not hold."""
+
+    run: Run
+    statement: Statement | None = None
+    """None: no file could say what was asserted; what the scenario expects is what counts."""
+    seed: int | None = None
+    """From which on the statement looks for plays; None: that of the run."""
+    dut: str = ""
+    """How the user named the device, if that is known."""
+    why: str = ""
+    """What was found instead of the statement."""
+
+    def command(self, scenario: Path) -> str:
+        """The line that plays the run again, from its scenario file, and the device beside it if it has no name."""
+        words = ["analogrig", "run", "--scenario", str(scenario)]
+        if self.seed not in (None, self.run.conditions.seed):
+            words += ["--seed", str(self.run.conditions.seed)]
+        return shlex.join([*words, "--dut", self._device() or str(scenario.with_name(DEVICE_FILE))])
+
+    def suite_command(self, folder: Path) -> str:
+        """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
+        place = recorded(self.run.conditions.dut).elsewhere
+        return shlex.join(["pytest", str(folder), "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
+
+    def write(self, folder: Path, *, page: bool = True) -> None:
+        """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
+
+        The scenario file names its seed, its rig, its device and what did not hold, so that a folder of such files is a
+        regression suite: `pytest --scenario-dir FOLDER`. A rig or a device that its name alone does not describe has a
+        file too.
+
+        :param page: with the report, which takes longer than all the rest.
+        :raises RecordingError: the recording cannot be written. OSError: the folder or a file cannot.
+        """
+        new = folder.with_name(f".{folder.name}.new")
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(parents=True)
+        try:
+            self._write(new, page=page)
+            _take_the_place(new, folder)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+
+    def _write(self, folder: Path, *, page: bool) -> None:
+        tables = self._tables()
+        for name, table in tables.items():
+            (folder / name).write_text(config.to_toml(table), encoding="utf-8")
+        self.run.save(folder / RUN_FILE)
+        if page:
+            from analogrig.judging.verdict import judge
+            from analogrig.reporting import write_report
+
+            write_report(self.run, judge(self.run), folder / REPORT_FILE)
+
+    def _tables(self) -> dict[str, dict[str, Any]]:
+        """What goes into which file."""
+        conditions, device = self.run.conditions, self._device()
+        scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
+        scenario["seed"] = conditions.seed if self.seed is None else self.seed
+        scenario["dut"] = device or DEVICE_FILE
+        tables = {SCENARIO_FILE: scenario}
+        if not device:
+            tables[DEVICE_FILE] = {key: value for key, value in _settings(conditions.dut).items() if key != "name"}
+        name = str(conditions.rig["name"])
+        if name in config.names("rigs") and _is_rig(name, self.run):
+            scenario["rig"] = name
+        elif conditions.rig.get("kind") in ("emulator", "real"):
+            scenario["rig"] = RIG_FILE
+            tables[RIG_FILE] = {key: value for key, value in conditions.rig.items() if key != "name"}
+        if self.statement is not None:
+            scenario["statement"] = dataclasses.asdict(self.statement)
+        return tables
+
+    def _device(self) -> str:
+        """The name that describes it; empty: it takes a file."""
+        names = (self.dut, str(self.run.conditions.dut["name"]))
+        return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
+
+
+def _take_the_place(new: Path, folder: Path) -> None:
+    """Whoever is killed between the two names leaves the old folder under another."""
+    old = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> str:
+    """The command that plays a run again, if names or files say what was played; else "", and it takes files.
+
+    ``scenario``, ``rig``, ``dut``: how the user named them, if that is known: a file is recorded without its folder.
+    """
+    words = ["analogrig", "run", "--seed", str(run.conditions.seed)]
+    for flag, given, table, is_it in (
+        ("--scenario", scenario, run.conditions.scenario, _is_scenario),
+        ("--rig", rig, run.conditions.rig, _is_rig),
+        ("--dut", dut, run.conditions.dut, _is_device),
+    ):
+        name = next((name for name in (given, str(table["name"])) if name and is_it(name, run)), None)
+        if name is None:
+            return ""
+        words += [flag, name]
+    return shlex.join(words)
+
+
+def _is_scenario(name: str, run: Run) -> bool:
+    """Whether that is what was played; so the others."""
+    from analogrig.errors import AnalogrigError
+    from analogrig.scenario import Scenario
+
+    try:
+        return dict(Scenario.load(name).as_table()) == dict(run.conditions.scenario)
+    except AnalogrigError:
+        return False
+
+
+def _is_rig(name: str, run: Run) -> bool:
+    from analogrig.errors import AnalogrigError
+    from analogrig.rigs.description import open_rig
+
+    try:
+        with open_rig(name) as opened:
+            return dict(opened.description()) == dict(run.conditions.rig)
+    except AnalogrigError:
+        return False
+
+
+def _is_device(name: str, run: Run) -> bool:
+    from analogrig.devices.devices import describe
+    from analogrig.errors import AnalogrigError
+
+    try:
+        described = describe(name).as_table()
+    except AnalogrigError:
+        return False
+    return _settings(described) == _settings(run.conditions.dut)
+
+
+def _settings(dut: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a device, without who it was, and without the zero of the force, which the bench sets by the rig's card."""
+    estimator = {key: value for key, value in dut["estimator"].items() if key != "force_zero"}
+    return {**{key: value for key, value in dut.items() if key != "identity"}, "estimator": estimator}

@@ -1,0 +1,230 @@
+"""A Run as a test speaks of it: what it shows, and why.
+
+``played.detects(within=1.5)`` and its like give a Finding: true or false, and a sentence that pytest shows when an
+assertion about it fails.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Concatenate, ParamSpec
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from analogrig.judging.exposure import exposure
+from analogrig.judging.statistics import Design, upper_rate
+from analogrig.judging.verdict import TweakVerdict, Verdict, judge
+from analogrig.reporting.summary import latency_text
+from analogrig.run import Run
+from analogrig.scenario import Statement
+from analogrig.testing.statement import Finding, make_known, said
+
+Arguments = ParamSpec("Arguments")
+
+
+def _of_a_valid_play(
+    statement: Callable[Concatenate[Played, Arguments], Finding],
+) -> Callable[Concatenate[Played, Arguments], Finding]:
+    """Nothing holds of a play that is not valid; what is found is noted."""
+
+    @functools.wraps(statement)
+    def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
+        for limit in (*args, *kwargs.values()):
+            if isinstance(limit, float) and not math.isfinite(limit):
+                raise ValueError(f"{statement.__name__}: a limit must be a finite number, not {limit}")
+        if played.verdict.valid:
+            finding = statement(played, *args, **kwargs)
+        else:
+            finding = Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
+        stated = said(checked, played, *args, **kwargs)
+        finding = dataclasses.replace(finding, statement=stated, run=played.run)
+        played.note(finding)
+        return finding
+
+    make_known(checked, is_experiment=False)
+    return checked
+
+
+def _to_nobody(_: Finding) -> None:
+    """Outside the plugin nobody asks why a test has failed."""
+
+
+@dataclass(frozen=True, repr=False)
+class Played:
+    """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``play`` hands
+    one on only if it is asked to."""
+
+    run: Run
+    repeat: str = ""
+    """The command that repeats it; empty: no names or files say what was played."""
+    note: Callable[[Finding], None] = field(default=_to_nobody, compare=False)
+    """Told whatever is found of it."""
+
+    def __repr__(self) -> str:
+        conditions = self.run.conditions
+        words = f"{conditions.scenario['name']}, seed {conditions.seed}"
+        return f"<{words}: {self.run.samples} samples on {conditions.rig['name']}, device {conditions.dut['name']}>"
+
+    @functools.cached_property
+    def verdict(self) -> Verdict:
+        return judge(self.run)
+
+    @_of_a_valid_play
+    def passes(self) -> Finding:
+        """What the scenario's ``[expect]`` asks: no change missed or late, no false alarm."""
+        return Finding(self.verdict.outcome == "passed", "; ".join(self.verdict.reasons) or "all that is expected")
+
+    @_of_a_valid_play
+    def detects(self, within: float | None = None) -> Finding:
+        """Every change that could be seen raised an alarm before the next one.
+
+        :param within: and not later than so many times its information bound (and the bound's own sample); None: than
+            the scenario's ``[expect]`` says.
+        """
+        if not self.verdict.tweaks:
+            return Finding(holds=False, why="nothing has changed, so nothing could be detected")
+        seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None and not tweak.unseen]
+        if not seeable:
+            return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
+        wrong = [why for tweak in seeable if (why := _not_detected(tweak, within))]
+        latencies = ", ".join(f"{tweak.what} after {latency_text(tweak)} (bound {tweak.bound_n})" for tweak in seeable)
+        return Finding(not wrong, "; ".join(wrong) or latencies)
+
+    @_of_a_valid_play
+    def stays_quiet(self) -> Finding:
+        """No alarm but one for each change."""
+        alarms, doubtful = self.verdict.false_alarms, self.verdict.doubtful_alarms
+        if doubtful and not alarms:
+            return Finding(holds=False, why=f"INCONCLUSIVE: the alarm at {doubtful[0]} is false, or not: {_UNKNOWN}")
+        where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
+        return Finding(not alarms, f"{len(alarms)} false alarms in {self.run.samples} samples: {where}".rstrip(": "))
+
+    @_of_a_valid_play
+    def isolates(self) -> Finding:
+        """Whatever was said to have changed has changed. Silence is allowed."""
+        judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
+        said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
+        wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
+                 if not diagnosis.right]  # fmt: skip
+        return Finding(
+            not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.tweaks)} changes named, rightly"
+        )
+
+    @_of_a_valid_play
+    def estimates(self, within: float) -> Finding:
+        """M, B and K at the end of every stretch are right to a part ``within``."""
+        off = []
+        for segment in self.verdict.estimates:
+            if segment.estimate is None:
+                off.append(f"samples {segment.start} to {segment.end}: no mass, damper and spring")
+            off += [
+                f"{name} is off by {error:+.2%} at sample {segment.end}"
+                for name, error in segment.error.items()
+                if not abs(error) <= within
+            ]
+        return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
+
+    @_of_a_valid_play
+    def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:
+        """The estimate goes the way of another one, in a tube around it.
+
+        :param reference: (n, p) what theta should be after each sample; NaN: any.
+        :param tolerance: how far it may be off; of a shape that broadcasts to (n, p).
+        :param time_tolerance: so many samples earlier or later it may have been so.
+        """
+        theta = self.run.theta.astype(np.float64)
+        wanted = np.asarray(reference, dtype=np.float64)
+        if wanted.shape != theta.shape:
+            raise ValueError(f"reference has the shape {wanted.shape}, theta {theta.shape}")
+        if np.isnan(tolerance).any():
+            raise ValueError("tolerance must be a number, not nan")
+        allowed = np.broadcast_to(np.asarray(tolerance, dtype=np.float64), theta.shape)
+        inside = np.zeros(theta.shape, dtype=bool)
+        for shift in range(-time_tolerance, time_tolerance + 1):
+            at = np.clip(np.arange(len(theta)) + shift, 0, len(theta) - 1)
+            inside |= (np.abs(theta - wanted[at]) <= allowed[at]) | np.isnan(wanted[at])
+        outside = np.argwhere(~inside)
+        if not len(outside):
+            return Finding(holds=True, why=f"{len(theta)} samples within the tolerance")
+        sample, element = (int(i) for i in outside[0])
+        why = f"theta[{element}] leaves the tube at sample {sample}: {theta[sample, element]:g}"
+        return Finding(holds=False, why=f"{why}, not {wanted[sample, element]:g} +- {allowed[sample, element]:g}")
+
+
+_UNKNOWN = "it depends on when the change came, which is not known better"
+
+
+def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
+    """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
+    reasons = [_too_late(each, within) for each in tweak.possible]
+    if all(reasons):
+        return _too_late(tweak, within)
+    low, high = tweak.between
+    return f"INCONCLUSIVE: {tweak.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
+
+
+def _too_late(tweak: TweakVerdict, within: float | None) -> str:
+    """As ``_not_detected``, for the very instant that it has."""
+    if tweak.latency_n is None and tweak.bound_n is None:
+        return ""
+    if tweak.latency_n is None:
+        return f"{tweak.what} at {tweak.sample} was missed (bound {tweak.bound_n})"
+    if within is None:
+        late, limit = tweak.late, tweak.deadline_n
+    else:
+        limit = round(within * (tweak.bound_n or 0)) + 1
+        late = tweak.latency_n > limit
+    return f"{tweak.what} at {tweak.sample}: {tweak.latency_n} samples, allowed {limit}" if late else ""
+
+
+def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
+    """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand.
+
+    It does not hold if one of them is not valid. A play counts once, with the samples in which its trigger was armed
+    (``analogrig.judging.exposure``).
+    """
+    plays = list({_samples_of(each.run): each for each in played}.values())
+    finding = _rate_below(rate, plays, confidence)
+    if plays:
+        finding = dataclasses.replace(finding, statement=_of_all(plays, rate, confidence), run=plays[0].run)
+        plays[0].note(finding)
+    return finding
+
+
+def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Finding:
+    invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
+    if invalid:
+        return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {len(plays)} plays, such as: {invalid[0]}")
+    events = sum(len(each.verdict.false_alarms) for each in plays)
+    samples = sum(exposure(each.run).armed for each in plays)
+    if not samples:
+        why = exposure(plays[0].run).no_evidence if plays else "there is none"
+        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: {why}")
+    bound = upper_rate(events, samples, confidence)
+    why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
+    if bound > rate:
+        needed = Design(rate=rate, confidence=confidence, allowed=events).trials
+        why += f", allowed {rate:g}: with so many alarms that takes {needed} samples"
+    return Finding(bound <= rate, why)
+
+
+def _samples_of(run: Run) -> tuple[str, bytes]:
+    """What makes it a play of its own: the device, and the samples that it was given."""
+    return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
+
+
+def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statement | None:
+    """What is said of them, if a scenario and its first seed tell them all."""
+    conditions = [each.run.conditions for each in plays]
+    first = conditions[0]
+    if any(
+        each.seed != first.seed + number or each.scenario != first.scenario for number, each in enumerate(conditions)
+    ):
+        return None
+    return Statement("rate_of_plays_below", {"rate": rate, "confidence": confidence, "plays": len(plays)})

@@ -1,0 +1,168 @@
+"""The plugin for pytest: rigs, devices and plays as fixtures, scenario files as tests, and a file for what fails.
+
+Loaded by every pytest in whose environment analogrig is installed, so nothing heavy is imported before a test asks.
+An option is taken from, in this order: indirect parametrization of its fixture, the command line, the environment
+(ANALOGRIG_RIG, ...), the ini file (analogrig_rig, ...), its default.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from analogrig.rigs import CAPABILITIES
+from analogrig.testing.plugin import devices, options, playing, scenarios
+from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR
+
+if TYPE_CHECKING:
+    from analogrig.bench import Bench
+    from analogrig.protocol.dut import Dut
+    from analogrig.rigs.rig import Rig
+    from analogrig.testing.experiment import Play
+
+# -------------------------------------------------------------------------------------------------------------- session
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    options.add(parser)
+
+
+_PROFILE_BEFORE = pytest.StashKey[str | None]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", f"needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
+    )
+    options.check(config)
+    profile = HIL_PROFILE.said(config).value
+    config.stash[_PROFILE_BEFORE] = os.environ.get(HIL_PROFILE.variable)
+    os.environ[HIL_PROFILE.variable] = profile  # analogrig.testing.strategies reads it where a test is defined
+    config.stash[scenarios.DEVICES] = devices.Devices()
+    devices.keep_with_owner(config)
+    scenarios.add_folder(config)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if (opened := config.stash.get(scenarios.DEVICES, None)) is not None:
+        opened.close()
+    before = config.stash.get(_PROFILE_BEFORE, None)
+    if before is None:
+        os.environ.pop(HIL_PROFILE.variable, None)
+    else:
+        os.environ[HIL_PROFILE.variable] = before
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    return scenarios.collected(file_path, parent)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    _check_needs(items)
+    devices.tell_owned(config, items)
+
+
+def _check_needs(items: list[pytest.Item]) -> None:
+    """:raises pytest.UsageError: a test needs what no rig can."""
+    for item in items:
+        for mark in item.iter_markers("needs"):
+            unknown = [*(need for need in mark.args if need not in CAPABILITIES), *mark.kwargs]
+            if unknown:
+                raise pytest.UsageError(
+                    f"{item.nodeid}: needs: no rig is known to {unknown[0]!r}: there are {', '.join(CAPABILITIES)}"
+                )
+
+
+# ------------------------------------------------------------------------------------------------------------- fixtures
+
+
+@pytest.fixture
+def scenario_dir(request: pytest.FixtureRequest) -> Path | None:
+    """The folder of --scenario-dir."""
+    value = SCENARIO_DIR.asked(request).value
+    return Path(value) if value else None
+
+
+@pytest.fixture
+def runs_dir(request: pytest.FixtureRequest) -> Path:
+    """The folder of --runs-dir."""
+    return Path(RUNS_DIR.asked(request).value)
+
+
+@pytest.fixture
+def hil_profile(request: pytest.FixtureRequest) -> str:
+    """``ci``, ``nightly`` or ``soak``."""
+    return HIL_PROFILE.asked(request).value
+
+
+@pytest.fixture
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """The rig of --rig, opened; the test is skipped if it lacks what the mark ``needs`` asks."""
+    from analogrig.rigs.description import open_rig
+
+    devices.check_owner(request.node)
+    said = RIG.asked(request)
+    with playing.in_one_line(said.by):
+        opened = open_rig(said.value)
+    with opened:
+        _skip_unless_able(request.node, opened, said.value)
+        yield opened
+
+
+def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
+    for mark in item.iter_markers("needs"):
+        lacking = sorted(set(mark.args) - rig.capabilities)
+        if lacking:
+            able = ", ".join(sorted(rig.capabilities)) or "nothing but play"
+            pytest.skip(f"rig {name} cannot {' and '.join(lacking)} (it can {able}): choose another with --rig")
+
+
+@pytest.fixture
+def dut(request: pytest.FixtureRequest) -> Dut:
+    """The device of --dut, reset and configured as described."""
+    devices.check_owner(request.node)
+    said = DUT.asked(request)
+    with playing.in_one_line(said.by):
+        return request.config.stash[scenarios.DEVICES].lease(said.value)
+
+
+@pytest.fixture
+def bench(rig: Rig, dut: Dut) -> Bench:
+    """Both on one table."""
+    from analogrig.bench import Bench
+
+    return Bench(rig, dut)
+
+
+@pytest.fixture
+def play(request: pytest.FixtureRequest, bench: Bench) -> Play:
+    """``play(scenario, seed=None) -> Played``: a name, a .toml file or a Scenario; by default the seed that it has.
+
+    A play that is INCONCLUSIVE fails the test with its reason; ``allow_inconclusive=True`` hands it on.
+    """
+    return playing.Player(request.node, bench)
+
+
+# ---------------------------------------------------------------------------------------------------- what has failed
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    with playing.examples_kept(item):
+        yield
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    if call.when == "call":
+        item.user_properties.extend(playing.properties(item))
+    report = yield
+    if report.when == "call" and report.failed and (left := playing.left_by(item)):
+        report.sections.append(("analogrig", left))
+    return report

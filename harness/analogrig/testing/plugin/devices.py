@@ -1,0 +1,177 @@
+"""The devices of a session, and what of rigs and devices there is only one, which one worker of pytest-xdist owns."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import pytest
+
+from analogrig.testing.plugin.options import DUT, RIG
+
+if TYPE_CHECKING:
+    from analogrig.protocol.dut import Dut
+
+_TOLD = "analogrig_owned"
+"""What a worker is told: the folder in which it says which tests need what there is one of."""
+
+_SPREADING = ("load", "worksteal")
+"""Those --dist of pytest-xdist that give any test to any worker."""
+
+
+@runtime_checkable
+class Equipped(Protocol):
+    """A test that says itself on what it plays."""
+
+    def equipment(self) -> tuple[str, str]:
+        """The names of rig and device; empty: unknown."""
+
+
+@dataclass
+class Devices:
+    """They last as long as the session, and are reached anew when a test has hung them."""
+
+    _open: dict[str, Dut] = field(default_factory=dict)
+    _described: dict[str, Any] = field(default_factory=dict)
+
+    def lease(self, name: str) -> Dut:
+        """A device that is there, reset and configured as described, whatever the test before has done to it.
+
+        :raises AnalogrigError: it cannot be reached.
+        """
+        from analogrig.devices.devices import describe
+        from analogrig.errors import AnalogrigError
+        from analogrig.protocol.dut import open_dut
+
+        dut = self._open.pop(name, None)
+        if dut is not None:
+            try:
+                dut.handshake()
+                dut.configure(self._described[name])
+            except AnalogrigError:
+                dut.close()
+                dut = None
+        if dut is None:
+            self._let_go(describe(name).only_one)
+            dut = open_dut(name)
+            self._described[name] = dut.estimator
+        self._open[name] = dut
+        return dut
+
+    def release(self, name: str) -> None:
+        """It is not asked for again."""
+        if (dut := self._open.pop(name, None)) is not None:
+            dut.close()
+
+    def _let_go(self, only_one: str) -> None:
+        """Of what is open under another name, and cannot be opened twice."""
+        from analogrig.devices.devices import describe
+
+        for name in [name for name in self._open if only_one and describe(name).only_one == only_one]:
+            self.release(name)
+
+    def close(self) -> None:
+        for name in list(self._open):
+            self.release(name)
+
+
+class OneOwner:
+    """Has pytest-xdist give all tests that need the one rig or device to one worker, and any other to any.
+
+    Its own groups (--dist loadgroup) would do, but do not reach the scheduler with pytest 9.2 (pytest-xdist 1386).
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_configure_node(self, node: Any) -> None:
+        node.workerinput[_TOLD] = str(self._folder)
+
+    @pytest.hookimpl(optionalhook=True, tryfirst=True)
+    def pytest_xdist_make_scheduler(self, config: pytest.Config, log: Any) -> Any:
+        from xdist.scheduler import LoadScopeScheduling
+
+        folder = self._folder
+
+        def scope(_: Any, nodeid: str) -> str:
+            return _TOLD if nodeid in _owned(folder) else nodeid
+
+        return type("OneOwnerScheduling", (LoadScopeScheduling,), {"_split_scope": scope})(config, log)
+
+    def pytest_unconfigure(self) -> None:
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+@functools.cache
+def _owned(folder: Path) -> frozenset[str]:
+    """Asked when every worker has collected: each says the same."""
+    told = sorted(folder.iterdir())
+    return frozenset(json.loads(told[0].read_text(encoding="utf-8")) if told else ())
+
+
+def keep_with_owner(config: pytest.Config) -> None:
+    """If the rig or the device of the options is one of which there is only one, and pytest-xdist has many workers.
+
+    :raises pytest.UsageError: tests are to be distributed in a way that does not go with that.
+    """
+    dist, workers = config.getoption("dist", "no"), config.getoption("tx", None) or []
+    if dist == "no" or len(workers) < 2:
+        return
+    rig, dut = (option.given(config) or option.otherwise(config) for option in (RIG, DUT))
+    single = _single(rig.value if rig.value != RIG.default else "", dut.value if dut.value != DUT.default else "")
+    if single and dist not in _SPREADING:
+        raise pytest.UsageError(f"{single}, and --dist {dist} may not: say --dist load, or leave out -n")
+    if single:
+        config.pluginmanager.register(OneOwner(Path(tempfile.mkdtemp(prefix="analogrig-"))))
+
+
+def tell_owned(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
+    """In a worker: which tests belong together."""
+    told = getattr(config, "workerinput", {})
+    if _TOLD in told:
+        owned = [item.nodeid for item in items if single_of(item)]
+        path = Path(told[_TOLD]) / f"{told['workerid']}.json"
+        try:
+            path.write_text(json.dumps(owned), encoding="utf-8")
+        except OSError:  # the folder of another machine
+            del told[_TOLD]
+
+
+def check_owner(item: pytest.Item) -> None:
+    """Fails a test that needs what another worker may have."""
+    told = getattr(item.config, "workerinput", {})
+    if told.get("workercount", 1) > 1 and _TOLD not in told and (single := single_of(item)):
+        pytest.fail(f"{single}: leave out -n, or name it for all tests (--rig, --dut)", pytrace=False)
+
+
+def single_of(item: pytest.Item) -> str:
+    """What a test needs of which there is one, and that one worker owns it; empty: nothing."""
+    if isinstance(item, Equipped):
+        return _single(*item.equipment())
+    wanted = getattr(item, "fixturenames", ())
+    rig, dut = (option.of(item) if option.name in wanted else "" for option in (RIG, DUT))
+    return _single(rig, dut)
+
+
+def _single(rig: str, dut: str) -> str:
+    """Which of a rig and a device there is only one of; whether they exist at all will be found out by who asks."""
+    from analogrig.devices.devices import describe
+    from analogrig.errors import AnalogrigError
+    from analogrig.rigs.description import described
+    from analogrig_emulator.errors import EmulatorError
+
+    with contextlib.suppress(AnalogrigError, EmulatorError):
+        if dut and describe(dut).only_one:
+            return f"device {dut}: one worker owns it"
+    with contextlib.suppress(AnalogrigError, EmulatorError):
+        if rig and not rig.startswith("recording:") and described(rig)[0].get("kind") == "real":
+            return f"rig {rig}: one worker owns it"
+    return ""

@@ -1,0 +1,267 @@
+"""The fixture ``play``: what a test has played, what it found, what JUnit is told, and what is left when it fails."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import re
+import subprocess
+import unittest
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR
+
+if TYPE_CHECKING:
+    from analogrig.bench import Bench
+    from analogrig.judging.verdict import TweakVerdict
+    from analogrig.protocol.dut import Dut
+    from analogrig.rigs.rig import Rig
+    from analogrig.scenario import Scenario
+    from analogrig.testing.counterexample import Counterexample
+    from analogrig.testing.played import Played
+    from analogrig.testing.statement import Finding
+
+
+@contextlib.contextmanager
+def in_one_line(by: str = "") -> Iterator[None]:
+    """What went wrong with rig, link or device is told without the way through our code; what cannot be configured
+    together with who wanted it."""
+    from analogrig.errors import AnalogrigError, ConfigurationError
+    from analogrig_emulator.errors import EmulatorError
+
+    try:
+        yield
+    except (AnalogrigError, EmulatorError) as error:
+        failure = f"{by}: {error}" if by and isinstance(error, ConfigurationError) else str(error)
+        raise pytest.fail.Exception(failure, pytrace=False) from None
+
+
+@dataclass
+class Record:
+    """What one test has played and found; of a property that hypothesis tries, with its last example."""
+
+    plays: list[Played] = field(default_factory=list)
+    found: tuple[Finding, int] | None = None
+    """The last finding, and the seed from which on it looked for plays."""
+    shown: Counterexample | None = None
+    """By the last example that failed."""
+
+    def begin(self) -> None:
+        """Another example."""
+        self.plays.clear()
+        self.found = None
+
+    def counterexample(self, item: pytest.Item) -> Counterexample | None:
+        """The plays until now, if they have failed; None: nothing was played."""
+        from analogrig.testing.counterexample import Counterexample
+
+        if not self.plays:
+            return None
+        if self.found is None or self.found[0]:
+            return Counterexample(self.plays[-1].run, dut=DUT.of(item))
+        finding, seed = self.found
+        runs = [played.run for played in self.plays]
+        run = finding.run or next((each for each in runs if each.conditions.seed == seed), runs[-1])
+        statement = finding.statement and dataclasses.replace(finding.statement, test=item.nodeid)
+        return Counterexample(run, statement, seed, DUT.of(item), finding.why)
+
+
+_RECORD = pytest.StashKey[Record]()
+
+
+def record_of(item: pytest.Item) -> Record:
+    return item.stash.setdefault(_RECORD, Record())
+
+
+class Player:
+    """Plays for one test, and keeps what it has played: ``analogrig.testing.experiment.Play``."""
+
+    def __init__(self, item: pytest.Item, bench: Bench) -> None:
+        self.item = item
+        self.bench = bench
+
+    def __call__(
+        self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
+    ) -> Played:
+        from analogrig.errors import AnalogrigError
+        from analogrig.scenario import DEFAULT_SEED, Scenario
+        from analogrig.testing.counterexample import command_of
+        from analogrig.testing.played import Played
+
+        with in_one_line():
+            chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
+            drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
+            run = self.bench.play(chosen, drawn)
+        if run.conditions.faults:  # nothing of it may reach the next play of this test
+            with contextlib.suppress(AnalogrigError):
+                self.bench.dut.handshake()
+        said = "" if isinstance(scenario, Scenario) else str(scenario)
+        repeat = command_of(run, said, RIG.of(self.item), DUT.of(self.item))
+        played = Played(run, repeat, functools.partial(self.note, seed=drawn))
+        record_of(self.item).plays.append(played)
+        if not played.verdict.valid and not allow_inconclusive:
+            pytest.fail(f"INCONCLUSIVE: {played.verdict.reasons[0]}", pytrace=False)
+        return played
+
+    def __repr__(self) -> str:
+        return "play"
+
+    def on(self, rig: Rig, dut: Dut) -> Player:
+        """The same for another rig or device."""
+        from analogrig.bench import Bench
+
+        return Player(self.item, Bench(rig, dut))
+
+    def note(self, finding: Finding, seed: int) -> None:
+        """What was found of the plays from a seed on."""
+        record_of(self.item).found = finding, seed
+
+
+# ----------------------------------------------------------------------------------------------------- what has failed
+
+
+@contextlib.contextmanager
+def examples_kept(item: pytest.Item) -> Iterator[None]:
+    """Each example of hypothesis that fails is written at once, in the place of the one before: whoever ends the
+    session while it is being shrunk finds the simplest until then."""
+    handle = getattr(getattr(item, "obj", None), "hypothesis", None)
+    if handle is None:
+        yield
+        return
+    tried = handle.inner_test
+    handle.inner_test = _kept_if_it_fails(tried, item)
+    try:
+        yield
+    finally:
+        handle.inner_test = tried
+
+
+def _kept_if_it_fails(tried: Callable[..., None], item: pytest.Item) -> Callable[..., None]:
+    from hypothesis.errors import UnsatisfiedAssumption
+
+    record = record_of(item)
+
+    @functools.wraps(tried)
+    def example(*args: Any, **kwargs: Any) -> None:
+        __tracebackhide__ = True
+        record.begin()
+        try:
+            tried(*args, **kwargs)
+        except (Exception, pytest.fail.Exception) as error:
+            if not isinstance(error, UnsatisfiedAssumption | unittest.SkipTest) and not _is_from_elsewhere(error):
+                _keep(record, item)
+            raise
+
+    return example
+
+
+def _is_from_elsewhere(error: BaseException) -> bool:
+    """Whether it says nothing of the example, as a time-out of pytest does; ours show no way to where they were."""
+    return isinstance(error, pytest.fail.Exception) and error.pytrace
+
+
+def _keep(record: Record, item: pytest.Item) -> None:
+    shown = record.counterexample(item)
+    if shown is None:
+        return  # the device did not even begin: what is there says more
+    record.shown = shown
+    with contextlib.suppress(*_unwritten()):  # which is said when the test has ended
+        shown.write(_folder(item), page=False)
+
+
+def left_by(item: pytest.Item) -> str:
+    """Writes what a test that failed leaves; says what was found, in full, where it is, and how to repeat it.
+    Empty: it has played nothing.
+
+    A scenario of --scenario-dir is there already: what it leaves shall not be one more of them.
+    """
+    from analogrig.testing.counterexample import SCENARIO_FILE
+
+    record, folder = record_of(item), _folder(item)
+    shown = record.shown or record.counterexample(item)
+    if shown is None:
+        return ""
+    lines = [f"found: {shown.why}"] if shown.why else []
+    if _is_left_already(item, folder):
+        return "\n".join([*lines, f"repeat it with: {shown.command(item.path)}"])
+    try:
+        shown.write(folder)
+    except _unwritten() as error:
+        return "\n".join([*lines, f"its recording could not be written to {folder}: {error}"])
+    lines += [f"recording and scenario: {folder}", f"repeat it with: {shown.command(folder / SCENARIO_FILE)}"]
+    if shown.statement is not None:
+        lines.append(f"judge it again with: {shown.suite_command(folder)}")
+    return "\n".join(lines)
+
+
+def _is_left_already(item: pytest.Item, folder: Path) -> bool:
+    """Whether it is a scenario of --scenario-dir that a test has left, or what it leaves would be one more of them."""
+    suite = SCENARIO_DIR.of(item)
+    if not suite or not item.path.resolve().is_relative_to(Path(suite).resolve()):
+        return False
+    left = item.path.resolve().is_relative_to(Path(RUNS_DIR.of(item)).resolve())
+    return left or folder.resolve().is_relative_to(Path(suite).resolve())
+
+
+def _folder(item: pytest.Item) -> Path:
+    return Path(RUNS_DIR.of(item)) / re.sub(r"[^\w.-]+", "_", item.nodeid).strip("_")
+
+
+def _unwritten() -> tuple[type[Exception], ...]:
+    from analogrig.errors import AnalogrigError
+
+    return AnalogrigError, OSError
+
+
+# --------------------------------------------------------------------------------------------------------------- JUnit
+
+
+def properties(item: pytest.Item) -> list[tuple[str, Any]]:
+    """What JUnit shall know of the plays of a test."""
+    record = record_of(item)
+    found = [("found", f"{record.found[0]!r}"[1:-1])] if record.found else []
+    return [*(each for played in record.plays for each in _properties(played).items()), *found]
+
+
+def _properties(played: Played) -> Mapping[str, Any]:
+    conditions, verdict = played.run.conditions, played.verdict
+    identity = conditions.dut.get("identity", {})
+    return {
+        "seed": conditions.seed,
+        "scenario": conditions.scenario["name"],
+        "rig": conditions.rig["name"],
+        "dut": conditions.dut["name"],
+        "firmware": identity.get("firmware", ""),
+        "catalogue_hash": f"{identity.get('catalogue_hash', 0):08x}",
+        "commit": _commit(),
+        "outcome": verdict.outcome,
+        "theta_hash": verdict.theta_hash,
+        "latency_n": " ".join(_latency(tweak) for tweak in verdict.tweaks),
+        "bound_n": " ".join(str(tweak.bound_n) for tweak in verdict.tweaks),
+        "false_alarms": len(verdict.false_alarms),
+        "overruns": conditions.counters.get("receive_overruns", 0),
+    }
+
+
+def _latency(tweak: TweakVerdict) -> str:
+    """``4``, or ``1..9`` where the instant of the change is not known better; ``None`` without an alarm."""
+    if tweak.latencies_n is None or not tweak.others:
+        return str(tweak.latency_n)
+    return "{}..{}".format(*tweak.latencies_n)
+
+
+@functools.cache
+def _commit() -> str:
+    """Of the repository in which pytest runs; empty where there is none."""
+    command = ["git", "rev-parse", "--short=12", "HEAD"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

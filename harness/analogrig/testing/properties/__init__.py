@@ -1,0 +1,40 @@
+"""The properties that any estimator behind the catalogue's messages should have, as tests to run against yours.
+
+    pytest --pyargs analogrig.testing.properties --dut serial:/dev/ttyACM0 --hil-profile nightly
+
+What fails is shrunk to the simplest scenario that still fails, and left as files (see --runs-dir). How seldom a sound
+device fails one is derived in harness/README.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import Scenario
+from analogrig.testing import experiment
+from analogrig.testing.experiment import Play
+from analogrig.testing.played import Played
+from analogrig.testing.statement import Finding
+
+__all__ = ["TRIES", "Play", "is_playable", "with_some_seed"]
+
+TRIES = 5
+"""What chance may spoil has failed when it did so with as many seeds, one after the other."""
+
+
+def is_playable(rig: Rig, scenario: Scenario) -> bool:
+    """Whether the rig has the waveform and the pots; one that has next to none fails hypothesis's health check."""
+    try:
+        rig.perform(scenario, 0)
+    except ConfigurationError:
+        return False
+    return True
+
+
+def with_some_seed(
+    play: Play, scenario: str | Scenario, seed: int, judge: Callable[[Played], Finding], tries: int = TRIES
+) -> Finding:
+    """As ``analogrig.testing.experiment.with_some_seed``, with as many tries as the shipped properties have."""
+    return experiment.with_some_seed(play, scenario, seed, judge, tries)

@@ -1,0 +1,455 @@
+"""The shipped properties as experiments: each plays what it needs, from a scenario and a seed on, and says what it
+found.
+
+The tests beside this module draw scenarios and state limits; what fails is left with both, and judged again by the
+function that failed (``analogrig.testing.statement``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from analogrig.bench import Bench
+from analogrig.campaigns.rare import false_alarm_rate
+from analogrig.campaigns.trials import Trials, are_possible
+from analogrig.devices.devices import DeviceDescription, InprocDevice, recorded
+from analogrig.errors import AnalogrigError
+from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
+from analogrig.judging.verdict import judge
+from analogrig.protocol.dut import Dut, connect
+from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.recording import RecordingRig
+from analogrig.run import Run
+from analogrig.scenario import Scenario
+from analogrig.testing.experiment import Play, experiment
+from analogrig.testing.played import Played, rate_below
+from analogrig.testing.statement import Finding
+
+LONGEST_TIMEOUT_S = 0.5
+"""Of a line on which faults are tried: some cost one, or a few."""
+
+_WITNESS_N = 2000
+"""Samples of the play that is left of many trials; more, if its first alarm came later."""
+
+_AFTER_N = 100
+"""Samples of it after that alarm."""
+
+_MOST_UNARMED = 2
+"""Trials may take so many times the samples in which the trigger was armed; else silence is no evidence."""
+
+_EVER = 1e9
+"""Of the bound: an alarm before the next change."""
+
+
+def described(dut: Dut) -> DeviceDescription:
+    """As it is configured now."""
+    return recorded(dut.description())
+
+
+def _played(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
+    return [play(scenario, seed + number, allow_inconclusive=True) for number in range(plays)]
+
+
+def _invalid(*plays: Played) -> Finding | None:
+    """Nothing is said of plays that are not valid."""
+    for played in plays:
+        if not played.verdict.valid:
+            return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}", run=played.run)
+    return None
+
+
+# --------------------------------------------------------------------------------------------------------- false alarms
+
+
+@experiment
+def rate_of_plays_below(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int
+) -> Finding:
+    """``analogrig.testing.played.rate_below`` of so many plays."""
+    return rate_below(rate, _played(play, scenario, seed, plays), confidence=confidence)
+
+
+@experiment
+def false_alarms_at_most(
+    play: Play, scenario: Scenario, seed: int, allowed: int, samples: int, samples_each: int
+) -> Finding:
+    """No more than so many in trials of ``samples_each``, in which the trigger was armed in ``samples`` altogether."""
+    trials = _trials(play, f"takes {samples} samples: analogrig certify")
+    scenario = dataclasses.replace(scenario, samples=samples_each)
+    alarms: list[NDArray[np.int64]] = []
+    armed = 0
+    while armed < samples:
+        watched = trials.watched(scenario, seed + len(alarms))
+        alarms.append(watched.alarms)
+        armed += watched.exposure.armed
+        if watched.exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+            why = (
+                watched.exposure.no_evidence
+                or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
+            )
+            return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
+    count = sum(map(len, alarms))
+    why = f"{count} false alarms in {armed} samples, allowed {allowed}"
+    if count <= allowed:
+        return Finding(holds=True, why=why)
+    most = _with_most(alarms)
+    return _witnessed(play, scenario, seed + most, alarms[most], why)
+
+
+@experiment
+def false_alarms_of_plants_rarer(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plants: int, samples_each: int
+) -> Finding:
+    """That they are more frequent over plants that are drawn cannot be said with that confidence."""
+    from analogrig.testing.strategies import random_suspensions
+
+    trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
+    scenario = dataclasses.replace(scenario, samples=samples_each)
+    drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
+    played = [trials.watched(each, seed) for each in drawn]
+    if nothing := next((each.exposure.no_evidence for each in played if each.exposure.no_evidence), ""):
+        return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
+    alarms = [each.alarms for each in played]
+    count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
+    low = lower_rate(count, samples, confidence)
+    why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
+    if _MOST_UNARMED * samples < plants * samples_each:
+        why = f"the trigger was armed in {samples} of {plants * samples_each} samples"
+        return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
+    if low <= rate:
+        return Finding(holds=True, why=why)
+    most = _with_most(alarms)
+    return _witnessed(play, drawn[most], seed, alarms[most], why)
+
+
+@experiment
+def rare_false_alarms_rarer(
+    play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
+) -> Finding:
+    """The same of a rate that is too low to be waited for, by ``analogrig.campaigns.rare``."""
+    rig, device = _in_this_process(play, "needs the estimator in this process")
+    if device.estimator.trigger != "cusum":
+        pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
+    rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
+    low, high = mean_bounds(rates, confidence)
+    why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
+    if low <= rate:
+        return Finding(holds=True, why=why)
+    return _witnessed(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
+
+
+def _trials(play: Play, otherwise: str) -> Trials:
+    return Trials(*_in_this_process(play, otherwise))
+
+
+def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
+    """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
+    rig, device = play.bench.rig, described(play.bench.dut)
+    if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
+        pytest.skip(f"{otherwise}, or an emulated rig and --dut inproc, not {play.bench.dut.name}")
+    return rig, device
+
+
+def _with_most(alarms: list[NDArray[np.int64]]) -> int:
+    return int(np.argmax([len(each) for each in alarms]))
+
+
+def _witnessed(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
+    """With a play that leaves a recording."""
+    samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
+    witness = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
+    return Finding(holds=False, why=why, run=play(witness, seed, allow_inconclusive=True).run)
+
+
+# ------------------------------------------------------------------------------------------------ latency and diagnoses
+
+
+@experiment
+def changes_are_noticed_soon_and_rightly_named(
+    play: Play,
+    scenario: Scenario,
+    seed: int,
+    plays: int,
+    latency: float,
+    doubtful_latency: float,
+    most_plays: int,
+    right: float,
+    confidence: float,
+) -> Finding:
+    """Mean latency over mean bound is at most ``latency``, after more plays if a few have it little above, and at most
+    ``doubtful_latency``; and of the diagnoses at least the part ``right`` may be."""
+    every = _played(play, scenario, seed, plays)
+    if latency < _latency_over_bound(every) <= doubtful_latency:
+        every += _played(play, scenario, seed + plays, most_plays - plays)
+    for failed in (
+        _invalid(*every),
+        _missed(every),
+        _late(every, latency),
+        _too_often_misnamed(every, right, confidence),
+    ):
+        if failed is not None:
+            return failed
+    return Finding(holds=True, why=f"mean latency is {_latency_over_bound(every):.3f} times the mean bound")
+
+
+def _latency_over_bound(plays: Sequence[Played]) -> float:
+    tweaks = [tweak for played in plays for tweak in played.verdict.tweaks if tweak.bound_n is not None]
+    bounds_n = sum(tweak.bound_n or 0 for tweak in tweaks)
+    return sum(tweak.latency_n or 0 for tweak in tweaks) / bounds_n if bounds_n else math.inf
+
+
+def _missed(plays: Sequence[Played]) -> Finding | None:
+    missed = [finding for played in plays if not (finding := played.detects(_EVER))]
+    if not missed:
+        return None
+    why = f"in {len(missed)} of {len(plays)} plays changes were missed: {missed[0].why}"
+    return Finding(holds=False, why=why, run=missed[0].run)
+
+
+def _late(plays: Sequence[Played], latency: float) -> Finding | None:
+    ratio = _latency_over_bound(plays)
+    if ratio <= latency:
+        return None
+    slowest = max(plays, key=lambda played: sum(tweak.latency_n or 0 for tweak in played.verdict.tweaks))
+    why = f"mean latency is {ratio:.2f} times the mean bound in {len(plays)} plays, allowed {latency:g}"
+    return Finding(holds=False, why=why, run=slowest.run)
+
+
+def _too_often_misnamed(plays: Sequence[Played], right: float, confidence: float) -> Finding | None:
+    said = [tweak.diagnosis.right for each in plays for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
+    wrong_n = said.count(False)
+    if not said or lower_rate(wrong_n, len(said), confidence) <= 1.0 - right:
+        return None
+    first = _wrongly_named(plays)
+    why = f"{wrong_n} of {len(said)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
+    return Finding(holds=False, why=why, run=first.run)
+
+
+def _wrongly_named(plays: Sequence[Played]) -> Finding:
+    """The first of them; there is one."""
+    return next(finding for played in plays if not (finding := played.isolates()))
+
+
+@experiment
+def single_changes_are_rightly_named(
+    play: Play,
+    scenario: Scenario,
+    seed: int,
+    expected: float,
+    refuted: float,
+    miss: float,
+    false_failure: float,
+    most_plays: int,
+    silent: int,
+) -> Finding:
+    """Wald's test of the part that is called wrongly, ``expected`` against ``refuted``; a device that has named nothing
+    in ``silent`` plays does not name changes at all, which is allowed."""
+    test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
+    every: list[Played] = []
+    for number in range(most_plays):
+        played = play(scenario, seed + number, allow_inconclusive=True)
+        if (invalid := _invalid(played)) is not None:
+            return invalid
+        right = [tweak.diagnosis.right for tweak in played.verdict.tweaks if tweak.diagnosis is not None]
+        every.append(played)
+        test.add(len(right), right.count(False))
+        if test.decision is not Decision.OPEN or (number + 1 >= silent and not test.trials):
+            break
+    why = f"{test.events} of {test.trials} single changes were called wrongly"
+    if test.decision is Decision.BELOW or not test.trials:
+        return Finding(holds=True, why=why)
+    first = _wrongly_named(every)
+    why = f"{why}, where {expected:.0%} are expected and {refuted:.0%} too many: {first.why}"
+    return Finding(holds=False, why=why, run=first.run)
+
+
+# -------------------------------------------------------------------------------------------------- whatever may happen
+
+
+@experiment
+def answers_with_numbers(play: Play, scenario: Scenario, seed: int) -> Finding:
+    """Whatever comes: the device answers, with finite numbers, and raises no alarm below its ceiling."""
+    played = play(scenario, seed, allow_inconclusive=True)
+    run, ceiling = played.run, played.verdict.ceiling
+    wrong = list(run.conditions.faults[:1])
+    for name in ("theta", "innovation", "statistic"):
+        rows = np.isfinite(getattr(run, name)).reshape(run.samples, -1).all(axis=1)
+        if not rows.all():
+            wrong.append(f"{name} is no number after sample {int(np.argmin(rows))}")
+    if (run.statistic < 0.0).any():
+        wrong.append(f"the statistic is negative after sample {int(np.argmax(run.statistic < 0.0))}")
+    if ceiling is not None:
+        low = run.alarm_index[run.statistic[run.alarm_index] < np.float32(ceiling)]
+        wrong += [f"an alarm at {index}: the statistic is below its ceiling {ceiling:g}" for index in low[:1].tolist()]
+    return Finding(not wrong, "; ".join(wrong) or f"{run.samples} samples, all answered with numbers", run=run)
+
+
+@experiment
+def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) -> Finding:
+    """While the force has no edge, up to sample ``until``, there is nothing to learn, and no alarm to raise."""
+    _configure(play, stuck_n=0)  # a displacement that does not move is a measurement then
+    played = play(scenario, seed, allow_inconclusive=True)
+    if (invalid := _invalid(played)) is not None:
+        return invalid
+    run, wrong = played.run, []
+    early = run.alarm_index[run.alarm_index < until].tolist()
+    wrong += [f"alarms in the pause, at {', '.join(map(str, early[:5]))}"] if early else []
+    wrong += [] if np.isfinite(run.theta).all() else ["theta is no number"]
+    return Finding(not wrong, "; ".join(wrong) or f"{run.samples} samples without harm", run=run)
+
+
+@experiment
+def alarms_keep_hold_off_and_warm_up(
+    play: Play, scenario: Scenario, seed: int, hold_off_n: int, warm_up_n: int, at_least: int
+) -> Finding:
+    """A device that is set to raise alarms as often as it may, and raises some, keeps those times."""
+    restless = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
+    _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **restless)
+    played = play(scenario, seed, allow_inconclusive=True)
+    if (invalid := _invalid(played)) is not None:
+        return invalid
+    run, index = played.run, played.run.alarm_index
+    if len(index) < at_least:
+        return Finding(holds=False, why=f"{len(index)} alarms, where at least {at_least} were due", run=run)
+    wrong = [f"an alarm at {index[0]}, in the warm-up of {warm_up_n} samples"] if index[0] < warm_up_n else []
+    gaps = np.diff(index)
+    if gaps.min() < hold_off_n:
+        at = index[int(np.argmin(gaps)) + 1]
+        wrong.append(f"an alarm at {at}, {gaps.min()} samples after the last, in the hold-off of {hold_off_n}")
+    return Finding(not wrong, "; ".join(wrong) or f"{len(index)} alarms, at least {gaps.min()} samples apart", run=run)
+
+
+def _configure(play: Play, **settings: Any) -> None:
+    """The device until the next test."""
+    dut = play.bench.dut
+    dut.configure(dataclasses.replace(dut.estimator, **settings))
+
+
+@experiment
+def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
+    """They leave the estimate as it is without them, or the run is INCONCLUSIVE, or refused with the cause."""
+    bench, device = play.bench, described(play.bench.dut)
+    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+    with contextlib.ExitStack() as stack:
+        if device.wire_faults:  # those with which it failed, when this is judged again
+            play = play.on(bench.rig, stack.enter_context(connect(dataclasses.replace(device, wire_faults=""))))
+        without = play(scenario, seed, allow_inconclusive=True)
+        if (invalid := _invalid(without)) is not None:
+            return invalid
+        clean = without.run
+        again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
+        try:
+            spoiled = stack.enter_context(connect(dataclasses.replace(device, wire_faults=faults)))
+            run = Bench(again, spoiled).play(again.scenario(), seed)
+        except AnalogrigError as error:
+            return Finding(holds=True, why=f"refused before the run: {error}")
+    is_same, verdict = run.theta_hash() == clean.theta_hash(), judge(run)
+    why = f"with {faults or 'no fault'} on the line the run is {verdict.outcome}"
+    why += " and the estimate as without" if is_same else ", and the estimate is another than without"
+    return Finding(is_same or not verdict.valid, why, run=run)
+
+
+@experiment
+def faults_among_the_samples_cost_no_more_than_samples(
+    play: Play, scenario: Scenario, seed: int, each: int, least_valid: int
+) -> Finding:
+    """Of each kind of fault that passes, ``each`` at messages with samples: what is lost is as if it had been declared
+    missing, to the bit, and nothing else changes. At least so many of the kinds must have left a valid run."""
+    device = dataclasses.replace(described(play.bench.dut), wire_faults="")
+    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+    kinds = sorted(PASSING.intersection(device.fault_kinds()))
+    valid: set[str] = set()
+    with connect(device) as alone:
+        play = play.on(play.bench.rig, alone)
+        without = play(scenario, seed, allow_inconclusive=True)
+        if (invalid := _invalid(without)) is not None:
+            return invalid
+        for kind, faults in _cases(kinds, alone, without.run, each):
+            run = _spoiled(without.run, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples))
+            if not judge(run).valid or not _took_effect(run):
+                continue
+            valid.add(kind)
+            if harm := _harm(run, Bench(_missing(without.run, run.lost), alone).play(_replayed(without.run), seed)):
+                return Finding(holds=False, why=f"with {faults} on the line {harm}", run=run)
+    if "repeat" in kinds and _START not in valid:
+        return Finding(holds=False, why=f"{_START} is never passed over: no run with one is valid", run=run)
+    valid.discard(_START)
+    why = f"{len(valid)} of {len(kinds)} kinds of faults left a valid run and took effect ({', '.join(sorted(valid))})"
+    if len(valid) < min(least_valid, len(kinds)):
+        return Finding(holds=False, why=f"INCONCLUSIVE: {why}, at least {least_valid} are needed")
+    return Finding(holds=True, why=why)
+
+
+PASSING = frozenset({"drop", "duplicate", "repeat", "reorder", "flip", "lose", "insert", "truncate"})
+"""Kinds of faults after which the line is as it was, and of which none goes on for long."""
+
+_BEFORE_SAMPLES_N = 5
+"""Messages to the device before the first with samples, beside two for each of its settings."""
+
+
+_START, _LATE_STARTS = "an order to start that comes again", 4
+"""Orders to start that come again, each in a run of its own: some come too late to be known for what they are."""
+
+
+def _cases(kinds: Sequence[str], dut: Dut, run: Run, each: int) -> Iterator[tuple[str, str]]:
+    """Kinds and faults: of each kind so many, evenly over a run on a connection of its own; and orders to start that
+    come again among the samples."""
+    first = 2 * len(list(dut.estimator.settings())) + _BEFORE_SAMPLES_N
+    messages = run.samples // dut.line["samples_per_message"]
+    for kind in kinds:
+        places = (first + (number + 1) * messages // (each + 1) for number in range(each))
+        yield kind, ",".join([*(f"{kind}@to:{place}" for place in places), f"seed={run.conditions.seed}"])
+    if "repeat" in kinds:
+        yield from ((_START, f"repeat@to:{first - 1},seed={seed}") for seed in range(_LATE_STARTS))
+
+
+def _replayed(run: Run) -> Scenario:
+    return RecordingRig.of(run, Path("without")).scenario()
+
+
+def _spoiled(without: Run, device: DeviceDescription) -> Run:
+    """The same samples, which a real rig would not take twice, over a line with faults."""
+    with connect(device) as dut:
+        return Bench(RecordingRig.of(without, Path("without")), dut).play(_replayed(without), without.conditions.seed)
+
+
+def _missing(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
+    """The same samples, some of them declared missing."""
+    return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | lost[:, np.newaxis]), Path("missing"))
+
+
+def _took_effect(run: Run) -> bool:
+    return bool(run.lost.any()) or any(run.conditions.counters.get(name, 0) for name in _EFFECTS)
+
+
+_EFFECTS = (
+    "frames_dropped",
+    "sequence_gaps",
+    "messages_repeated",
+    "messages_refused",
+    "samples_lost",
+    "samples_ignored",
+)
+"""Counters of the device that tell of a fault."""
+
+
+def _harm(run: Run, declared: Run) -> str:
+    """How a run differs from one in which the samples that it has lost were declared missing; empty: not at all."""
+    heard = ~run.lost
+    for name in ("theta", "innovation", "statistic"):
+        ours, theirs = (getattr(each, name)[heard].view(np.uint32) for each in (run, declared))
+        if not np.array_equal(ours, theirs):
+            at = int(np.flatnonzero(heard)[np.argmax((ours != theirs).reshape(len(ours), -1).any(axis=1))])
+            return f"{name} at sample {at} is another than with {int(run.lost.sum())} samples declared missing"
+    return "" if np.array_equal(run.alarm_index, declared.alarm_index) else "there are other alarms"

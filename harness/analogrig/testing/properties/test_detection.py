@@ -1,0 +1,111 @@
+"""What can be seen is seen in time; where nothing happens nothing is seen; what is said to have changed has, mostly.
+
+How late is in time, how often chance may spoil it, and how often a name may be wrong is said beside each number here,
+and derived in harness/README.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import assume, given
+
+from analogrig.judging.information import detectable
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import Expectations, Scenario, Tweak
+from analogrig.testing.played import Played
+from analogrig.testing.properties import Play, is_playable, with_some_seed
+from analogrig.testing.properties.experiments import (
+    changes_are_noticed_soon_and_rightly_named,
+    single_changes_are_rightly_named,
+)
+from analogrig.testing.strategies import WARM_UP_N, profile, scenarios, seeds
+from analogrig_emulator.excitation import Excitation
+
+ARL0 = 1e5
+MOST_INFORMATION = 6.0
+"""A change is found once its information has reached so many times ln ARL0, and MOST_SLACK_N samples more."""
+MOST_SLACK_N = 40
+PATIENT = Expectations(late_information_ratio=MOST_INFORMATION, late_slack_n=MOST_SLACK_N)
+
+PLAYS_N, MOST_PLAYS_N = 40, 100
+MOST_LATENCY, DOUBTFUL_LATENCY = 1.35, 1.42
+"""Mean latency over mean bound: 1.22 on the thesis profile, with a standard error of 0.029 over PLAYS_N plays; what is
+between the two is played MOST_PLAYS_N times."""
+LEAST_RIGHT, SURELY = 0.9, 1.0 - 1e-7
+"""Of the diagnoses on the thesis profile, of which two are hard: M falls by three quarters, B and K change at once."""
+
+SINGLE_WRONG, SINGLE_FAR_TOO_WRONG = 0.01, 0.05
+"""Of the diagnoses of single changes by 20 %: what is expected at most, and what is refuted."""
+SINGLE_MISS, SINGLE_FALSE_FAILURE = 1e-3, 1e-7
+MOST_SINGLE_PLAYS_N, SILENT_N = 300, 5
+
+_TURNED = {
+    "stiffness_n_per_m": (24500.0, (0.8,)),
+    "damping_n_s_per_m": (3021.0, (0.8, 1.2)),
+    "mass_kg": (115.0, (0.8, 1.2)),
+}
+_SETTINGS: list[dict[str, Any]] = [
+    {name: value * each} for name, (value, factors) in _TURNED.items() for factor in factors for each in (factor, 1.0)
+]
+_EACH_N = 250
+SINGLY = Scenario(
+    samples=WARM_UP_N + _EACH_N * len(_SETTINGS),
+    excitation=Excitation(low_v=0.1, high_v=9.0),
+    random_phase=True,
+    tweaks=tuple(Tweak(WARM_UP_N + _EACH_N * i, **setting) for i, setting in enumerate(_SETTINGS)),
+    name="singly",
+    description="front suspension: one parameter at a time, by 20 % and back; K does not rise, for want of pot",
+)
+
+
+@pytest.mark.needs("tweak", "excite")
+@profile()
+@given(scenario=scenarios(expect=PATIENT), seed=seeds())
+def test_every_change_that_can_be_seen_is_found_once(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
+    assume(detectable(scenario, ARL0**MOST_INFORMATION))
+    found = with_some_seed(play, scenario, seed, Played.passes)
+    assert found
+
+
+@pytest.mark.needs("excite")
+@profile()
+@given(scenario=scenarios(most_changes=0), seed=seeds())
+def test_a_plant_that_does_not_change_raises_no_alarm(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
+    found = with_some_seed(play, scenario, seed, Played.stays_quiet)
+    assert found
+
+
+@pytest.mark.needs("tweak", "excite")
+def test_changes_are_noticed_soon_and_rightly_named(play: Play) -> None:
+    found = changes_are_noticed_soon_and_rightly_named(
+        play,
+        Scenario.load("thesis"),
+        0,
+        plays=PLAYS_N,
+        latency=MOST_LATENCY,
+        doubtful_latency=DOUBTFUL_LATENCY,
+        most_plays=MOST_PLAYS_N,
+        right=LEAST_RIGHT,
+        confidence=SURELY,
+    )
+    assert found
+
+
+@pytest.mark.needs("tweak", "excite")
+def test_a_single_change_is_rightly_named(play: Play) -> None:
+    found = single_changes_are_rightly_named(
+        play,
+        SINGLY,
+        0,
+        expected=SINGLE_WRONG,
+        refuted=SINGLE_FAR_TOO_WRONG,
+        miss=SINGLE_MISS,
+        false_failure=SINGLE_FALSE_FAILURE,
+        most_plays=MOST_SINGLE_PLAYS_N,
+        silent=SILENT_N,
+    )
+    assert found

@@ -1,0 +1,70 @@
+"""Estimates are right when the plant has been still, and numbers whatever comes."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import assume, given
+
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
+from analogrig.rigs.rig import Rig
+from analogrig.scenario import Scenario
+from analogrig.testing.played import Played
+from analogrig.testing.properties import Play, is_playable, with_some_seed
+from analogrig.testing.properties.experiments import (
+    alarms_keep_hold_off_and_warm_up,
+    answers_with_numbers,
+    pause_does_no_harm,
+)
+from analogrig.testing.statement import Finding
+from analogrig.testing.strategies import profile, rigs, scenarios, seeds
+from analogrig_emulator.excitation import Excitation
+
+WITHIN = 0.1
+"""Of M, B and K each: six times the rms error of the worst plant drawn."""
+
+PAUSED = Scenario(
+    samples=16_000,
+    excitation=Excitation(low_v=0.1, high_v=9.9, frequency_hz=200.0 / 130.0, shape="pulse", duty=0.01),
+    name="paused",
+)
+"""An edge, and another 130 samples later, every 13,000: between them nothing is to be learned."""
+PAUSE_END_N = 13_000
+
+STEADY = Scenario(samples=2000, excitation=Excitation(low_v=0.1, high_v=9.9), name="steady")
+HOLD_OFF_N, WARM_UP_N, AT_LEAST = 80, 120, 5
+
+
+def estimates(played: Played) -> Finding:
+    return played.estimates(WITHIN)
+
+
+@pytest.mark.needs("excite")
+@profile()
+@given(scenario=scenarios(most_changes=0), seed=seeds())
+def test_estimates_come_to_the_truth(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(rig, scenario))
+    found = with_some_seed(play, scenario, seed, estimates)
+    assert found
+
+
+@profile()
+@given(drawn=rigs(most_noise_lsb=200.0), scenario=scenarios(), seed=seeds())
+def test_whatever_comes_the_device_answers_with_numbers(
+    play: Play, drawn: EmulatorDescription, scenario: Scenario, seed: int
+) -> None:
+    found = answers_with_numbers(play.on(EmulatorRig(drawn), play.bench.dut), scenario, seed)
+    assert found
+
+
+@pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
+def test_a_pause_of_the_excitation_does_no_harm(play: Play) -> None:
+    found = pause_does_no_harm(play, PAUSED, 1, until=PAUSE_END_N)
+    assert found
+
+
+@pytest.mark.needs("excite")
+def test_alarms_keep_the_hold_off_and_the_warm_up(play: Play) -> None:
+    found = alarms_keep_hold_off_and_warm_up(
+        play, STEADY, 1, hold_off_n=HOLD_OFF_N, warm_up_n=WARM_UP_N, at_least=AT_LEAST
+    )
+    assert found

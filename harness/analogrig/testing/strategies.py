@@ -1,0 +1,330 @@
+"""What a property can be tried on, as strategies of hypothesis: plants, changes, excitations, noise, cards, machines,
+faults of the line, and scenarios of all that.
+
+Each of them shrinks towards the usual: the front suspension with its own parameters, one jump of the stiffness, the
+square wave of the thesis, the ideal card. What is left of a scenario that fails is what matters. ``detectable`` of
+analogrig.judging.information tells which changes a device may be held to.
+
+Needs the extra ``analogrig[pytest]``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, assume, settings
+from hypothesis import strategies as st
+
+from analogrig.plant import PARAMETERS, Plant
+from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
+from analogrig.scenario import PLANTS, Expectations, PlantChoice, Scenario, Tweak
+from analogrig_emulator.excitation import Excitation
+from analogrig_emulator.suspension import PROGRAMS
+
+FIELDS = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}
+REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
+DAMPING_RATIO = (0.4, 1.2)
+"""The plants that the default device is held to, all of which the pots can show. It raises false alarms on slower ones
+(estimator_c/README.md)."""
+
+WIDE_RANGES_V = {
+    "force": (-1.0, 11.0),
+    "displacement": (-1.0, 9.0),
+    "velocity": (-10.0, 10.0),
+    "net_force": (-12.5, 12.5),
+}
+"""Of the card of the rig ``emulator``: they hold every signal."""
+
+WARM_UP_N, SETTLING_N = 400, 300
+"""Samples before the first change, and between two: enough edges for the device to have learned the plant."""
+
+QUIET_N = 1000
+"""Samples of a scenario in which nothing changes."""
+
+MOST_DISPLACEMENT_V = 8.0
+"""That a scenario may come to, at the most."""
+
+_EXAMPLES = {"ci": 15, "nightly": 300, "soak": 5000}
+
+for _name, _examples in _EXAMPLES.items():
+    settings.register_profile(
+        f"analogrig-{_name}",
+        max_examples=_examples,
+        derandomize=_name == "ci",
+        deadline=None,
+        print_blob=_name != "ci",
+        report_multiple_bugs=False,  # the files that are left are those of one
+        phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.target, Phase.shrink],  # to explain takes minutes
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
+
+
+def profile(name: str = "") -> settings:
+    """How much a property tries: ``ci`` (the same each time), ``nightly``, ``soak``; else that of --hil-profile."""
+    return settings.get_profile(f"analogrig-{name or os.environ.get('ANALOGRIG_HIL_PROFILE', 'ci')}")
+
+
+def _usually(usual: Any, others: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    """Shrinks to the usual value."""
+    return st.one_of(st.just(usual), others)
+
+
+def _number(low: float, high: float, digits: int = 3) -> st.SearchStrategy[float]:
+    """Evenly spread, with few digits, so that a file shows it as it is."""
+    step = 10.0 ** math.floor(math.log10(high) - digits + 1)
+    return st.integers(math.ceil(low / step), math.floor(high / step)).map(lambda n: float(f"{n * step:.12g}"))
+
+
+# ------------------------------------------------------------------------------------------------------ what is played
+
+
+def suspensions() -> st.SearchStrategy[PlantChoice]:
+    """Front suspensions with any mass, damping and stiffness that the pots can show."""
+    front = PLANTS["front"].parameters()
+    mass, stiffness = (_usually(front[name], _number(*REACH[name])) for name in ("M", "K"))
+    return st.builds(_suspension, mass, stiffness, _usually(None, _number(*DAMPING_RATIO, 2)))
+
+
+def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
+    """So many of the same, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
+    rng = np.random.default_rng(seed)
+    mass, stiffness, ratio = (
+        rng.uniform(*ends, count) for ends in (*(REACH[name] for name in ("M", "K")), DAMPING_RATIO)
+    )
+    return [
+        _suspension(_rounded(float(m)), _rounded(float(k)), float(zeta))
+        for m, k, zeta in zip(mass, stiffness, ratio, strict=True)
+    ]
+
+
+def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> PlantChoice:
+    """Without a damping ratio, that of the front suspension."""
+    front = PLANTS["front"]
+    critical = 2.0 * math.sqrt(mass_kg * stiffness_n_per_m)
+    damping = front.damping_n_s_per_m if damping_ratio is None else _rounded(damping_ratio * critical)
+    if not DAMPING_RATIO[0] <= damping / critical <= DAMPING_RATIO[1]:
+        damping = _rounded(0.8 * critical)
+    return PlantChoice("front", mass_kg, damping, stiffness_n_per_m)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+def _within_reach(plant: Plant) -> bool:
+    ratio = _damping_ratio(plant)
+    values = plant.parameters()
+    return DAMPING_RATIO[0] <= ratio <= DAMPING_RATIO[1] and all(
+        low <= values[name] <= high for name, (low, high) in REACH.items()
+    )
+
+
+def _damping_ratio(plant: Plant) -> float:
+    return plant.damping_n_s_per_m / (2.0 * math.sqrt(plant.stiffness_n_per_m * plant.mass_kg))
+
+
+def changes(
+    plant: PlantChoice | None = None,
+    *,
+    parameters: Sequence[str] = ("K", "B", "M"),
+    sizes: tuple[float, float] = (0.1, 0.3),
+    at: st.SearchStrategy[int] | None = None,
+    together: int = 1,
+    longest_ramp_n: int = 0,
+) -> st.SearchStrategy[Tweak]:
+    """Pots that are turned.
+
+    :param plant: the plant that changes; None: the front suspension.
+    :param sizes: the least and the largest relative change, up or down as the pots allow.
+    :param at: the sample.
+    :param together: so many parameters may change at once.
+    :param longest_ramp_n: 0: only jumps.
+    """
+    truth = (plant or PlantChoice()).plant()
+    return _changes(truth, tuple(parameters), sizes, st.just(WARM_UP_N) if at is None else at, together, longest_ramp_n)
+
+
+@st.composite
+def _changes(
+    draw: st.DrawFn,
+    truth: Plant,
+    parameters: tuple[str, ...],
+    sizes: tuple[float, float],
+    at: st.SearchStrategy[int],
+    together: int,
+    longest_ramp_n: int,
+) -> Tweak:
+    count = draw(st.integers(1, together))
+    names = draw(st.lists(st.sampled_from(parameters), min_size=count, max_size=count, unique=True))
+    changed = truth
+    for name in names:
+        size = draw(_number(sizes[0], sizes[1], 2))
+        ways = [changed.scaled(name, factor) for factor in (1.0 - size, 1.0 + size)]
+        able = [way for way in ways if _within_reach(way)]
+        assume(able)
+        changed = draw(st.sampled_from(able))
+    values = changed.parameters()
+    turned = {FIELDS[name]: _rounded(values[name]) for name in names}
+    return Tweak(sample=draw(at), ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
+
+
+def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:
+    """Two-level waveforms within the card's range, never longer than 10 ms without an edge; the usual is the thesis's
+    square wave.
+
+    :param free: also generators with a clock of their own, up to 20 ppm fast or slow.
+    """
+    clocks = (
+        _usually(("card", 0.0), st.tuples(st.just("free"), _number(1.0, 20.0, 2))) if free else st.just(("card", 0.0))
+    )
+    return st.builds(
+        _excitation,
+        _usually("square", st.sampled_from(["pulse", "prbs"])),
+        _usually((0.1, 9.9), st.tuples(_number(0.1, 2.0, 2), _number(7.0, 9.9, 2))),
+        _usually(200.0, st.sampled_from([100.0, 125.0, 160.0, 250.0, 400.0])),
+        _usually(0.0, _number(0.01, 0.99, 2)),
+        clocks,
+    )
+
+
+def _excitation(
+    shape: str, levels_v: tuple[float, float], frequency_hz: float, phase: float, clock: tuple[str, float]
+) -> Excitation:
+    """A random sequence stays where it is for up to as many bits as its register has."""
+    return Excitation(
+        shape=shape,
+        low_v=levels_v[0],
+        high_v=levels_v[1],
+        frequency_hz=4.0 * frequency_hz if shape == "prbs" else frequency_hz,
+        phase=phase,
+        duty=0.4 if shape == "pulse" else 0.5,
+        clock=clock[0],
+        drift_ppm=clock[1],
+        register_length=4 if shape == "prbs" else 9,
+    )
+
+
+def _within_range(excitation: Excitation, plants: Sequence[Plant]) -> Excitation:
+    """With its upper level so low that no displacement goes beyond the card's range. What undershoots it is missing.
+
+    About the middle of the levels the displacement swings by at most half their difference, over K, times what the
+    impulse response of such a plant adds up to in magnitude: coth(pi zeta / (2 sqrt(1 - zeta^2))).
+    """
+    volts_per_m = PROGRAMS["front"].scales.volts("displacement")
+    n_per_v = 1.0 / PROGRAMS["front"].scales.volts("force")
+    low, high = excitation.low_v, excitation.high_v
+    for plant in plants:
+        v_per_v = n_per_v * volts_per_m / plant.stiffness_n_per_m
+        zeta = _damping_ratio(plant)
+        swing = 1.0 if zeta >= 1.0 else 1.0 / math.tanh(0.5 * math.pi * zeta / math.sqrt(1.0 - zeta * zeta))
+        # low + high, over two, and (high - low) over two times the swing, are at most MOST_DISPLACEMENT_V together
+        most = (2.0 * MOST_DISPLACEMENT_V / v_per_v + low * (swing - 1.0)) / (swing + 1.0)
+        high = min(high, math.floor(10.0 * most) / 10.0)
+    return dataclasses.replace(excitation, high_v=max(high, low))
+
+
+# ---------------------------------------------------------------------------------------------------- on what it plays
+
+
+def noise(most_lsb: float = 1.0) -> st.SearchStrategy[float]:
+    """Of a card, rms in LSB; the default device is set for no more than 1."""
+    return _usually(most_lsb, _number(0.1 * most_lsb, most_lsb, 2))
+
+
+def cards(most_noise_lsb: float = 1.0) -> st.SearchStrategy[CardDescription]:
+    """Cards with ranges that hold the signals: ideal, or with the faults of good ones."""
+    faults = {
+        "gain_error": st.lists(_number(1e-4, 2e-3, 2), min_size=4, max_size=4).map(tuple),
+        "offset_lsb": st.lists(_number(0.1, 3.0, 2), min_size=4, max_size=4).map(tuple),
+        "aperture_jitter_s": st.just(1e-9),
+    }
+    return st.builds(
+        CardDescription,
+        range_v=st.just(WIDE_RANGES_V),
+        noise_lsb=noise(most_noise_lsb),
+        faults=_usually({}, st.fixed_dictionaries({}, optional=faults)),
+    )
+
+
+def computers() -> st.SearchStrategy[ComputerDescription]:
+    """Machines of ideal or real amplifiers, whose offsets, and whose components, the seed draws."""
+    return st.builds(
+        ComputerDescription,
+        op_amp=_usually("tl07x", st.sampled_from(["ideal", "opa627"])),
+        offset_v=_usually(0.0, _number(1e-3, 3e-3, 2)),
+        components=_usually("nominal", st.just("polypropylene")),
+    )
+
+
+def rigs(most_noise_lsb: float = 1.0) -> st.SearchStrategy[EmulatorDescription]:
+    """Emulated computers with their cards."""
+    return st.builds(EmulatorDescription, card=cards(most_noise_lsb), computer=computers(), name=st.just("drawn"))
+
+
+def seeds() -> st.SearchStrategy[int]:
+    """Of all that is random in a play."""
+    return st.integers(0, 2**31 - 1)
+
+
+def link_faults(kinds: Sequence[str] | None = None, most: int = 3) -> st.SearchStrategy[str]:
+    """What goes wrong on a line, as ``--wire-faults`` has it; shrinks to a line without faults."""
+    from analogrig.links.faulty_wire import FaultyWire
+
+    where = st.one_of(
+        st.builds("{}:{}".format, st.sampled_from(["to", "from"]), st.integers(0, 400)),
+        _number(0.001, 0.02, 2).map("{:g}".format),
+    )
+    fault = st.builds("{}@{}".format, st.sampled_from(sorted(kinds or FaultyWire.HAPPENS)), where)
+    return st.lists(fault, max_size=most, unique_by=lambda text: text.partition("@")[0]).flatmap(
+        lambda faults: seeds().map(lambda seed: ",".join([*faults, f"seed={seed}"]) if faults else "")
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- scenarios
+
+
+@st.composite
+def scenarios(
+    draw: st.DrawFn,
+    *,
+    most_changes: int = 2,
+    sizes: tuple[float, float] = (0.1, 0.3),
+    together: int = 1,
+    longest_ramp_n: int = 0,
+    free: bool = False,
+    expect: Expectations | None = None,
+) -> Scenario:
+    """Scenarios: a suspension, an excitation, and changes with time to learn in between.
+
+    Whether they can be seen is for ``detectable`` to say.
+    """
+    plant = draw(suspensions())
+    excitation = draw(excitations(free=free))
+    tweaks: list[Tweak] = []
+    sample, now, passed = WARM_UP_N, plant, [plant]
+    for _ in range(draw(st.integers(min(1, most_changes), most_changes))):
+        sample += draw(st.integers(0, 60))
+        tweak = draw(changes(now, sizes=sizes, at=st.just(sample), together=together, longest_ramp_n=longest_ramp_n))
+        tweaks.append(tweak)
+        now = PlantChoice(set="front", **_after(now, tweak))
+        passed.append(now)
+        sample += tweak.ramp_n + SETTLING_N
+    plants = [each.plant() for each in passed]
+    return Scenario(
+        samples=sample if tweaks else QUIET_N,
+        excitation=_within_range(excitation, plants),
+        plant=plant,
+        tweaks=tuple(tweaks),
+        expect=expect or Expectations(),
+        name="drawn",
+    )
+
+
+def _after(plant: PlantChoice, tweak: Tweak) -> dict[str, float]:
+    before = plant.plant().parameters()
+    return {FIELDS[name]: tweak.given().get(FIELDS[name], before[name]) for name in PARAMETERS}

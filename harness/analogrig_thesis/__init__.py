@@ -1,0 +1,10 @@
+"""The experiments of the thesis, chapters 3 to 5, made again; ``analogrig thesis``.
+
+from analogrig_thesis import reproduce
+reproduction = reproduce()
+reproduction.write(Path("build/thesis"))
+"""
+
+from analogrig_thesis.reproduction import Reproduction, reproduce
+
+__all__ = ["Reproduction", "reproduce"]

@@ -1,0 +1,114 @@
+"""The plants of the thesis as difference equations, and its one time-varying profile."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from analogrig.plant import AT_REST, Plant, SampledPlant
+from analogrig.run import Segment
+from analogrig_thesis.document import Signal
+
+PERIOD_S = 0.01
+"""Section 4.2: "The system sample rate was 100Hz"."""
+
+SHOCK = Plant(2.0, 900.0, 12250.0)
+FRONT = Plant(115.0, 3021.0, 24500.0)
+
+PROFILE = (
+    Segment(0, FRONT),
+    Segment(200, Plant(115.0, 3021.0, 18000.0)),
+    Segment(400, Plant(115.0, 3453.0, 18000.0)),
+    Segment(500, Plant(115.0, 2123.0, 20000.0)),
+    Segment(600, Plant(30.0, 2123.0, 20000.0)),
+)
+"""Section 4.4.1. Printed with both ends: 0 <= t <= 200, 201 <= t <= 400, ..."""
+PROFILE_N = 800
+
+
+@dataclass(frozen=True)
+class Arx:
+    """y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) + b1 u(k-2) (thesis Equ 3.10 with na = nb = 2)."""
+
+    a1: float
+    a2: float
+    b0: float
+    b1: float
+
+    @classmethod
+    def of(cls, plant: Plant) -> Arx:
+        """Zero-order hold: trace and determinant of the transition matrix are -a1 and a2, and b follows from the first
+        two values of the step response."""
+        sampled = SampledPlant.of(plant, PERIOD_S)
+        xx, xv, vx, vv = sampled.transition
+        first = sampled.next(AT_REST, 1.0)
+        second = sampled.next(first, 1.0)
+        a1, a2 = -(xx + vv), xx * vv - xv * vx
+        return cls(a1, a2, first[0], second[0] + a1 * first[0] - first[0])
+
+    @classmethod
+    def of_theta(cls, theta: Sequence[float] | Signal) -> Arx:
+        a1, a2, b0, b1 = (float(x) for x in theta[:4])
+        return cls(a1, a2, b0, b1)
+
+    @property
+    def values(self) -> tuple[float, float, float, float]:
+        return (self.a1, self.a2, self.b0, self.b1)
+
+    @property
+    def poles(self) -> tuple[complex, complex]:
+        """The larger one first."""
+        first, second = sorted(np.roots([1.0, self.a1, self.a2]).tolist(), key=abs, reverse=True)
+        return (complex(first), complex(second))
+
+    @property
+    def gain(self) -> float:
+        """Static, metres per newton."""
+        return (self.b0 + self.b1) / (1.0 + self.a1 + self.a2)
+
+    def response(self, u: Signal, before: tuple[Signal, Signal] | None = None) -> Signal:
+        """The simulated output (n,).
+
+        :param before: the two inputs and the two outputs before the first sample; at rest if not given.
+        """
+        past_u, past_y = before or (np.zeros(2), np.zeros(2))
+        inputs, y = [*past_u.tolist(), *u.tolist()], past_y.tolist()
+        for k in range(len(u)):
+            y.append(-self.a1 * y[k + 1] - self.a2 * y[k] + self.b0 * inputs[k + 1] + self.b1 * inputs[k])
+        return np.array(y[2:])
+
+    def frequency_response(self, frequency_hz: Signal) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+        """G(exp(j w T)) (n,) complex."""
+        z = np.exp(2j * math.pi * frequency_hz * PERIOD_S)
+        return np.asarray((self.b0 * z + self.b1) / (z * z + self.a1 * z + self.a2))
+
+
+def square(n: int, low: float, high: float, period_n: int = 100) -> Signal:
+    """A square wave that begins high; 100 samples are the 1 Hz of the thesis."""
+    return np.where(np.arange(n) % period_n < period_n // 2, high, low)
+
+
+def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: float = PERIOD_S) -> Signal:
+    """The displacement (n,) of a plant whose parameters jump in its physical state: position and velocity go on."""
+    ends = [*(segment.start for segment in segments[1:]), len(u)]
+    y, state = np.empty(len(u)), AT_REST
+    for segment, end in zip(segments, ends, strict=True):
+        sampled = SampledPlant.of(segment.plant, period_s)
+        for k in range(segment.start, end):
+            y[k] = state[0]
+            state = sampled.next(state, float(u[k]))
+    return y
+
+
+def jumps_in_the_coefficients(u: Signal, segments: Sequence[Segment] = PROFILE) -> Signal:
+    """As ``time_varying``, in the other reading: the coefficients of the difference equation jump, its past stays."""
+    bounds = [*(segment.start for segment in segments), len(u)]
+    y, before = np.empty(0), (np.zeros(2), np.zeros(2))
+    for segment, (start, end) in zip(segments, itertools.pairwise(bounds), strict=True):
+        y = np.append(y, Arx.of(segment.plant).response(u[start:end], before))
+        before = (u[end - 2 : end], y[-2:])
+    return y
