@@ -201,7 +201,7 @@ def left_by(item: pytest.Item) -> str:
 
 
 def _is_left_already(item: pytest.Item, folder: Path) -> bool:
-    """True if --hil-scenario-dir holds the counterexample of this item already, or would gain it as one more scenario."""
+    """True if --hil-scenario-dir holds the counterexample of this item, or would gain it as one more scenario."""
     suite = SCENARIO_DIR.of(item)
     if not suite or not item.path.resolve().is_relative_to(Path(suite).resolve()):
         return False
