@@ -154,7 +154,7 @@ def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
         "pytest",
         "-q",
         "failed",
-        "--scenario-dir",
+        "--hil-scenario-dir",
         "failed",
         cwd=users_repository,
     )

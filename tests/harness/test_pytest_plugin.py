@@ -46,8 +46,8 @@ missed = 0
 {expect}
 """
 PLAYS = """\
-def test_it(play):
-    played = play("short.toml")
+def test_it(hil_play):
+    played = hil_play("short.toml")
     assert played.run.samples == 400
     {assertion}
 """
@@ -88,7 +88,7 @@ def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]
 
 def test_play_of_a_scenario_is_a_test_and_junit_knows_its_figures(user: pytest.Pytester) -> None:
     user.makepyfile(PLAYS.format(assertion="assert played.detects(within=3.0) and played.stays_quiet()"))
-    run(user, "--dut", "inproc", "--junitxml", "junit.xml").assert_outcomes(passed=1)
+    run(user, "--hil-dut", "inproc", "--junitxml", "junit.xml").assert_outcomes(passed=1)
     told = properties(user)
     assert told["dut"] == "inproc"
     assert told["rig"] == "emulator"
@@ -107,12 +107,19 @@ LEVELS = {
     "command line": ("emulator-skewed", "inproc?exchange=block", "of_command_line", "runs/command_line", "ci"),
     "indirect": ("emulator-real", "mean-between-faults", "of_indirect", "runs/indirect", "soak"),
 }
-NAMES = ("rig", "dut", "scenario_dir", "runs_dir", "hil_profile")
+VARIABLES = (
+    "ANALOGRIG_RIG",
+    "ANALOGRIG_DUT",
+    "ANALOGRIG_SCENARIO_DIR",
+    "ANALOGRIG_RUNS_DIR",
+    "ANALOGRIG_HIL_PROFILE",
+)
+NAMES = ("hil_rig", "hil_dut", "hil_scenario_dir", "hil_runs_dir", "hil_profile")
 TELLS_ALL = """
 import pytest
 
-def test_it(rig, dut, scenario_dir, runs_dir, hil_profile):
-    print("<", rig.description()["name"], dut.name, scenario_dir, runs_dir, hil_profile, ">")
+def test_it(hil_rig, hil_dut, hil_scenario_dir, hil_runs_dir, hil_profile):
+    print("<", hil_rig.description()["name"], hil_dut.name, hil_scenario_dir, hil_runs_dir, hil_profile, ">")
 """
 
 
@@ -129,11 +136,11 @@ def test_each_option_is_taken_from_parameter_then_command_line_then_environment_
     for _, _, folder, *_ in LEVELS.values():
         user.mkdir(folder)
     tell("default")
-    options = [f"analogrig_{name} = {value}" for name, value in zip(NAMES, LEVELS["ini"], strict=True)]
+    options = [f"{name} = {value}" for name, value in zip(NAMES, LEVELS["ini"], strict=True)]
     user.makeini("\n".join(["[pytest]", *options]))
     tell("ini")
-    for name, value in zip(NAMES, LEVELS["environment"], strict=True):
-        monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
+    for variable, value in zip(VARIABLES, LEVELS["environment"], strict=True):
+        monkeypatch.setenv(variable, value)
     tell("environment")
     given = [f"--{name.replace('_', '-')}={value}" for name, value in zip(NAMES, LEVELS["command line"], strict=True)]
     tell("command line", *given)
@@ -150,8 +157,8 @@ def test_each_option_is_taken_from_parameter_then_command_line_then_environment_
     ("name", "value", "complaint"),
     [
         ("hil_profile", "tea", "must be one of ci, nightly, soak, not 'tea'"),
-        ("scenario_dir", "nowhere", "nowhere is no folder"),
-        ("runs_dir", "short.toml/runs", "short.toml is no folder"),
+        ("hil_scenario_dir", "nowhere", "nowhere is no folder"),
+        ("hil_runs_dir", "short.toml/runs", "short.toml is no folder"),
     ],
 )
 def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
@@ -163,10 +170,11 @@ def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
     )
     result = user.runpytest_inprocess("-p", "no:cacheprovider", path.name)
     result.stdout.fnmatch_lines([f"parameter {name} of *::test_it*: {complaint}"])
-    user.makeini(f"[pytest]\nanalogrig_{name} = {value}")
-    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: *tox.ini: analogrig_{name}: {complaint}"])
-    monkeypatch.setenv(f"ANALOGRIG_{name.upper()}", value)
-    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: ANALOGRIG_{name.upper()}: {complaint}"])
+    user.makeini(f"[pytest]\n{name} = {value}")
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: *tox.ini: {name}: {complaint}"])
+    variable = VARIABLES[NAMES.index(name)]
+    monkeypatch.setenv(variable, value)
+    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: {variable}: {complaint}"])
     flag = f"--{name.replace('_', '-')}"
     refused(user, path.name, f"{flag}={value}").stderr.fnmatch_lines([f"ERROR: {flag}: {complaint}"])
 
@@ -174,12 +182,12 @@ def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
 def test_rig_or_device_that_does_not_exist_fails_in_one_line_with_who_named_it(
     user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    user.makepyfile("def test_rig(rig):\n    pass\n\ndef test_device(dut):\n    pass\n")
+    user.makepyfile("def test_rig(hil_rig):\n    pass\n\ndef test_device(hil_dut):\n    pass\n")
     monkeypatch.setenv("ANALOGRIG_DUT", "no-such")
-    result = run(user, "--rig", "none")
+    result = run(user, "--hil-rig", "none")
     result.assert_outcomes(errors=2)
     result.stdout.fnmatch_lines(
-        ["--rig: no rig is called 'none': *", "ANALOGRIG_DUT: no device is called 'no-such': *"]
+        ["--hil-rig: no rig is called 'none': *", "ANALOGRIG_DUT: no device is called 'no-such': *"]
     )
     assert "Traceback" not in result.stdout.str()
     assert "another exception" not in result.stdout.str()
@@ -190,9 +198,9 @@ def test_need_that_the_rig_lacks_skips_with_the_reason(user: pytest.Pytester) ->
         """
         import pytest
 
-        @pytest.mark.needs("excite", "tweak")
-        @pytest.mark.parametrize("rig", ["emulator", "recording:RECORDED"], indirect=True)
-        def test_it(rig):
+        @pytest.mark.hil_needs("excite", "tweak")
+        @pytest.mark.parametrize("hil_rig", ["emulator", "recording:RECORDED"], indirect=True)
+        def test_it(hil_rig):
             pass
         """.replace("RECORDED", str(recorded(user.path)))
     )
@@ -208,9 +216,9 @@ def recorded(folder: Path) -> Path:
 
 
 def test_need_that_no_rig_knows_ends_the_collection_in_one_line_with_those_known(user: pytest.Pytester) -> None:
-    user.makepyfile("import pytest\n\n@pytest.mark.needs('twaek')\ndef test_it(rig):\n    pass\n")
+    user.makepyfile("import pytest\n\n@pytest.mark.hil_needs('twaek')\ndef test_it(hil_rig):\n    pass\n")
     result = refused(user)
-    result.stderr.fnmatch_lines(["ERROR: *::test_it: needs: no rig is known to 'twaek': there are excite, tweak"])
+    result.stderr.fnmatch_lines(["ERROR: *::test_it: hil_needs: no rig is known to 'twaek': there are excite, tweak"])
     assert len(result.errlines) <= 2
 
 
@@ -224,7 +232,7 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     user.makepyfile(
         PLAYS.replace('"short.toml"', '"short.toml", seed=77').format(assertion="assert played.detects(within=0.0)")
     )
-    result = run(user, "--dut", "inproc", "--rig", "noisy.toml", "--junitxml", "junit.xml")
+    result = run(user, "--hil-dut", "inproc", "--hil-rig", "noisy.toml", "--junitxml", "junit.xml")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         ["E*<no: K at 300: * samples, allowed 1>*", "repeat it with: analogrig run --scenario *"]
@@ -243,7 +251,7 @@ def test_failure_on_a_device_of_a_file_leaves_that_device_too(
         'kind = "inproc"\nexchange = "block"\nwire_faults = "duplicate@0.01,seed=3"\n[estimator]\nwarm_up_n = 150\n'
     )
     user.makepyfile(PLAYS.format(assertion="assert False"))
-    result = run(user, "--dut", "./mydev.toml", "--junitxml", "junit.xml")
+    result = run(user, "--hil-dut", "./mydev.toml", "--junitxml", "junit.xml")
     (line,) = [line for line in result.outlines if line.startswith("repeat it with: ")]
     (user.path / "mydev.toml").unlink()
     monkeypatch.chdir(user.path)
@@ -262,14 +270,14 @@ def test_command_of_a_play_names_files_as_the_user_does_and_says_nothing_when_no
         import dataclasses
         from analogrig.scenario import Scenario
 
-        def test_it(play):
-            played = play("short.toml", seed=5)
+        def test_it(hil_play):
+            played = hil_play("short.toml", seed=5)
             print(played.repeat, played.verdict.theta_hash, sep="#")
-            assert not play(dataclasses.replace(Scenario.load("short.toml"), samples=500)).repeat
-            assert play("thesis").repeat
+            assert not hil_play(dataclasses.replace(Scenario.load("short.toml"), samples=500)).repeat
+            assert hil_play("thesis").repeat
         """
     )
-    result = run(user, "-s", "--dut", "own/dev.toml", "--rig", "own/rig.toml")
+    result = run(user, "-s", "--hil-dut", "own/dev.toml", "--hil-rig", "own/rig.toml")
     result.assert_outcomes(passed=1)
     (line,) = [line for line in result.outlines if "#" in line]
     command, _, theta = line[line.index("analogrig") :].partition("#")
@@ -287,7 +295,7 @@ def test_folder_of_scenarios_is_a_suite(user: pytest.Pytester) -> None:
     shipped = Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-0-10v.toml"
     (folder / "rig.toml").write_text(shipped.read_text())
     (folder / "wrong.toml").write_text("samples = -1\n[excitation]\n")
-    result = run(user, "--dut", "inproc", "--scenario-dir", "suite", "-v", "-rA")
+    result = run(user, "--hil-dut", "inproc", "--hil-scenario-dir", "suite", "-v", "-rA")
     result.stdout.fnmatch_lines(["*good*PASSED*"])
     result.stdout.fnmatch_lines(["*wrong.toml*samples must be in 1 .. *"])
     result.assert_outcomes(passed=1, failed=2)
@@ -298,18 +306,18 @@ def test_folder_of_scenarios_comes_on_top_of_the_tests_and_a_stray_kind_is_told(
     folder = user.mkdir("suite")
     (folder / "stray.toml").write_text('kind = "scenario"\n' + SHORT.format(head="", expect=""))
     user.makepyfile("def test_own():\n    pass\n")
-    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result = run(user, "--hil-dut", "inproc", "--hil-scenario-dir", "suite")
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*stray.toml: unknown key 'kind' *"])
-    refused(user, "--scenario-dir", "").stderr.fnmatch_lines(["ERROR: --scenario-dir: is empty"])
+    refused(user, "--hil-scenario-dir", "").stderr.fnmatch_lines(["ERROR: --hil-scenario-dir: is empty"])
     user.mkdir("build")
-    refused(user, "--scenario-dir", "build").stderr.fnmatch_lines(["*pytest does not look into build of itself: *"])
+    refused(user, "--hil-scenario-dir", "build").stderr.fnmatch_lines(["*pytest does not look into build of itself: *"])
 
 
 def test_inconclusive_play_fails_the_test_with_its_reason(user: pytest.Pytester) -> None:
     user.path.joinpath("deaf.toml").write_text('kind = "inproc"\nwire_faults = "hang@from:150"\n')
     user.makepyfile(PLAYS.format(assertion="pass"))
-    result = run(user, "--dut", "deaf.toml")
+    result = run(user, "--hil-dut", "deaf.toml")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*INCONCLUSIVE: device deaf: no estimate for sample *"])
 
@@ -323,19 +331,19 @@ def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Py
         sys.path.append({str(Path(__file__).parents[2])!r})
         from tests.harness.processes import descendants
 
-        def test_first(play, dut):
-            dut.configure(dut.estimator.__class__(warm_up_n=33))
+        def test_first(hil_play, hil_dut):
+            hil_dut.configure(hil_dut.estimator.__class__(warm_up_n=33))
             device = descendants(os.getpid())[-1]
             os.kill(device, signal.SIGSTOP)
             print("<stopped", device, ">")
-            play("short.toml")
+            hil_play("short.toml")
 
-        def test_second(play, dut):
-            assert dut.estimator.warm_up_n != 33
-            assert play("short.toml").detects()
+        def test_second(hil_play, hil_dut):
+            assert hil_dut.estimator.warm_up_n != 33
+            assert hil_play("short.toml").detects()
         """
     )
-    result = run_apart(user, "--dut", dut, "-rA")
+    result = run_apart(user, "--hil-dut", dut, "-rA")
     result.assert_outcomes(failed=1, passed=1)
     result.stdout.fnmatch_lines([f"device {dut}: no * within 2 s *"])
     (stopped,) = re.findall("<stopped ([0-9]+) >", result.stdout.str())
@@ -346,8 +354,8 @@ SHARED = """
 import os, pytest
 
 @pytest.mark.parametrize("n", range(4))
-def test_on_the_device(n, dut):
-    assert dut.handshake()
+def test_on_the_device(n, hil_dut):
+    assert hil_dut.handshake()
     print(f"<{os.environ['PYTEST_XDIST_WORKER']}>")
 
 @pytest.mark.parametrize("n", range(4))
@@ -359,7 +367,7 @@ def test_without(n):
 def test_device_of_which_there_is_one_belongs_to_one_worker(user: pytest.Pytester) -> None:
     user.makepyfile(SHARED)
     with board() as port:
-        result = user.runpytest_subprocess("-n", "2", "--dut", f"serial:{port}", "-rP")
+        result = user.runpytest_subprocess("-n", "2", "--hil-dut", f"serial:{port}", "-rP")
     result.assert_outcomes(passed=8)
     assert len({line for line in result.outlines if re.fullmatch(r"<gw\d>", line)}) == 1
 
@@ -369,14 +377,16 @@ def test_scenario_files_for_a_device_of_which_there_is_one_go_to_one_worker(user
     for name in "abcd":
         (folder / f"{name}.toml").write_text(SHORT.format(head="", expect=""))
     with board() as port:
-        result = user.runpytest_subprocess("-n", "2", "--scenario-dir", "suite", "--dut", f"serial:{port}", "-v")
+        result = user.runpytest_subprocess(
+            "-n", "2", "--hil-scenario-dir", "suite", "--hil-dut", f"serial:{port}", "-v"
+        )
     result.assert_outcomes(passed=4)
     assert len(set(re.findall(r"\[(gw[01])\].* PASSED", result.stdout.str()))) == 1
 
 
 def test_device_of_which_there_is_one_refuses_other_ways_to_share_the_tests_out(user: pytest.Pytester) -> None:
     user.makepyfile(SHARED)
-    result = refused(user, "-n", "2", "--dist", "loadfile", "--dut", "serial:/dev/null")
+    result = refused(user, "-n", "2", "--dist", "loadfile", "--hil-dut", "serial:/dev/null")
     result.stderr.fnmatch_lines(["ERROR: device serial:/dev/null: one worker owns it, and --dist loadfile may not: *"])
 
 
@@ -409,15 +419,15 @@ DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
 
 def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     """What an earlier session has left, as a suite."""
-    return run(user, "build/runs", "--scenario-dir", "build/runs", *arguments)
+    return run(user, "build/runs", "--hil-scenario-dir", "build/runs", *arguments)
 
 
 def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(user: pytest.Pytester) -> None:
     user.path.joinpath("deafer.toml").write_text('kind = "inproc"\n[estimator]\nnoise_variance = 400.0\n')
     user.makepyfile(DETECTS_SOON.format(within=1.5))
-    first = run(user, "--dut", "deafer.toml")
+    first = run(user, "--hil-dut", "deafer.toml")
     first.assert_outcomes(failed=1)
-    first.stdout.fnmatch_lines(["judge it again with: pytest build/runs/* --scenario-dir build/runs/*"])
+    first.stdout.fnmatch_lines(["judge it again with: pytest build/runs/* --hil-scenario-dir build/runs/*"])
     (left,) = user.path.glob("build/runs/*/scenario.toml")
     statement = tomllib.loads(left.read_text())["statement"]
     assert statement["name"] == "detects"
@@ -427,7 +437,7 @@ def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(use
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*scenario.toml: K at 300: * samples, allowed *"])
     assert len(list(user.path.glob("build/runs/*"))) == 1, "one more of the same"
-    again(user, "--dut", "inproc").assert_outcomes(passed=1)
+    again(user, "--hil-dut", "inproc").assert_outcomes(passed=1)
 
 
 def test_property_that_failed_with_every_seed_is_tried_with_every_seed_again(user: pytest.Pytester) -> None:
@@ -435,11 +445,11 @@ def test_property_that_failed_with_every_seed_is_tried_with_every_seed_again(use
         """
         from analogrig.testing.properties import with_some_seed
 
-        def test_it(play):
-            assert with_some_seed(play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
+        def test_it(hil_play):
+            assert with_some_seed(hil_play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
         """
     )
-    run(user, "--dut", "inproc").assert_outcomes(failed=1)
+    run(user, "--hil-dut", "inproc").assert_outcomes(failed=1)
     (left,) = user.path.glob("build/runs/*/scenario.toml")
     table = tomllib.loads(left.read_text())
     assert (table["seed"], table["statement"]["tries"]) == (7, 3)
@@ -463,7 +473,7 @@ def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_lim
     for name, at_least in (("good", 3), ("strict", 300)):
         told = SHORT.format(head="", expect="") + KEEPS_HOLD_OFF.format(at_least=at_least)
         (folder / f"{name}.toml").write_text(told)
-    result = run(user, "--dut", "inproc", "--scenario-dir", "suite")
+    result = run(user, "--hil-dut", "inproc", "--hil-scenario-dir", "suite")
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*strict.toml: * alarms, where at least 300 were due"])
 
@@ -486,7 +496,7 @@ def test_statement_that_says_nothing_is_refused_before_anything_is_played(told: 
 def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:
     folder = user.mkdir("suite")
     (folder / "one.toml").write_text(SHORT.format(head='dut = "inproc:./evil.so"', expect=""))
-    result = run(user, "--scenario-dir", "suite")
+    result = run(user, "--hil-scenario-dir", "suite")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(["*the scenario is for inproc:./evil.so, which is not opened on the word of a file: *"])
 
@@ -520,8 +530,8 @@ from analogrig.testing.strategies import profile, seeds
 
 @profile()
 @given(seed=seeds())
-def test_it(play, seed):
-    found = play("short.toml", seed).estimates(within=1e-9)
+def test_it(hil_play, seed):
+    found = hil_play("short.toml", seed).estimates(within=1e-9)
     left = sorted(pathlib.Path("build/runs").glob("*"))
     print("<left", seed, *(path.name for path in left), ">", flush=True)
     if left:
@@ -534,14 +544,14 @@ def test_it(play, seed):
 
 def test_property_that_is_ended_while_it_shrinks_has_left_a_counterexample(user: pytest.Pytester) -> None:
     user.makepyfile(FALLS_APART.replace("STOP", "import os; os.kill(os.getpid(), 9)"))
-    result = run_apart(user, "-s", "--dut", "inproc")
+    result = run_apart(user, "-s", "--hil-dut", "inproc")
     assert result.ret == -9
     again(user).assert_outcomes(failed=1)
 
 
 def test_counterexample_is_replaced_while_it_shrinks_and_ends_as_the_simplest(user: pytest.Pytester) -> None:
     user.makepyfile(FALLS_APART.replace("STOP", "pass"))
-    result = run(user, "-s", "--dut", "inproc")
+    result = run(user, "-s", "--hil-dut", "inproc")
     result.assert_outcomes(failed=1)
     (left,) = user.path.glob("build/runs/*")
     assert tomllib.loads((left / "scenario.toml").read_text())["seed"] == 1000

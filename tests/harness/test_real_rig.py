@@ -472,8 +472,8 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
         result = subprocess.run(
             [
                 *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0"),
-                *("--pyargs", "analogrig.testing.properties", "--rig", "bench", "--dut", "inproc"),
-                *("--runs-dir", str(tmp_path / "runs")),
+                *("--pyargs", "analogrig.testing.properties", "--hil-rig", "bench", "--hil-dut", "inproc"),
+                *("--hil-runs-dir", str(tmp_path / "runs")),
             ],
             cwd=tmp_path,
             env={**environment, "PYTHONPATH": str(ROOT)},

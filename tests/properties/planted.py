@@ -105,7 +105,7 @@ def tried(library: Path, name: str, folder: Path, *, shrunk: bool) -> Found:
     command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
         *("-p", "no:xdist", "-p", "no:randomly", "--tb=short", "--pyargs", "analogrig.testing.properties", "-k", name),
-        *("--dut", f"inproc:{library}", "--runs-dir", runs),
+        *("--hil-dut", f"inproc:{library}", "--hil-runs-dir", runs),
         *(() if shrunk else ("-p", FOUND_ONLY)),
     ]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("ANALOGRIG_", "PYTEST_"))}

@@ -22,7 +22,7 @@ from analogrig.testing.statement import Finding
 
 @dataclasses.dataclass
 class Alone:
-    """As much of the fixture ``play`` as trials need."""
+    """As much of the fixture ``hil_play`` as trials need."""
 
     bench: Bench
 

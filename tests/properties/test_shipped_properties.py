@@ -39,7 +39,7 @@ DIFFERING, MISS = 7e-4, 1e-3
 def run(folder: Path, dut: str, *arguments: str) -> str:
     command: list[str | Path] = [
         *(sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", folder, "-p", "no:cacheprovider"),
-        *("-p", "no:xdist", "--pyargs", "analogrig.testing.properties", "--dut", dut, *arguments),
+        *("-p", "no:xdist", "--pyargs", "analogrig.testing.properties", "--hil-dut", dut, *arguments),
     ]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("ANALOGRIG_", "PYTEST_"))}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)

@@ -43,14 +43,16 @@ class Counterexample:
     def suite_command(self, folder: Path) -> str:
         """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
         place = recorded(self.run.conditions.dut).elsewhere
-        return shlex.join(["pytest", str(folder), "--scenario-dir", str(folder), *(("--dut", place) if place else ())])
+        return shlex.join(
+            ["pytest", str(folder), "--hil-scenario-dir", str(folder), *(("--hil-dut", place) if place else ())]
+        )
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
 
         The scenario file names its seed, its rig, its device and what did not hold, so that a folder of such files is a
-        regression suite: `pytest --scenario-dir FOLDER`. A rig or a device that its name alone does not describe has a
-        file too.
+        regression suite: `pytest --hil-scenario-dir FOLDER`. A rig or a device that its name alone does not describe
+        has a file too.
 
         :param page: with the report, which takes longer than all the rest.
         :raises RecordingError: the recording cannot be written. OSError: the folder or a file cannot.

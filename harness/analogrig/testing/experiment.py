@@ -26,7 +26,7 @@ Arguments = ParamSpec("Arguments")
 
 
 class Play(Protocol):
-    """The fixture ``play``."""
+    """The fixture ``hil_play``."""
 
     @property
     def bench(self) -> Bench: ...

@@ -57,8 +57,8 @@ def _to_nobody(_: Finding) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Played:
-    """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``play`` hands
-    one on only if it is asked to."""
+    """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``hil_play``
+    hands one on only if it is asked to."""
 
     run: Run
     repeat: str = ""

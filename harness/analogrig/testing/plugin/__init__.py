@@ -2,7 +2,7 @@
 
 Loaded by every pytest in whose environment analogrig is installed, so nothing heavy is imported before a test asks.
 An option is taken from, in this order: indirect parametrization of its fixture, the command line, the environment
-(ANALOGRIG_RIG, ...), the ini file (analogrig_rig, ...), its default.
+(ANALOGRIG_RIG, ...), the ini file (hil_rig, ...), its default.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PROFILE_BEFORE = pytest.StashKey[str | None]()
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
-        "markers", f"needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
+        "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
     options.check(config)
     profile = HIL_PROFILE.said(config).value
@@ -69,11 +69,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def _check_needs(items: list[pytest.Item]) -> None:
     """:raises pytest.UsageError: a test needs what no rig can."""
     for item in items:
-        for mark in item.iter_markers("needs"):
+        for mark in item.iter_markers("hil_needs"):
             unknown = [*(need for need in mark.args if need not in CAPABILITIES), *mark.kwargs]
             if unknown:
                 raise pytest.UsageError(
-                    f"{item.nodeid}: needs: no rig is known to {unknown[0]!r}: there are {', '.join(CAPABILITIES)}"
+                    f"{item.nodeid}: hil_needs: no rig is known to {unknown[0]!r}: there are {', '.join(CAPABILITIES)}"
                 )
 
 
@@ -81,15 +81,15 @@ def _check_needs(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
-def scenario_dir(request: pytest.FixtureRequest) -> Path | None:
-    """The folder of --scenario-dir."""
+def hil_scenario_dir(request: pytest.FixtureRequest) -> Path | None:
+    """The folder of --hil-scenario-dir."""
     value = SCENARIO_DIR.asked(request).value
     return Path(value) if value else None
 
 
 @pytest.fixture
-def runs_dir(request: pytest.FixtureRequest) -> Path:
-    """The folder of --runs-dir."""
+def hil_runs_dir(request: pytest.FixtureRequest) -> Path:
+    """The folder of --hil-runs-dir."""
     return Path(RUNS_DIR.asked(request).value)
 
 
@@ -100,8 +100,8 @@ def hil_profile(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    """The rig of --rig, opened; the test is skipped if it lacks what the mark ``needs`` asks."""
+def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """The rig of --hil-rig, opened; the test is skipped if it lacks what the mark ``hil_needs`` asks."""
     from analogrig.rigs.description import open_rig
 
     devices.check_owner(request.node)
@@ -114,16 +114,16 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
 
 
 def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
-    for mark in item.iter_markers("needs"):
+    for mark in item.iter_markers("hil_needs"):
         lacking = sorted(set(mark.args) - rig.capabilities)
         if lacking:
             able = ", ".join(sorted(rig.capabilities)) or "nothing but play"
-            pytest.skip(f"rig {name} cannot {' and '.join(lacking)} (it can {able}): choose another with --rig")
+            pytest.skip(f"rig {name} cannot {' and '.join(lacking)} (it can {able}): choose another with --hil-rig")
 
 
 @pytest.fixture
-def dut(request: pytest.FixtureRequest) -> Dut:
-    """The device of --dut, reset and configured as described."""
+def hil_dut(request: pytest.FixtureRequest) -> Dut:
+    """The device of --hil-dut, reset and configured as described."""
     devices.check_owner(request.node)
     said = DUT.asked(request)
     with playing.in_one_line(said.by):
@@ -131,20 +131,20 @@ def dut(request: pytest.FixtureRequest) -> Dut:
 
 
 @pytest.fixture
-def bench(rig: Rig, dut: Dut) -> Bench:
+def hil_bench(hil_rig: Rig, hil_dut: Dut) -> Bench:
     """Both on one table."""
     from analogrig.bench import Bench
 
-    return Bench(rig, dut)
+    return Bench(hil_rig, hil_dut)
 
 
 @pytest.fixture
-def play(request: pytest.FixtureRequest, bench: Bench) -> Play:
-    """``play(scenario, seed=None) -> Played``: a name, a .toml file or a Scenario; by default the seed that it has.
+def hil_play(request: pytest.FixtureRequest, hil_bench: Bench) -> Play:
+    """``hil_play(scenario, seed=None) -> Played``: a name, a .toml file or a Scenario; by default the seed that it has.
 
     A play that is INCONCLUSIVE fails the test with its reason; ``allow_inconclusive=True`` hands it on.
     """
-    return playing.Player(request.node, bench)
+    return playing.Player(request.node, hil_bench)
 
 
 # ---------------------------------------------------------------------------------------------------- what has failed

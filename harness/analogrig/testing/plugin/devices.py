@@ -149,7 +149,7 @@ def check_owner(item: pytest.Item) -> None:
     """Fails a test that needs what another worker may have."""
     told = getattr(item.config, "workerinput", {})
     if told.get("workercount", 1) > 1 and _TOLD not in told and (single := single_of(item)):
-        pytest.fail(f"{single}: leave out -n, or name it for all tests (--rig, --dut)", pytrace=False)
+        pytest.fail(f"{single}: leave out -n, or name it for all tests (--hil-rig, --hil-dut)", pytrace=False)
 
 
 def single_of(item: pytest.Item) -> str:

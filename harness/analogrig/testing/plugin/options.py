@@ -29,18 +29,16 @@ class Option:
     """One setting of the plugin."""
 
     name: str
+    variable: str
+    """Environment variable; the command line ``analogrig`` reads those of rig and device too."""
     default: str
     help: str
     complaint: Callable[[str], str] = _anything
     """What is wrong with a value; empty: nothing that can be told beforehand."""
 
     @property
-    def variable(self) -> str:
-        return f"ANALOGRIG_{self.name.upper()}"
-
-    @property
     def ini(self) -> str:
-        return f"analogrig_{self.name}"
+        return self.name
 
     @property
     def flag(self) -> str:
@@ -107,13 +105,28 @@ def _no_profile(value: str) -> str:
     return "" if value in PROFILES else f"must be one of {', '.join(PROFILES)}, not {value!r}"
 
 
-RIG = Option("rig", "emulator", "what plays the scenarios: a shipped name, a .toml file, recording:FILE")
-DUT = Option(
-    "dut", "host", "the device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml"
+RIG = Option(
+    "hil_rig", "ANALOGRIG_RIG", "emulator", "what plays the scenarios: a shipped name, a .toml file, recording:FILE"
 )
-SCENARIO_DIR = Option("scenario_dir", "", "a folder of scenario files, each of which is a test", _no_folder)
-RUNS_DIR = Option("runs_dir", "build/runs", "where the recordings of tests that fail go", _not_to_be_a_folder)
-HIL_PROFILE = Option("hil_profile", "ci", f"how much the properties try: {', '.join(PROFILES)}", _no_profile)
+DUT = Option(
+    "hil_dut",
+    "ANALOGRIG_DUT",
+    "host",
+    "the device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml",
+)
+SCENARIO_DIR = Option(
+    "hil_scenario_dir", "ANALOGRIG_SCENARIO_DIR", "", "a folder of scenario files, each of which is a test", _no_folder
+)
+RUNS_DIR = Option(
+    "hil_runs_dir",
+    "ANALOGRIG_RUNS_DIR",
+    "build/runs",
+    "where the recordings of tests that fail go",
+    _not_to_be_a_folder,
+)
+HIL_PROFILE = Option(
+    "hil_profile", "ANALOGRIG_HIL_PROFILE", "ci", f"how much the properties try: {', '.join(PROFILES)}", _no_profile
+)
 
 OPTIONS = (RIG, DUT, SCENARIO_DIR, RUNS_DIR, HIL_PROFILE)
 

@@ -1,4 +1,4 @@
-"""The fixture ``play``: what a test has played, what it found, what JUnit is told, and what is left when it fails."""
+"""The fixture ``hil_play``: record the plays and findings of a test, report them to JUnit, keep a counterexample."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Player:
         return played
 
     def __repr__(self) -> str:
-        return "play"
+        return "hil_play"
 
     def on(self, rig: Rig, dut: Dut) -> Player:
         """The same for another rig or device."""
@@ -179,7 +179,7 @@ def left_by(item: pytest.Item) -> str:
     """Writes what a test that failed leaves; says what was found, in full, where it is, and how to repeat it.
     Empty: it has played nothing.
 
-    A scenario of --scenario-dir is there already: what it leaves shall not be one more of them.
+    A scenario of --hil-scenario-dir is there already: what it leaves shall not be one more of them.
     """
     from analogrig.testing.counterexample import SCENARIO_FILE
 
@@ -201,7 +201,7 @@ def left_by(item: pytest.Item) -> str:
 
 
 def _is_left_already(item: pytest.Item, folder: Path) -> bool:
-    """Whether it is a scenario of --scenario-dir that a test has left, or what it leaves would be one more of them."""
+    """True if --hil-scenario-dir holds the counterexample of this item, or would gain it as one more scenario."""
     suite = SCENARIO_DIR.of(item)
     if not suite or not item.path.resolve().is_relative_to(Path(suite).resolve()):
         return False

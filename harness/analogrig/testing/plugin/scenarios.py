@@ -1,4 +1,4 @@
-"""Scenario files as tests: those of --scenario-dir."""
+"""Scenario files as tests: those of --hil-scenario-dir."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 class ScenarioFile(pytest.File):
-    """A file of --scenario-dir."""
+    """A file of --hil-scenario-dir."""
 
     def collect(self) -> Iterator[pytest.Item]:
         from analogrig.testing.counterexample import SCENARIO_FILE

@@ -1,9 +1,9 @@
 """The properties that any estimator behind the catalogue's messages should have, as tests to run against yours.
 
-    pytest --pyargs analogrig.testing.properties --dut serial:/dev/ttyACM0 --hil-profile nightly
+    pytest --pyargs analogrig.testing.properties --hil-dut serial:/dev/ttyACM0 --hil-profile nightly
 
-What fails is shrunk to the simplest scenario that still fails, and left as files (see --runs-dir). How seldom a sound
-device fails one is derived in harness/README.md.
+What fails is shrunk to the simplest scenario that still fails, and left as files (see --hil-runs-dir). How seldom a
+sound device fails one is derived in harness/README.md.
 """
 
 from __future__ import annotations

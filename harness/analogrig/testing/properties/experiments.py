@@ -155,7 +155,7 @@ def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDes
     """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
     rig, device = play.bench.rig, described(play.bench.dut)
     if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
-        pytest.skip(f"{otherwise}, or an emulated rig and --dut inproc, not {play.bench.dut.name}")
+        pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
     return rig, device
 
 
@@ -339,7 +339,7 @@ def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, fau
     """They leave the estimate as it is without them, or the run is INCONCLUSIVE, or refused with the cause."""
     bench, device = play.bench, described(play.bench.dut)
     if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
-        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
             play = play.on(bench.rig, stack.enter_context(connect(dataclasses.replace(device, wire_faults=""))))
@@ -367,7 +367,7 @@ def faults_among_the_samples_cost_no_more_than_samples(
     missing, to the bit, and nothing else changes. At least so many of the kinds must have left a valid run."""
     device = dataclasses.replace(described(play.bench.dut), wire_faults="")
     if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
-        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --dut inproc, or ?timeout_s=0.5")
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()
     with connect(device) as alone:

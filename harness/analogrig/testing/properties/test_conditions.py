@@ -35,46 +35,46 @@ HEAVY_RATE, HEAVY_ESTIMATES_N, HEAVY_BRANCHES_N = 0.1 * CERTIFIED.rate, 32, 1000
 that is not taken from this plant, of a damping ratio of 0.4, leaves them coloured, and 2.7e-6."""
 
 
-@pytest.mark.needs("excite")
+@pytest.mark.hil_needs("excite")
 @pytest.mark.parametrize("drift_ppm", [-20.0, 20.0])
 @profile()
 @given(seed=seeds())
-def test_edges_that_drift_past_the_samples_are_no_change(play: Play, drift_ppm: float, seed: int) -> None:
+def test_edges_that_drift_past_the_samples_are_no_change(hil_play: Play, drift_ppm: float, seed: int) -> None:
     phase = 2e-4 if drift_ppm < 0.0 else 1.0 - 2e-4  # they come to a sample's instant after a thousand samples
     excitation = Excitation(low_v=0.1, high_v=9.9, phase=phase, clock="free", drift_ppm=drift_ppm)
-    found = with_some_seed(play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
+    found = with_some_seed(hil_play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
     assert found
 
 
-@pytest.mark.parametrize("rig", ["emulator-0-10v"], indirect=True)
+@pytest.mark.parametrize("hil_rig", ["emulator-0-10v"], indirect=True)
 @profile()
 @given(seed=seeds())
-def test_samples_that_are_missing_are_no_change(play: Play, seed: int) -> None:
-    found = with_some_seed(play, "thesis", seed, Played.passes)
+def test_samples_that_are_missing_are_no_change(hil_play: Play, seed: int) -> None:
+    found = with_some_seed(hil_play, "thesis", seed, Played.passes)
     assert found
 
 
 @profile()
 @given(drawn=st.data(), seed=seeds())
 def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
-    play: Play, drawn: st.DataObject, seed: int
+    hil_play: Play, drawn: st.DataObject, seed: int
 ) -> None:
-    faults = drawn.draw(link_faults(sorted(described(play.bench.dut).fault_kinds())), "faults of the line")
-    found = faults_of_the_line_do_no_harm(play, SHORT, seed, faults)
+    faults = drawn.draw(link_faults(sorted(described(hil_play.bench.dut).fault_kinds())), "faults of the line")
+    found = faults_of_the_line_do_no_harm(hil_play, SHORT, seed, faults)
     assert found
 
 
-def test_faults_of_the_line_among_the_samples_cost_no_more_than_those_samples(play: Play) -> None:
+def test_faults_of_the_line_among_the_samples_cost_no_more_than_those_samples(hil_play: Play) -> None:
     found = faults_among_the_samples_cost_no_more_than_samples(
-        play, SHORT, 1, each=FAULTS_EACH, least_valid=LEAST_VALID_KINDS
+        hil_play, SHORT, 1, each=FAULTS_EACH, least_valid=LEAST_VALID_KINDS
     )
     assert found
 
 
-@pytest.mark.needs("excite")
-def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(play: Play) -> None:
+@pytest.mark.hil_needs("excite")
+def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(hil_play: Play) -> None:
     found = false_alarms_at_most(
-        play,
+        hil_play,
         Scenario.load("healthy"),
         0,
         allowed=CERTIFIED.allowed,
@@ -84,10 +84,10 @@ def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(play: Pla
     assert found
 
 
-@pytest.mark.needs("excite")
-def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(play: Play) -> None:
+@pytest.mark.hil_needs("excite")
+def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(hil_play: Play) -> None:
     found = false_alarms_of_plants_rarer(
-        play,
+        hil_play,
         Scenario.load("healthy"),
         1,
         rate=CERTIFIED.rate,
@@ -98,12 +98,12 @@ def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(play: Play
     assert found
 
 
-@pytest.mark.needs("excite")
-def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(play: Play) -> None:
+@pytest.mark.hil_needs("excite")
+def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(hil_play: Play) -> None:
     healthy = Scenario.load("healthy")
     excitation = dataclasses.replace(healthy.excitation, high_v=8.0)
     found = rare_false_alarms_rarer(
-        play,
+        hil_play,
         dataclasses.replace(healthy, plant=HEAVY, excitation=excitation),
         0,
         rate=HEAVY_RATE,

@@ -60,29 +60,33 @@ SINGLY = Scenario(
 )
 
 
-@pytest.mark.needs("tweak", "excite")
+@pytest.mark.hil_needs("tweak", "excite")
 @profile()
 @given(scenario=scenarios(expect=PATIENT), seed=seeds())
-def test_every_change_that_can_be_seen_is_found_once(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
-    assume(is_playable(rig, scenario))
+def test_every_change_that_can_be_seen_is_found_once(
+    hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int
+) -> None:
+    assume(is_playable(hil_rig, scenario))
     assume(detectable(scenario, ARL0**MOST_INFORMATION))
-    found = with_some_seed(play, scenario, seed, Played.passes)
+    found = with_some_seed(hil_play, scenario, seed, Played.passes)
     assert found
 
 
-@pytest.mark.needs("excite")
+@pytest.mark.hil_needs("excite")
 @profile()
 @given(scenario=scenarios(most_changes=0), seed=seeds())
-def test_a_plant_that_does_not_change_raises_no_alarm(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
-    assume(is_playable(rig, scenario))
-    found = with_some_seed(play, scenario, seed, Played.stays_quiet)
+def test_a_plant_that_does_not_change_raises_no_alarm(
+    hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int
+) -> None:
+    assume(is_playable(hil_rig, scenario))
+    found = with_some_seed(hil_play, scenario, seed, Played.stays_quiet)
     assert found
 
 
-@pytest.mark.needs("tweak", "excite")
-def test_changes_are_noticed_soon_and_rightly_named(play: Play) -> None:
+@pytest.mark.hil_needs("tweak", "excite")
+def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
     found = changes_are_noticed_soon_and_rightly_named(
-        play,
+        hil_play,
         Scenario.load("thesis"),
         0,
         plays=PLAYS_N,
@@ -95,10 +99,10 @@ def test_changes_are_noticed_soon_and_rightly_named(play: Play) -> None:
     assert found
 
 
-@pytest.mark.needs("tweak", "excite")
-def test_a_single_change_is_rightly_named(play: Play) -> None:
+@pytest.mark.hil_needs("tweak", "excite")
+def test_a_single_change_is_rightly_named(hil_play: Play) -> None:
     found = single_changes_are_rightly_named(
-        play,
+        hil_play,
         SINGLY,
         0,
         expected=SINGLE_WRONG,

@@ -38,33 +38,33 @@ def estimates(played: Played) -> Finding:
     return played.estimates(WITHIN)
 
 
-@pytest.mark.needs("excite")
+@pytest.mark.hil_needs("excite")
 @profile()
 @given(scenario=scenarios(most_changes=0), seed=seeds())
-def test_estimates_come_to_the_truth(rig: Rig, play: Play, scenario: Scenario, seed: int) -> None:
-    assume(is_playable(rig, scenario))
-    found = with_some_seed(play, scenario, seed, estimates)
+def test_estimates_come_to_the_truth(hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int) -> None:
+    assume(is_playable(hil_rig, scenario))
+    found = with_some_seed(hil_play, scenario, seed, estimates)
     assert found
 
 
 @profile()
 @given(drawn=rigs(most_noise_lsb=200.0), scenario=scenarios(), seed=seeds())
 def test_whatever_comes_the_device_answers_with_numbers(
-    play: Play, drawn: EmulatorDescription, scenario: Scenario, seed: int
+    hil_play: Play, drawn: EmulatorDescription, scenario: Scenario, seed: int
 ) -> None:
-    found = answers_with_numbers(play.on(EmulatorRig(drawn), play.bench.dut), scenario, seed)
+    found = answers_with_numbers(hil_play.on(EmulatorRig(drawn), hil_play.bench.dut), scenario, seed)
     assert found
 
 
-@pytest.mark.parametrize("rig", ["emulator-ideal"], indirect=True)
-def test_a_pause_of_the_excitation_does_no_harm(play: Play) -> None:
-    found = pause_does_no_harm(play, PAUSED, 1, until=PAUSE_END_N)
+@pytest.mark.parametrize("hil_rig", ["emulator-ideal"], indirect=True)
+def test_a_pause_of_the_excitation_does_no_harm(hil_play: Play) -> None:
+    found = pause_does_no_harm(hil_play, PAUSED, 1, until=PAUSE_END_N)
     assert found
 
 
-@pytest.mark.needs("excite")
-def test_alarms_keep_the_hold_off_and_the_warm_up(play: Play) -> None:
+@pytest.mark.hil_needs("excite")
+def test_alarms_keep_the_hold_off_and_the_warm_up(hil_play: Play) -> None:
     found = alarms_keep_hold_off_and_warm_up(
-        play, STEADY, 1, hold_off_n=HOLD_OFF_N, warm_up_n=WARM_UP_N, at_least=AT_LEAST
+        hil_play, STEADY, 1, hold_off_n=HOLD_OFF_N, warm_up_n=WARM_UP_N, at_least=AT_LEAST
     )
     assert found
