@@ -17,7 +17,7 @@ from .components import (
     OpAmpGrade,
     PotGrade,
 )
-from .deck import Deck, read_deck
+from .deck import Deck
 from .engine import Engine
 from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, ModeError, PotError, SamplerError
 from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
@@ -107,6 +107,5 @@ __all__ = [
     "is_repeatable",
     "piecewise_linear",
     "probes_per_sample",
-    "read_deck",
     "to_spice",
 ]

@@ -60,7 +60,7 @@ class OpAmpModel:
         if not self.has_state and (self.slews or self.clamps):
             raise CircuitError("op-amp: slew_v_per_s and swing_v need a finite gbw_hz")
         if self.gbw_hz < LEAST_GBW_HZ:
-            raise CircuitError(f"op-amp: gbw_hz {self.gbw_hz!r} is below {LEAST_GBW_HZ:g} Hz (in a deck 1M is 1e-3)")
+            raise CircuitError(f"op-amp: gbw_hz {self.gbw_hz!r} is below {LEAST_GBW_HZ:g} Hz")
 
     @property
     def has_state(self) -> bool:

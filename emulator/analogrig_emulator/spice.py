@@ -1,8 +1,8 @@
-"""A circuit as a SPICE deck that ngspice runs unchanged, and that deck.py reads back.
+"""A circuit as a SPICE deck that ngspice runs unchanged.
 
     ngspice -b -r out.raw deck.cir
 
-Op-amps and pots are instances of subcircuits (deck_library.py), with their datasheet numbers as parameters; an op-amp
+Op-amps and pots are instances of the subcircuits of LIBRARY, with their datasheet numbers as parameters; an op-amp
 follows the same law there as in the engine. The deck starts from the initial conditions (uic). A pot that is turned has
 a fourth node, whose voltage is its dial. Sources and dials step within STEP_S, from the instant on. A dummy PULSE
 source puts ngspice's time points on the sample instants, where it would otherwise interpolate.
@@ -10,8 +10,10 @@ source puts ngspice's time points on the sample instants, where it would otherwi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +30,10 @@ from .circuit import (
     Switch,
     VoltageSource,
 )
-from .deck_library import LIBRARY, instance_of
 from .errors import CircuitError
 from .excitation import TICKS_PER_SAMPLE, Edges
+from .opamp import CLAMP_RATE
+from .pot import END_FRACTION
 
 __all__ = ["STEP_S", "Accuracy", "to_spice"]
 
@@ -38,6 +41,55 @@ STEP_S = 1e-11
 """Rise time of every step in a deck, far below anything the circuits resolve."""
 
 _WRAP = 8
+
+
+LIMITLESS = 1e99
+"""What stands for infinity in a deck."""
+
+LIBRARY: Mapping[str, str] = MappingProxyType(
+    {
+        # The capacitance only scales the currents to sizes that ngspice's tolerances suit (mA at full slew). An output
+        # without resistance gets 0.1 mOhm, 1 uV at 10 mA.
+        "opamp": f"""\
+.subckt opamp plus minus out avol=2e5 gbw=3e6 slew=13e6 swing_low=-13.5 swing_high=13.5 rout=100 vos=0
+Cstate state 0 1e-10
+Bstate 0 state I = 1e-10 * (max(-{{slew}}, min({{slew}},
++ {2 * math.pi!r} * {{gbw}} * (v(plus, minus) + {{vos}} - v(state) / {{avol}})))
++ - {CLAMP_RATE!r} * (max(0, v(state) - {{swing_high}}) + min(0, v(state) - {{swing_low}})))
+Einner inner 0 state 0 1
+Rout inner out {{max(rout, 1e-4)}}
+.ends""",
+        "opamp_without_pole": """\
+.subckt opamp_without_pole plus minus out avol=1e99 rout=0 vos=0
+Binner inner 0 V = {min(avol, 1e9)} * (v(plus, minus) + {vos})
+Rout inner out {max(rout, 1e-4)}
+.ends""",
+        "pot": f"""\
+.subckt pot top wiper bottom track=10k dial=0.5
+Rupper top wiper {{max(1 - dial, {END_FRACTION!r}) * track}}
+Rlower wiper bottom {{max(dial, {END_FRACTION!r}) * track}}
+.ends""",
+        "turned_pot": f"""\
+.subckt turned_pot top wiper bottom dial track=10k
+Bupper top wiper I = v(top, wiper) / (max(1 - v(dial), {END_FRACTION!r}) * {{track}})
+Blower wiper bottom I = v(wiper, bottom) / (max(v(dial), {END_FRACTION!r}) * {{track}})
+.ends""",
+        "diode_limiter": """\
+.subckt diode_limiter a b threshold=0 on=1 off=1g
+Roff a b {off}
+Bon a b I = (1 / {on} - 1 / {off}) * max(0, v(a, b) - {threshold})
+.ends""",
+        "switch": """\
+.subckt switch a b on=1 off=1g closed=1
+Rab a b {closed * on + (1 - closed) * off}
+.ends""",
+        "time_points": """\
+.subckt time_points node period=5e-5
+Vnode node 0 PULSE(0 1 0 1n 1n {period / 2} {period})
+.ends""",
+    }
+)
+"""The subcircuits of which decks are made, by name."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +191,7 @@ class _Writer:
             case Pot() if turns := [(sample, d[element.name]) for sample, d in self._turns if element.name in d]:
                 yield from self._turned_pot(card, element, turns)
             case _:
-                subcircuit, values = instance_of(element)
+                subcircuit, values = _instance_of(element)
                 yield self._instance(subcircuit, card, element.nodes, **values)
 
     def _source(self, card: str, source: VoltageSource | CurrentSource) -> Iterator[str]:
@@ -223,3 +275,35 @@ def _stepped(head: str, times_s: NDArray[np.float64], values: NDArray[np.float64
 
 def _number(value: float) -> str:
     return repr(float(value))
+
+
+def _instance_of(element: OpAmp | Pot | DiodeLimiter | Switch) -> tuple[str, dict[str, float]]:
+    """Return the subcircuit of an element and its parameters; its nodes are the element's, in their order."""
+    match element:
+        case OpAmp(model=model) if not model.has_state:
+            return "opamp_without_pole", _finite(avol=model.avol, rout=model.rout_ohm, vos=model.vos_v)
+        case OpAmp(model=model):
+            low, high = model.swing_v
+            return "opamp", _finite(
+                avol=model.avol,
+                gbw=model.gbw_hz,
+                slew=model.slew_v_per_s,
+                swing_low=low,
+                swing_high=high,
+                rout=model.rout_ohm,
+                vos=model.vos_v,
+            )
+        case Pot():
+            return "pot", {"track": element.track_ohm, "dial": element.dial}
+        case DiodeLimiter():
+            return "diode_limiter", {
+                "threshold": element.threshold_v,
+                "on": element.on_ohm,
+                "off": element.off_ohm,
+            }
+        case Switch():
+            return "switch", {"on": element.on_ohm, "off": element.off_ohm, "closed": float(element.closed)}
+
+
+def _finite(**values: float) -> dict[str, float]:
+    return {name: v if math.isfinite(v) else math.copysign(LIMITLESS, v) for name, v in values.items()}

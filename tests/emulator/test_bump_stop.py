@@ -14,12 +14,9 @@ from analogrig_emulator import (
     BumpStop,
     CircuitError,
     Deck,
-    DiodeLimiter,
     Excitation,
     OpAmp,
     SuspensionComputer,
-    Switch,
-    read_deck,
 )
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
@@ -76,23 +73,6 @@ def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -
     reference = ngspice(deck.text(outputs), outputs, 300)
     error = np.abs(deck.volts(outputs) - reference)
     assert error.max() < 0.05 * LSB_V
-
-
-def test_its_deck_reads_back_equal() -> None:
-    deck = deck_of(SuspensionComputer("bump-stop"), Excitation(), 100)
-    read = read_deck(deck.text())
-    assert read.circuit == deck.circuit
-    assert np.array_equal(read.volts(["u5"]), deck.volts(["u5"]))
-
-
-def test_limiters_and_switches_are_read_from_decks() -> None:
-    head = "t\nV1 in 0 DC 5\nX1 in out "
-    [_, limiter, _] = read_deck(head + "diode_limiter threshold=1.5 on=10 off=1meg\nR1 out 0 1k").circuit.elements
-    assert limiter == DiodeLimiter("X1", "in", "out", 1.5, 10.0, 1e6)
-    [_, switch, _] = read_deck(head + "switch on=10 closed=0\nR1 out 0 1k").circuit.elements
-    assert switch == Switch("X1", "in", "out", 10.0, 1e9, closed=False)
-    with pytest.raises(CircuitError, match="deck:3: X1: closed must be 0 or 1"):
-        read_deck(head + "switch closed=2\nR1 out 0 1k")
 
 
 def test_a_stop_that_cannot_be_is_refused() -> None:

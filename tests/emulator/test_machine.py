@@ -24,6 +24,7 @@ from analogrig_emulator import (
     Circuit,
     CircuitError,
     Components,
+    Deck,
     DiodeLimiter,
     Edges,
     EngineError,
@@ -39,7 +40,6 @@ from analogrig_emulator import (
     SuspensionComputer,
     Switch,
     VoltageSource,
-    read_deck,
     to_spice,
 )
 from analogrig_emulator.circuit import Element
@@ -207,8 +207,7 @@ def test_every_node_of_a_large_circuit_is_shown_and_played() -> None:
     computer.run(1, level(10.0))
     expected_v = 10.0 * (1.0 - np.arange(200) / 200)
     assert [computer.read()[node] for node in nodes[:-1]] == pytest.approx(expected_v.tolist(), abs=1e-9)
-    deck = read_deck(to_spice(circuit, samples=2, edges=level(10.0)))
-    assert deck.volts()[-1] == pytest.approx(expected_v, abs=1e-9)
+    assert Deck(circuit, samples=2, edges=level(10.0)).volts()[-1] == pytest.approx(expected_v, abs=1e-9)
 
 
 def test_a_pot_into_a_limiter_is_read_and_set_as_the_engine_plays_it() -> None:

@@ -11,7 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.cli import main
-from analogrig_emulator import Deck
+from analogrig.reporting.netlist import netlist
+from analogrig.rigs.description import open_rig
+from analogrig.scenario import Scenario
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 
@@ -51,16 +53,12 @@ def test_ngspice_runs_the_deck_of_a_scenario_and_agrees_at_every_sample(
     assert np.abs(volts * (1, 1, 1, -1) - reference).max() < 0.05 * LSB_V
 
 
-def test_the_deck_read_back_plays_to_the_bit_what_the_rig_plays(
-    scenario: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    what = ["--scenario", scenario, "--seed", "7"]
-    assert main(["netlist", *what]) == 0
-    (tmp_path / "machine.cir").write_text(capsys.readouterr().out)
-    assert main(["emulate", *what, "--out", str(tmp_path / "machine.npz")]) == 0
+def test_engine_plays_the_deck_to_the_bit_as_the_rig_does(scenario: str, tmp_path: Path) -> None:
+    assert main(["emulate", "--scenario", scenario, "--seed", "7", "--out", str(tmp_path / "machine.npz")]) == 0
+    with open_rig("emulator") as rig:
+        deck = netlist(rig, Scenario.load(scenario), 7)
     volts = np.load(tmp_path / "machine.npz")["volts"]
-    read = Deck.load(tmp_path / "machine.cir").volts(["in", "u5", "u2", "u1"])
-    assert np.array_equal(read * (1, 1, 1, -1), volts)
+    assert np.array_equal(deck.volts(["in", "u5", "u2", "u1"]) * (1, 1, 1, -1), volts)
 
 
 def test_json_names_the_file_or_holds_the_deck(

@@ -23,7 +23,6 @@ from analogrig_emulator import (
     TwoMassParts,
     TwoMassPlant,
     TwoMassProgram,
-    read_deck,
 )
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
@@ -125,13 +124,6 @@ def test_every_amplifier_agrees_with_ngspice_at_every_sample(ngspice: NgSpice) -
     outputs = [amp.out for amp in deck.circuit.of(OpAmp)]
     reference = ngspice(deck.text(outputs), outputs, SAMPLES)
     assert np.abs(deck.volts(outputs) - reference).max() < 0.05 * LSB_V
-
-
-def test_it_is_a_netlist_that_reads_back_equal() -> None:
-    deck = deck_of(SuspensionComputer("two-mass"))
-    read = read_deck(deck.text())
-    assert read.circuit == deck.circuit
-    assert np.array_equal(read.volts(["u11"]), deck.volts(["u11"]))
 
 
 def test_both_springs_in_series_carry_a_constant_force() -> None:
