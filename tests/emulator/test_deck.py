@@ -270,10 +270,10 @@ CHAIN = ".param " + " ".join(f"p{i}={{p{i + 1}+p{i + 1}}}" for i in range(40_000
     ids=["elements", "doubling", "parameters", "states", "digits", "word", "text", "edges"],
 )
 def test_a_deck_beyond_the_limits_is_refused_at_once(cards: str, message: str) -> None:
-    start_s = time.perf_counter()
+    start_s = time.process_time()
     with pytest.raises(CircuitError, match=message):
         read_deck(HEAD + cards)
-    assert time.perf_counter() - start_s < 5.0
+    assert time.process_time() - start_s < 5.0
 
 
 def test_a_file_may_be_given_by_its_name(tmp_path: Path) -> None:

@@ -61,13 +61,13 @@ def test_a_file_of_random_bytes_is_refused_or_empty(tmp_path: Path) -> None:
 
 BOUNDED = """
 import resource, sys, time
-from emulator import EmulatorError, read_deck
+from analogrig_emulator import EmulatorError, read_deck
 resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
-start_s = time.perf_counter()
+start_s = time.process_time()
 try:
     read_deck(sys.stdin.read())
 except EmulatorError as error:
-    print(f"{time.perf_counter() - start_s:.1f} {str(error)[-200:]}")
+    print(f"{time.process_time() - start_s:.1f} {str(error)[-200:]}")
 """
 
 
@@ -84,9 +84,9 @@ except EmulatorError as error:
     ],
     ids=["elements", "doubling", "nesting", "self", "exponent", "include", "signs"],
 )
-def test_no_deck_takes_more_than_a_gigabyte_or_ten_seconds(cards: str, message: str) -> None:
+def test_no_deck_takes_more_than_a_gigabyte_or_ten_seconds_of_the_processor(cards: str, message: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", BOUNDED], input=f"t\n{cards}\n", capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", BOUNDED], input=f"t\n{cards}\n", capture_output=True, text=True, check=False
     )
     taken_s, _, error = done.stdout.partition(" ")
     assert message in error, done.stderr[-500:]
