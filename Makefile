@@ -14,11 +14,14 @@ STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
 BIN := $(VENV)/bin
+ZIG := $(BUILD)/zig
+PYTHONS ?= $(foreach version,3.11 3.12 3.13,$(if $(shell python$(version) -c '' 2>/dev/null && echo found),python$(version)))
 
 PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
             harness/analogrig/bin/analogrig-tether harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
 NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
+PYTHON_PACKAGES := $(foreach depth,* */* */*/* */*/*/*,$(wildcard harness/$(depth).py emulator/$(depth).py))
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
 # The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
@@ -40,9 +43,11 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
+
+found = $(shell command -v $1 2>/dev/null)
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -52,8 +57,11 @@ setup: $(PRODUCTS) ## make the environment in .venv and compile the C; every oth
 run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="--seed 7" goes to analogrig run
 	@$(BIN)/analogrig run --out $(BUILD)/run $(ARGS)
 
-test: check firmware ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
+test: check $(if $(call found,arm-none-eabi-gcc),firmware,no-firmware) ## check, then every test that this machine can run; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+
+test-bare: ## make test on a PATH that has python3, a C compiler, make, git and coreutils alone
+	@$(PYTHON) -m tests.bare $(if $(PYTEST_ARGS),PYTEST_ARGS='$(PYTEST_ARGS)')
 
 check: lint strict ## linters, types, and the C with every warning an error
 
@@ -81,8 +89,17 @@ $(BUILD)/firmware/analogrig-m0.elf: estimator_c/ports/cortex_m0/float.S
 
 $(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/mps2.ld $(PRODUCTS)
 	@mkdir -p $(@D)
+	@command -v arm-none-eabi-gcc >/dev/null || \
+	    { echo "the firmware needs arm-none-eabi-gcc: apt-get install gcc-arm-none-eabi" >&2; exit 1; }
 	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) $(filter %.S,$^) $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c)) \
 	    $(BUILD)/generated/*.c -lgcc -o $@
+
+no-firmware:
+	@echo "arm-none-eabi-gcc is absent, so no firmware is built: make tools"
+
+tools: ## install what the tests need from the operating system (apt, sudo if you are not root), and the guest's kernel
+	@$(PYTHON) -m tests.tools install
+	@$(MAKE) --no-print-directory $(BUILD)/can_guest/linux
 
 fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
@@ -116,6 +133,29 @@ mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sa
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
+
+wheels: $(BUILD)/wheels/.made ## build manylinux wheels for x86_64 and aarch64 into build/wheels; downloads zig, 100 MB
+
+test-wheels: wheels ## run the wheels of make wheels, each Python of PYTHONS in an environment of its own
+	@ANALOGRIG_WHEELS=$(BUILD)/wheels ANALOGRIG_PYTHONS="$(PYTHONS)" ANALOGRIG_ZIG=$(ZIG)/bin \
+	    $(BIN)/pytest tests/test_manylinux.py $(PYTEST_ARGS)
+
+# zig is a C compiler for every platform. Newer releases than 0.14.1 define B115200 otherwise than glibc 2.17 has it, so
+# that analogrig-device cannot set up its terminal, which auditwheel does not notice.
+$(ZIG)/.made: Makefile
+	@rm -rf $(ZIG) && $(PYTHON) -m venv $(ZIG)
+	@$(ZIG)/bin/python -m pip install --quiet ziglang==0.14.1 auditwheel==6.8.2
+	@touch $@
+
+$(BUILD)/wheels/.made: $(ZIG)/.made $(PRODUCTS) setup.py pyproject.toml $(PYTHON_PACKAGES) $(wildcard fixtures/*/*.toml)
+	@rm -rf $(@D) && mkdir -p $(@D)
+	@for machine in x86_64 aarch64; do \
+	    CC="$(CURDIR)/$(ZIG)/bin/python -m ziglang cc -target $$machine-linux-gnu.2.17" CFLAGS= LDFLAGS=-s \
+	    $(BIN)/python -m build --no-isolation --wheel --config-setting=--build-option=--plat-name=manylinux_2_17_$$machine \
+	        --outdir $(@D) . >$(@D)/log 2>&1 || { cat $(@D)/log >&2; exit 1; }; \
+	done
+	@for wheel in $(@D)/*.whl; do $(ZIG)/bin/auditwheel show $$wheel; done
+	@touch $@
 
 lock: ## resolve requirements.lock again from pyproject.toml; needs uv
 	@$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \
@@ -169,7 +209,6 @@ $(BUILD)/strict/%.ok: $(NATIVE_SOURCES) setup.py Makefile | $(VENV)/.installed
 	@mkdir -p $(@D)
 	@if command -v $* >/dev/null; then \
 	    CC=$* CFLAGS="$(STRICT_CFLAGS)" $(BIN)/python setup.py --quiet build_products \
-	        --build-lib $(@D)/$* --build-temp $(@D)/$*; \
-	elif test -n "$$ANALOGRIG_CI"; then echo "$* is absent: apt-get install $*" >&2; exit 1; \
-	else echo "$* is absent, so the C was not checked with it (apt-get install $*)"; exit 0; fi
-	@touch $@
+	        --build-lib $(@D)/$* --build-temp $(@D)/$* && touch $@; \
+	elif test "$$ANALOGRIG_CI" = 1; then echo "$* is absent: make tools" >&2; exit 1; \
+	else echo "$* is absent, so the C is not checked with it: make tools"; fi
