@@ -6,22 +6,21 @@ import contextlib
 import dataclasses
 import gc
 import itertools
+import math
+import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analogrig.errors import DeviceError, LinkError, RigError
-from analogrig.protocol.dut import Dut, Replies, Stretch
+from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
+from analogrig.links.wire import Clock
+from analogrig.protocol.dut import Dut, RaisedAlarm, Replies, Stretch
+from analogrig.protocol.exchange import StatedDiagnosis
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
 from analogrig.scenario import Scenario
-
-T = TypeVar("T", bound=np.generic)
 
 Progress = Callable[[int, int], None]
 """Called after each block with the samples done and the samples asked."""
@@ -31,44 +30,58 @@ INTERRUPTED_BY_USER = "interrupted by the user"
 _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
 
-@dataclass
 class _Collected:
-    """What has come from rig and device so far, block by block; the volts are not kept."""
+    """Samples and answers of one run. A Run refers to these very arrays: nothing is kept twice.
 
-    codes: list[NDArray[np.uint16]] = field(default_factory=list)
-    clipped: list[NDArray[np.bool_]] = field(default_factory=list)
-    replies: list[Replies] = field(default_factory=list)
-    samples: int = 0
-    records: list[int] = field(default_factory=list)
-    """Their first samples."""
-    counters: Counter[str] = field(default_factory=Counter)
-    """The device's, of all records."""
-    line_s: float = 0.0
+    The arrays have room for all samples that were asked for. Memory that is never written costs nothing.
+    """
+
+    def __init__(self, samples_asked: int, parameters: int) -> None:
+        self._codes = np.empty((samples_asked, len(CHANNELS)), np.uint16)
+        self._clipped = np.empty((samples_asked, len(CHANNELS)), np.bool_)
+        self._theta = np.empty((samples_asked, parameters), np.float32)
+        self._innovation = np.empty(samples_asked, np.float32)
+        self._statistic = np.empty(samples_asked, np.float32)
+        self._flags = np.empty(samples_asked, np.uint8)
+        self._alarms: list[RaisedAlarm] = []
+        self._diagnoses: list[StatedDiagnosis] = []
+        self.samples = 0
+        self.records: list[int] = []
+        """Their first samples."""
+        self.counters: Counter[str] = Counter()
+        """The device's, of all records."""
+        self.line_s = 0.0
 
     def begin_record(self) -> None:
         self.records.append(self.samples)
 
     def add(self, block: Block, reply: Replies) -> None:
-        self.codes.append(block.codes)
-        self.clipped.append(block.clipped)
-        self.replies.append(_since(self.records[-1], reply))
-        self.samples += len(block.codes)
+        """Keep the samples of a block that were answered: all, unless the run ends here."""
+        answered = len(reply.flags)
+        to = slice(self.samples, self.samples + answered)
+        self._codes[to] = block.codes[:answered]
+        self._clipped[to] = block.clipped[:answered]
+        self._theta[to], self._innovation[to] = reply.theta, reply.innovation
+        self._statistic[to], self._flags[to] = reply.statistic, reply.flags
+        shifted = _since(self.records[-1], reply)
+        self._alarms += shifted.alarms
+        self._diagnoses += shifted.diagnoses
+        self.samples += answered
 
     def end_record(self, line_s: float, counters: Mapping[str, int]) -> None:
         self.line_s += line_s
         self.counters.update(counters)
 
-    def run(self, conditions: Conditions, parameters: int) -> Run:
-        alarms = [alarm for reply in self.replies for alarm in reply.alarms]
-        diagnoses = [diagnosis for reply in self.replies for diagnosis in reply.diagnoses]
+    def run(self, conditions: Conditions) -> Run:
+        alarms, diagnoses = self._alarms, self._diagnoses
         return Run(
             conditions=conditions,
-            codes=_stacked(self.codes, (0, len(CHANNELS)), np.uint16),
-            clipped=_stacked(self.clipped, (0, len(CHANNELS)), np.bool_),
-            theta=_stacked([reply.theta for reply in self.replies], (0, parameters), np.float32),
-            innovation=_stacked([reply.innovation for reply in self.replies], (0,), np.float32),
-            statistic=_stacked([reply.statistic for reply in self.replies], (0,), np.float32),
-            flags=_stacked([reply.flags for reply in self.replies], (0,), np.uint8),
+            codes=self._codes[: self.samples],
+            clipped=self._clipped[: self.samples],
+            theta=self._theta[: self.samples],
+            innovation=self._innovation[: self.samples],
+            statistic=self._statistic[: self.samples],
+            flags=self._flags[: self.samples],
             alarm_index=np.array([alarm.index for alarm in alarms], dtype=np.int64),
             alarm_kind=np.array([alarm.kind for alarm in alarms], dtype=np.uint8),
             alarm_statistic=np.array([alarm.statistic for alarm in alarms], dtype=np.float32),
@@ -92,10 +105,6 @@ def _since(first: int, reply: Replies) -> Replies:
     )
 
 
-def _stacked(parts: Sequence[NDArray[T]], empty_shape: tuple[int, ...], dtype: type[T]) -> NDArray[T]:
-    return np.concatenate(parts) if parts else np.zeros(empty_shape, dtype=dtype)
-
-
 @contextlib.contextmanager
 def _undisturbed(pace: Pace | None) -> Iterator[None]:
     """In real time the collector of garbage waits: among as many answers it takes longer than a message lasts."""
@@ -112,12 +121,27 @@ def _undisturbed(pace: Pace | None) -> Iterator[None]:
 class Bench:
     """Joins a rig and a device; the device is configured and its handshake is done."""
 
-    def __init__(self, rig: Rig, dut: Dut, progress: Progress | None = None, *, real_time: float | None = None) -> None:
-        """With ``real_time`` the samples go out as the machine takes them, in time stretched by that factor."""
+    def __init__(
+        self,
+        rig: Rig,
+        dut: Dut,
+        progress: Progress | None = None,
+        *,
+        real_time: float | None = None,
+        time_limit_s: float | None = None,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        """With ``real_time`` the samples go out as the machine takes them, in time stretched by that factor.
+
+        ``time_limit_s`` is the longest time of one play, on ``clock``. It bounds every wait for the device. A rig is
+        not interrupted: the limit is checked after each block of samples that it gives.
+        """
         self.rig = rig
         self.dut = dut
         self._progress = progress
         self._real_time = real_time
+        self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
+        self._clock = clock
 
     def play(self, scenario: Scenario, seed: int) -> Run:
         """Play ``scenario`` and collect what the device answers: in lock-step, where nothing is late, or in real time.
@@ -126,20 +150,22 @@ class Bench:
         machine does is worked out before.
 
         A rig, link or device that fails once samples flow ends the run, it does not raise: the Run holds all complete
-        blocks until then, and its conditions say what failed.
+        blocks until then, and its conditions say what failed. The time limit ends the run likewise, and the Run holds
+        every sample that was answered until then.
 
         :raises DeviceError, LinkError, RigError: before the first sample.
         :raises ConfigurationError: real time does not fit the line.
         """
+        until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._paced(performance)
         self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
         begun = self._begun(performance, scenario, seed)
-        collected = _Collected()
-        faults = (*scenario.caveats, *self._failures(blocks, pace, scenario.samples, collected))
+        collected = _Collected(scenario.samples, self.dut.parameters)
+        faults = (*scenario.caveats, *self._failures(blocks, pace, scenario.samples, collected, until_s))
         conditions = self._concluded(begun, performance.hindsight(), faults, collected)
-        return collected.run(conditions, self.dut.parameters)
+        return collected.run(conditions)
 
     def _begun(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
         """What is known before the first sample."""
@@ -158,12 +184,17 @@ class Bench:
             real_time=self._real_time or 0.0,
         )
 
-    def _failures(self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected) -> list[str]:
+    def _failures(
+        self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected, until_s: float
+    ) -> list[str]:
         """Exchanges the samples, and says what kept it from doing so to the end."""
         faults = []
         try:
-            with _undisturbed(pace):
-                self._exchange(blocks, pace, samples, collected)
+            with _undisturbed(pace), self._limited(until_s):
+                self._exchange(self._in_time(blocks, until_s), pace, samples, collected)
+        except TimeLimitReached:
+            limit = f"time limit of {self._time_limit_s:g} s"
+            faults.append(f"{limit} reached after {collected.samples} of {samples} samples")
         except RigError as error:
             faults.append(str(error))
             with contextlib.suppress(DeviceError, LinkError):
@@ -177,6 +208,25 @@ class Bench:
                 f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"
             )
         return faults
+
+    @contextlib.contextmanager
+    def _limited(self, until_s: float) -> Iterator[None]:
+        """Bound every wait for the device by the time limit."""
+        self.dut.limit(until_s - self._clock())
+        try:
+            yield
+        finally:
+            self.dut.limit(math.inf)
+
+    def _in_time(self, blocks: Iterable[Block], until_s: float) -> Iterator[Block]:
+        """The blocks until the time limit.
+
+        :raises TimeLimitReached: it is over.
+        """
+        for block in blocks:
+            if self._clock() >= until_s:
+                raise TimeLimitReached("the time limit of the run is over")
+            yield block
 
     def _concluded(
         self, begun: Conditions, known: Hindsight, faults: tuple[str, ...], collected: _Collected

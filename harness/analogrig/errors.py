@@ -14,6 +14,7 @@ AnalogrigError
 ├── LinkError                   the link failed
 │   ├── LinkTimeout             nothing came in time
 │   └── LinkClosed              the other end is gone
+├── TimeLimitReached            the time limit of the run is over
 └── DeviceError                 the device answers, but not as it should
     ├── CatalogueMismatch       it was built from another message catalogue
     └── DeviceRefused           it refused a command or a value
@@ -78,6 +79,10 @@ class LinkTimeout(LinkError):  # noqa: N818 - the word of the field
 
 class LinkClosed(LinkError):  # noqa: N818 - the word of the field
     """The other end is gone."""
+
+
+class TimeLimitReached(AnalogrigError):  # noqa: N818 - the word of the field
+    """The time limit of the run is over."""
 
 
 class DeviceError(AnalogrigError):

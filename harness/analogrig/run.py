@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import IO, Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from analogrig.storage import replacing
 
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
+
+CHUNK_SAMPLES = 1 << 16
+"""Long runs are worked on in parts of this length, so that intermediate results take no memory to speak of."""
 
 _FAR = 1e9
 """Beyond any unit, time or noise that is one."""
@@ -264,7 +267,10 @@ class Run:
 
     def theta_hash(self) -> str:
         """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
-        return hashlib.sha256(np.ascontiguousarray(self.theta, dtype="<f4").tobytes()).hexdigest()
+        digest = hashlib.sha256()
+        for first in range(0, self.samples, CHUNK_SAMPLES):
+            digest.update(np.ascontiguousarray(self.theta[first : first + CHUNK_SAMPLES], dtype="<f4").data)
+        return digest.hexdigest()
 
     def save(self, path: Path) -> None:
         """Write atomically: the file is either the whole run or not there.
@@ -273,8 +279,10 @@ class Run:
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
         arrays = {name: getattr(self, name) for name in _ARRAYS | _LATER_ARRAYS}
-        with replacing(path) as file:
-            np.savez(file, allow_pickle=False, header=np.array(header), **arrays)
+        with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+            for name, array in {"header": np.array(header), **arrays}.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    _write_array(member, array)
 
     @classmethod
     def load(cls, path: Path) -> Run:
@@ -340,6 +348,15 @@ class Run:
         wrong = [what for what, holds in checks.items() if not holds]
         if wrong:
             raise RecordingError(f"{path}: damaged recording: its {', '.join(wrong)} do not fit together")
+
+
+def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
+    """Write in the npy format, in parts: np.savez would copy 16 MB at a time."""
+    described = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+    np.lib.format.write_array_header_1_0(file, described)
+    rows = np.atleast_1d(array)
+    for first in range(0, len(rows), CHUNK_SAMPLES):
+        file.write(rows[first : first + CHUNK_SAMPLES].tobytes())
 
 
 def _ascend(starts: Sequence[int]) -> bool:

@@ -140,7 +140,7 @@ class Page(HTMLParser):
         out = {}
         for column in data["columns"]:
             dtype = np.dtype(column["type"]).newbyteorder("<")
-            size = data["samples"] * dtype.itemsize
+            size = data["points"] * dtype.itemsize
             out[column["name"]] = column["offset"] + column["scale"] * np.frombuffer(raw[:size], dtype).astype(float)
             raw = raw[size:]
         assert not raw

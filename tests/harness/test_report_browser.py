@@ -13,6 +13,7 @@ from analogrig.judging.verdict import Verdict, judge
 from analogrig.reporting import write_report
 from analogrig.run import Run
 from tests.browser import Watched
+from tests.harness.long_runs import long_run
 from tests.harness.reported import NOTICED, empty_run, reported_run, reported_verdict
 from tests.harness.runs import with_fault
 
@@ -158,6 +159,40 @@ def test_run_without_truth_and_trigger_is_drawn(browser: Browser, run: Run, tmp_
     assert len(watched.plots()) == PLOTS
     assert len(watched.values(MASS)) == 2  # sample and estimate
     assert watched.complaints == []
+
+
+def test_page_of_two_million_samples_is_drawn_with_its_alarms_and_zooms(browser: Browser, tmp_path: Path) -> None:
+    long = long_run(2_000_000, false_alarms=5, changes=2)
+    watched = _open(browser, long, judge(long), tmp_path)
+    assert len(watched.plots()) == PLOTS
+    assert watched.complaints == []
+    whole = watched.images()
+    assert min(watched.pixels(ALARM)) > 20
+    assert min(watched.pixels(FALSE_ALARM)) > 20
+    watched.page.get_by_role("button", name="666666", exact=True).click()
+    near = watched.images()
+    assert all(before != after for before, after in zip(whole, near, strict=True))
+    watched.point_at(FORCE, 40 / 120)
+    assert watched.values(FORCE)[0] == "666,666"  # full resolution: a point for every sample
+    force, displacement = watched.values(FORCE)[1:]
+    assert _number(force, "N") == pytest.approx(long.codes[666_666, 0] * 2940.0 / 4096, rel=1e-4)
+    assert _number(displacement, "mm") == pytest.approx(long.codes[666_666, 1] * 199.6 / 4096, rel=1e-4)
+    watched.page.get_by_role("button", name="Whole run").click()
+    watched.page.mouse.move(0, 0)
+    assert watched.images() == whole
+
+
+def test_spike_of_one_sample_among_two_million_is_drawn(browser: Browser, tmp_path: Path) -> None:
+    flat = long_run(2_000_000, false_alarms=0, changes=0)
+    flat.statistic[:] = 0.0
+    spiked = replace(flat, statistic=flat.statistic.copy())
+    spiked.statistic[1_234_567] = 11.0  # below the ceiling, which makes the scale
+    (tmp_path / "spiked").mkdir()
+    without, with_it = (
+        _open(browser, run, judge(run), folder).images()[STATISTIC]
+        for run, folder in ((flat, tmp_path), (spiked, tmp_path / "spiked"))
+    )
+    assert without != with_it
 
 
 def test_run_that_converged_nowhere_is_drawn(browser: Browser, run: Run, tmp_path: Path) -> None:

@@ -72,6 +72,25 @@ def factor(text: str) -> float:
     raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
 
 
+def seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if 1e-3 <= seconds <= 1e9:
+        return seconds
+    raise argparse.ArgumentTypeError(f"must be a number of seconds from 0.001 to 1e9, not {text[:40]!r}")
+
+
+def add_time_limit(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--time-limit",
+        type=seconds,
+        metavar="SECONDS",
+        help="end the run after that time; it is then INCONCLUSIVE, and what was recorded is kept (default: no limit)",
+    )
+
+
 def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
     command.add_argument(
         "--dut",

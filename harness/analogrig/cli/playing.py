@@ -99,7 +99,8 @@ def play(
     if arguments.can_log is not None and log is not None and not log.has_heard:
         raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
     _begin(log, arguments.out)
-    run = Bench(rig, dut, progress_line(), real_time=arguments.real_time).play(scenario, seed)
+    bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
+    run = bench.play(scenario, seed)
     status = conclude(run, arguments)
     try:
         if log is not None:

@@ -6,7 +6,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_can_log, add_capture, add_dut, add_output, changes_of_dut, is_capture, recorded
+from analogrig.cli.options import (
+    add_can_log,
+    add_capture,
+    add_dut,
+    add_output,
+    add_time_limit,
+    changes_of_dut,
+    is_capture,
+    recorded,
+)
 from analogrig.cli.playing import can_log, play, prepare
 
 
@@ -17,6 +26,7 @@ def add(commands: Any) -> None:
     add_dut(command, default=None, shown="that of the recording")
     add_output(command, default=Path("build/replay"))
     add_can_log(command)
+    add_time_limit(command)
     command.set_defaults(command=_run)
 
 

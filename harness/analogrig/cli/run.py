@@ -6,7 +6,15 @@ import argparse
 import os
 from typing import Any
 
-from analogrig.cli.options import add_can_log, add_dut, add_output, add_what_to_play, changes_of_dut, opened
+from analogrig.cli.options import (
+    add_can_log,
+    add_dut,
+    add_output,
+    add_time_limit,
+    add_what_to_play,
+    changes_of_dut,
+    opened,
+)
 from analogrig.cli.playing import can_log, play, prepare
 
 
@@ -16,6 +24,7 @@ def add(commands: Any) -> None:
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")
     add_output(command)
     add_can_log(command)
+    add_time_limit(command)
     command.set_defaults(command=_run)
 
 

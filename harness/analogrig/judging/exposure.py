@@ -6,7 +6,6 @@ excited, raises no alarm whatever it is worth: its silence is no evidence.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.protocol.catalogue import SteppedFlag
-from analogrig.run import CHANNELS, LOST, Run
+from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, Run
 
 EDGE_NOISES = 9.0
 """Of the noise of the force: less is no edge, whatever the device takes for one. By chance two samples differ as much
@@ -79,7 +78,9 @@ class Heard:
 def exposure(run: Run) -> Exposure:
     """Of all records, each of which is a run of its own to the device."""
     estimator, noise_lsb = run.conditions.dut["estimator"], run.conditions.channels["force"].noise_lsb
-    numbers = np.isfinite(run.innovation) & np.isfinite(run.statistic) & np.isfinite(run.theta).all(axis=1)
+    numbers = np.isfinite(run.innovation) & np.isfinite(run.statistic)
+    for column in run.theta.T:
+        numbers &= np.isfinite(column)
     parts = [
         exposed(
             Heard(
@@ -125,9 +126,11 @@ def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: fl
     else:
         known = codes[heard]
         excited[heard] = np.maximum.accumulate(known) - np.minimum.accumulate(known) >= edge_codes
-    for edge, following in itertools.pairwise([0, *edges.tolist(), len(codes)]):
-        if idle_n and following - edge > idle_n:
-            excited[edge:following] &= np.cumsum(heard[edge:following]) - heard[edge] < idle_n
+    if idle_n:
+        bounds = np.concatenate(([0], edges, [len(codes)]))
+        for i in np.flatnonzero(np.diff(bounds) > idle_n).tolist():
+            idle = slice(bounds[i], bounds[i + 1])
+            excited[idle] &= np.cumsum(heard[idle], dtype=np.int32) - heard[bounds[i]] < idle_n
     return excited
 
 
@@ -139,6 +142,8 @@ def _watched(
     watched = equations & (count > int(estimator.get("warm_up_n", 0)))
     hold_off_n = int(estimator.get("hold_off_n", 0))
     if hold_off_n and len(alarms):
-        last = np.searchsorted(alarms, np.arange(len(count))) - 1  # of the alarms before the sample
-        watched &= (last < 0) | (count > count[alarms[last]] + hold_off_n)
+        for first in range(0, len(count), CHUNK_SAMPLES):
+            part = slice(first, min(first + CHUNK_SAMPLES, len(count)))
+            last = np.searchsorted(alarms, np.arange(part.start, part.stop)) - 1  # of the alarms before the sample
+            watched[part] &= (last < 0) | (count[part] > count[alarms[last]] + hold_off_n)
     return watched

@@ -13,6 +13,7 @@ become and the likeliest plant in which another parameter alone had changed reac
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State
-from analogrig.run import Run
+from analogrig.run import CHUNK_SAMPLES, Run
 from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.suspension import PROGRAMS
 
@@ -47,11 +48,11 @@ class _Change:
 
     before: Plant
     after: Plant
-    steps: Sequence[SampledPlant]
-    """The plant in each of the sample periods after it."""
+    turning: Sequence[SampledPlant]
+    """The plant in each of the sample periods after it while it lasts."""
     state: State
     """In which it finds the plant."""
-    force_n: Sequence[float]
+    force_n: NDArray[np.float64]
     """(n,) as it was measured."""
     weight: NDArray[np.float64]
     """(n,) of a squared metre of displacement, after each of these forces: information; 0 for a missing sample."""
@@ -69,9 +70,40 @@ def changes(run: Run) -> list[NDArray[np.float64]]:
 
 def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change."""
-    unchanged = [SampledPlant.of(change.before, period_s)] * len(change.steps)
-    difference_m = _course(change, change.steps) - _course(change, unchanged)
-    return np.cumsum(difference_m**2 * change.weight)
+    changed = _Motion.after(change, period_s)
+    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.of(change.before, period_s)))
+    out = np.empty(len(change.force_n))
+    gathered = 0.0
+    for first in range(0, len(out), CHUNK_SAMPLES):
+        part = slice(first, first + CHUNK_SAMPLES)
+        difference_m = changed.under(change.force_n[part]) - unchanged.under(change.force_n[part])
+        out[part] = np.cumsum(np.append(gathered, difference_m**2 * change.weight[part]))[1:]
+        gathered = float(out[part][-1])
+    return out
+
+
+class _Motion:
+    """Displacement of a plant under a force, part by part."""
+
+    def __init__(self, state: State, steps: Iterator[SampledPlant]) -> None:
+        """From ``state`` on; ``steps`` are the plant in one sample period after the other."""
+        self.state = state
+        self._steps = steps
+
+    @classmethod
+    def after(cls, change: _Change, period_s: float) -> _Motion:
+        settled = itertools.repeat(SampledPlant.of(change.after, period_s))
+        return cls(change.state, itertools.chain(change.turning, settled))
+
+    def under(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) metres, after each of the n forces that come next."""
+        state = self.state
+        out = np.empty(len(force_n))
+        for k, (force, step) in enumerate(zip(force_n.tolist(), self._steps, strict=False)):
+            state = step.next(state, force)
+            out[k] = state[0]
+        self.state = state
+        return out
 
 
 def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
@@ -91,7 +123,7 @@ def predicted_bounds(
     lsb_m = lsb_v / scales.volts("displacement")
     weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
     volts = _levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
-    force_n = (volts / scales.volts("force")).tolist()
+    force_n = volts / scales.volts("force")
     segments = scenario.segments()
     stretches = [
         (segment.start, following, segment.plant)
@@ -122,7 +154,7 @@ def isolation_bounds(run: Run) -> list[int | None]:
     out = []
     for change in _changes(run):
         changed = tuple(change.before.changes_to(change.after))
-        course = _course(change, change.steps)[:ISOLATION_HORIZON_N]
+        course = _Motion.after(change, period_s).under(change.force_n[:ISOLATION_HORIZON_N])
         least = np.full(len(course), np.inf)
         for name in PARAMETERS:
             if changed != (name,):
@@ -135,7 +167,7 @@ def isolation_bounds(run: Run) -> list[int | None]:
 
 def _changes(run: Run) -> Iterator[_Change]:
     conditions = run.conditions
-    force_n = run.channel("force").tolist()
+    force_n = run.channel("force")
     displacement = conditions.channels["displacement"]
     variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
     weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
@@ -148,7 +180,7 @@ def _changes(run: Run) -> Iterator[_Change]:
 def _courses_of(
     stretches: Iterable[tuple[int, int, Plant]],
     ramps_n: Mapping[int, int],
-    force_n: Sequence[float],
+    force_n: NDArray[np.float64],
     weight: NDArray[np.float64],
     period_s: float,
     records: Sequence[int] = (0,),
@@ -159,21 +191,23 @@ def _courses_of(
     for start, end, plant in stretches:
         if start in records:
             state = AT_REST
-        steps = _steps(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
+        turning = _turning(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
+        change = _Change(before or plant, plant, turning, state, force_n[start : end - 1], weight[start + 1 : end])
         if before is not None:
-            yield _Change(before, plant, steps[:-1], state, force_n[start : end - 1], weight[start + 1 : end])
+            yield change
         if end < len(force_n):
-            for step, force in zip(steps, force_n[start:end], strict=True):
-                state = step.next(state, force)
+            motion = _Motion.after(change, period_s)
+            for first in range(start, end, CHUNK_SAMPLES):
+                motion.under(force_n[first : min(first + CHUNK_SAMPLES, end)])
+            state = motion.state
         before = plant
 
 
-def _steps(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
-    """The plant in each of the sample periods after a change; on a ramp that of the period's middle."""
-    turning = [
+def _turning(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
+    """The plant in each of the sample periods of a ramp, in the middle of the period."""
+    return [
         SampledPlant.of(before.on_the_way(after, (k + 0.5) / ramp_n), period_s) for k in range(min(ramp_n, samples))
     ]
-    return turning + [SampledPlant.of(after, period_s)] * (samples - len(turning))
 
 
 def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
@@ -182,23 +216,13 @@ def first_reaching(information: Sequence[float] | NDArray[np.float64], level: fl
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _course(change: _Change, steps: Sequence[SampledPlant]) -> NDArray[np.float64]:
-    """(n,) metres, after each of the n forces."""
-    state = change.state
-    out = np.empty(len(steps))
-    for k, (step, force) in enumerate(zip(steps, change.force_n, strict=True)):
-        state = step.next(state, force)
-        out[k] = state[0]
-    return out
-
-
 def _courses(change: _Change, plants: Sequence[Plant], period_s: float) -> NDArray[np.float64]:
     """(p, n) metres, of each of p plants, up to the horizon."""
     sampled = [SampledPlant.of(plant, period_s) for plant in plants]
     xx, xv, vx, vv = np.array([each.transition for each in sampled]).T
     xf, vf = np.array([each.response for each in sampled]).T
     x, v = (np.full(len(plants), value) for value in change.state)
-    forces = change.force_n[:ISOLATION_HORIZON_N]
+    forces = change.force_n[:ISOLATION_HORIZON_N].tolist()
     out = np.empty((len(plants), len(forces)))
     for k, force in enumerate(forces):
         x, v = xx * x + xv * v + xf * force, vx * x + vv * v + vf * force

@@ -415,8 +415,8 @@ def _losses(run: Run) -> list[str]:
     most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
     where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
     reasons = [f"{lost} samples were {where}, more than {most}"] if lost > most else []
-    heard = np.flatnonzero(~run.lost)
-    known = int(run.lost[: heard[-1]].sum()) if len(heard) else 0  # of those after the last one heard it cannot know
+    after_n = int(np.argmin(run.lost[::-1])) if lost < run.samples else run.samples
+    known = lost - after_n  # of those after the last one heard it cannot know
     missed = run.conditions.counters.get("samples_lost", known)
     if missed != known:
         reasons.append(f"the device never saw {missed} samples, where {known} are known to be lost")

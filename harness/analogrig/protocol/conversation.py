@@ -6,9 +6,10 @@ each answer says which message it answers.
 
 from __future__ import annotations
 
+import math
 from typing import TypeVar
 
-from analogrig.errors import DeviceError, LinkError, LinkTimeout
+from analogrig.errors import DeviceError, LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.link import Link
 from analogrig.protocol.catalogue import SEQS, Configured, Controlled, Firmware, Hello, Message, Status, brief, pack
 
@@ -27,6 +28,8 @@ class Conversation:
         self.name = name
         self.timeout_s = timeout_s
         self.clock = link.clock
+        self.limit_s = math.inf
+        """Time on the clock at which the time limit of the run is over."""
         self._seq = 0
         self._expected: int | None = None
         self._heard: dict[int, Message] = {}
@@ -73,14 +76,16 @@ class Conversation:
         """The next message of the device, or None if none comes in time. One that comes again is passed over.
 
         :raises LinkError: messages before it were lost, somebody else speaks as the device, or the line failed.
+        :raises TimeLimitReached: none came before the time limit of the run.
         """
-        while (left_s := deadline_s - self.clock()) >= 0.0:  # also when messages never cease
+        until_s = min(self.limit_s, deadline_s)
+        while (left_s := until_s - self.clock()) >= 0.0:  # also when messages never cease
             try:
                 message = self.link.receive(left_s)
             except LinkError as error:
                 raise self._named(error) from error
             if message is None:
-                return None
+                break
             if self._expected is None or message.seq == self._expected:
                 self._expected = (message.seq + 1) % SEQS
                 self._heard[message.seq] = self._last = message
@@ -98,6 +103,8 @@ class Conversation:
                     f"device {self.name}: {brief(before)} and {brief(message)} have the same number, {message.seq}:"
                     " it was reset, or two speak as this device"
                 )
+        if self.limit_s <= deadline_s:
+            raise TimeLimitReached(f"device {self.name}: time limit reached ({self.so_far})")
         return None
 
     def ask(self, request: Message, kind: type[Answer]) -> Answer:

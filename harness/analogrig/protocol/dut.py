@@ -28,6 +28,7 @@ from analogrig.errors import (
     LinkClosed,
     LinkError,
     LinkTimeout,
+    TimeLimitReached,
 )
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.catalogue import (
@@ -114,6 +115,13 @@ class Dut:
         line, packing = self._talk.link.line, self._packing()
         rates = {} if line is None else line.rates()
         return {**rates, "samples_per_message": packing.per_message, "window": packing.window}
+
+    def limit(self, left_s: float) -> None:
+        """Wait no longer than ``left_s`` from now, whatever is asked; ``math.inf`` removes the limit.
+
+        After that, every method that waits for the device raises ``TimeLimitReached``.
+        """
+        self._talk.limit_s = self._talk.clock() + left_s
 
     @property
     def estimator(self) -> EstimatorConfig:
@@ -340,22 +348,36 @@ class Dut:
         return replies
 
     def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        """As ``feed`` for one stretch of samples after the other, without a pause between them."""
+        """As ``feed`` for one stretch of samples after the other, without a pause between them.
+
+        :raises TimeLimitReached: after the answers to all samples that were answered in time, the last stretch in part.
+        """
         exchange = self._running()
         waiting: deque[tuple[int, int]] = deque()
-        for first, force, displacement, missing in stretches:
-            exchange.enter(first, force, displacement, missing)
-            waiting.append((len(force), first + len(force)))
-            while waiting and exchange.ready >= waiting[0][0]:
-                yield exchange.take(*waiting.popleft())
-        exchange.finish()
-        yield from (exchange.take(*each) for each in waiting)
+        try:
+            for first, force, displacement, missing in stretches:
+                waiting.append((len(force), first + len(force)))
+                exchange.enter(first, force, displacement, missing)
+                while waiting and exchange.ready >= waiting[0][0]:
+                    yield exchange.take(*waiting.popleft())
+            exchange.finish()
+        except TimeLimitReached:
+            yield from _answered(exchange, waiting)
+            raise
+        yield from _answered(exchange, waiting)
 
     def _running(self) -> Exchange:
         """:raises ValueError: there is no run."""
         if self._exchange is None:
             raise ValueError("no run has been started")
         return self._exchange
+
+
+def _answered(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
+    """Answers to stretches (samples, end), the last one in part if not all of its samples were answered."""
+    for n, end in waiting:
+        answered = min(n, exchange.ready)
+        yield exchange.take(answered, end - n + answered)
 
 
 def open_dut(name: str, *, listener: CanListener | None = None, **changes: Any) -> Dut:

@@ -6,12 +6,14 @@
   const ROBUST_TAIL = 0.15; // of the estimates in view, on either side, may lie outside the plot ...
   const ROBUST_SPREAD = 0.6; // ... and nothing farther than this from the truth widens it
   const CEILINGS_SHOWN = 2;
+  const BUCKET_PX = 3;
   const { alarms, begin, cursor, curve, inks, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf } = plotting;
 
   const run = JSON.parse(document.getElementById("run").textContent);
   const last = run.samples - 1;
   const showEvery = document.getElementById("every");
   const view = { min: 0, max: last };
+  const places = placed();
   let plots = [];
 
   function decoded(buffer) {
@@ -19,7 +21,7 @@
     const signals = {};
     let at = 0;
     for (const column of run.columns) {
-      const size = types[column.type].BYTES_PER_ELEMENT * run.samples;
+      const size = types[column.type].BYTES_PER_ELEMENT * run.points;
       const raw = new types[column.type](buffer.slice(at, at + size)); // a copy is aligned
       at += size;
       const values = Array.from(raw, (v) => (Number.isFinite(v) ? column.offset + column.scale * v : null));
@@ -28,10 +30,33 @@
     return signals;
   }
 
+  // The sample of each point. Of a bucket of several samples there are two: the minimum and the maximum.
+  function placed() {
+    const places = [];
+    for (const [start, end, size] of run.pieces) {
+      for (let first = start; first < end; first += size) {
+        places.push(first);
+        if (size > 1) places.push(first + (Math.min(size, end - first) >> 1));
+      }
+    }
+    return places;
+  }
+
+  // The first point at a sample or after it.
+  function pointAt(sample) {
+    let [low, high] = [0, places.length];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (places[middle] < sample) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+
   function truth(name) {
     if (!run.segments.length) return null;
-    const values = new Array(run.samples).fill(null);
-    for (const segment of run.segments) values.fill(segment[name], segment.start, segment.end);
+    const values = new Array(run.points).fill(null);
+    for (const segment of run.segments) values.fill(segment[name], pointAt(segment.start), pointAt(segment.end));
     return values;
   }
 
@@ -41,7 +66,7 @@
       if (!missing[k]) continue;
       const first = k;
       while (k + 1 < missing.length && missing[k + 1]) k++;
-      stretches.push([first, k]);
+      stretches.push([places[first], places[k]]);
     }
     return stretches;
   }
@@ -49,8 +74,9 @@
   // Ranges of the vertical scales
 
   function inView(values) {
-    const first = Math.max(0, Math.ceil(view.min));
-    return values.slice(first, Math.min(last, Math.floor(view.max)) + 1).filter((v) => v !== null);
+    const [first, end] = [pointAt(view.min), pointAt(Math.floor(view.max) + 1)];
+    const seen = first < end ? values.slice(first, end) : values.slice(Math.max(0, first - 1), first + 1); // or beside
+    return seen.filter((v) => v !== null);
   }
 
   function extent(values) {
@@ -124,6 +150,34 @@
     ctx.restore();
   }
 
+  // Where two points stand for many samples and are so far apart that they look like a signal: shade, and words above.
+  function buckets(u, ink) {
+    const { ctx, bbox } = u;
+    const px = devicePixelRatio;
+    const wide = run.pieces.filter(([, , size]) => size > 1 && (size * bbox.width) / (view.max - view.min) > BUCKET_PX * px);
+    const spans = wide.map(([start, end, size]) => {
+      const from = Math.max(bbox.left, u.valToPos(start, "x", true));
+      return { from, width: Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true)) - from, size };
+    }).filter(({ width }) => width > 0);
+    return {
+      shade() {
+        ctx.save();
+        ctx.fillStyle = ink("line");
+        ctx.globalAlpha = 0.35;
+        for (const { from, width } of spans) ctx.fillRect(from, bbox.top, width, bbox.height);
+        ctx.restore();
+      },
+      words() {
+        lettered(u, ink("muted"), "left", "bottom");
+        for (const { from, width, size } of spans) {
+          const words = `minimum and maximum of every ${size} samples`;
+          if (ctx.measureText(words).width < width) ctx.fillText(words, from, bbox.top - 2 * px);
+        }
+        ctx.restore();
+      },
+    };
+  }
+
   // Plots
 
   function line(label, ink, colour, unit, more) {
@@ -137,7 +191,7 @@
     clipped.forEach((bits, k) => bits & (1 << channel) && indices.push(k));
     return {
       show: indices.length > 0,
-      filter: () => indices.filter((k) => k >= view.min && k <= view.max),
+      filter: () => indices.filter((k) => places[k] >= view.min && places[k] <= view.max),
       size: 7,
       width: 1.25,
       stroke: ink(colour),
@@ -193,7 +247,7 @@
     const ceiling = run.ceiling === null ? [] : [line("ceiling", ink, "truth", "", { scale: "left", width: 2, dash: [10, 6] })];
     return {
       caption: "Trigger: its statistic, and the ceiling above which it raises an alarm",
-      data: ceiling.length ? [values, new Array(run.samples).fill(run.ceiling)] : [values],
+      data: ceiling.length ? [values, new Array(run.points).fill(run.ceiling)] : [values],
       series: [line("statistic", ink, "first", "", { scale: "left" }), ...ceiling],
       scales: { left: { range: statisticRange } },
       axes: [axis("left", "statistic", 3, ink)],
@@ -221,8 +275,9 @@
       axes: [sampleAxis(ink), ...plot.axes],
       series: [{ label: "sample" }, ...plot.series],
       hooks: {
+        drawClear: [(u) => buckets(u, ink).shade()],
         drawAxes: [(u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }), (u) => alarms(u, marks, ink).lines()],
-        draw: [(u) => missingBand(u, stretches, ink), (u) => alarms(u, marks, ink).flags(), (u) => lamps(u, ink)],
+        draw: [(u) => missingBand(u, stretches, ink), (u) => alarms(u, marks, ink).flags(), (u) => lamps(u, ink), (u) => buckets(u, ink).words()],
       },
     };
   }
@@ -236,7 +291,6 @@
     const place = document.getElementById("plots");
     const width = widthOf(place);
     const stretches = missingStretches(signals.missing.raw);
-    const samples = Array.from({ length: run.samples }, (_, k) => k);
     const kept = { ...view };
     plots.forEach((plot) => plot.destroy());
     place.replaceChildren();
@@ -255,7 +309,7 @@
       figure.append(caption);
       place.append(figure);
       const name = `${plot.caption}, samples 0 to ${last}`;
-      return plotted(options(plot, width, ink, stretches), [samples, ...plot.data], figure, name);
+      return plotted(options(plot, width, ink, stretches), [places, ...plot.data], figure, name);
     });
     show(kept.min, kept.max);
   }

@@ -51,6 +51,7 @@ def render(run: Run, verdict: Verdict) -> str:
         estimates=tables.estimates(verdict),
         settings=tables.settings(run),
         period=tables.period(run),
+        resolution=tables.resolution(run, verdict),
     )
 
 

@@ -10,11 +10,15 @@ from analogrig.judging.advice import advice
 from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
 from analogrig.links.bus_load import load_of
 from analogrig.plant import PARAMETERS, UNITS
+from analogrig.reporting.payload import is_thinned, marked_alarms
 from analogrig.reporting.summary import lamps_text, latency_text, load_text
 from analogrig.run import Run
 
 _MAX_FALSE_ALARMS = 20
-"""Rows of their table; the plots mark them all."""
+"""Rows of their table; the plots mark more."""
+
+_MOST_ROWS = 500
+"""Rows shown of any table."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
 
@@ -144,6 +148,20 @@ def period(run: Run) -> str:
     return _text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
 
 
+def resolution(run: Run, verdict: Verdict) -> str:
+    """Sentences about what the plots leave out, with a space before; empty if they show everything."""
+    out = ""
+    if is_thinned(run):
+        out += (
+            " The run is long: the plots hold every sample near changes and the first alarms; elsewhere minima and"
+            " maxima of several samples. The recording holds every sample."
+        )
+    marked, alarms = marked_alarms(run, verdict), len(run.alarm_index)
+    if marked < alarms:
+        out += f" {marked:,} of {alarms:,} alarms are marked."
+    return out
+
+
 def _what_ran(run: Run) -> str:
     ran = run.conditions
     return f"{_text(ran.scenario['name'])} on {_text(ran.rig['name'])}, device {_text(ran.dut['name'])}"
@@ -243,10 +261,13 @@ def _shown(key: str, value: object) -> str:
 
 
 def _table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers") -> str:
-    """``head`` and ``rows`` are finished rows; ``kind`` is a class of the style."""
+    """``head`` and ``rows`` are finished rows, of which the first are shown; ``kind`` is a class of the style."""
+    shown = list(rows)
+    if len(shown) > _MOST_ROWS:
+        caption += f"; the first {_MOST_ROWS} of {len(shown):,} rows"
     return (
         f'<div class="scroll"><table class="{kind}"><caption>{_text(caption)}</caption>'
-        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(rows)}</tbody></table></div>"
+        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(shown[:_MOST_ROWS])}</tbody></table></div>"
     )
 
 

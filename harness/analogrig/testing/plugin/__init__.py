@@ -16,7 +16,7 @@ import pytest
 
 from analogrig.rigs import CAPABILITIES
 from analogrig.testing.plugin import devices, options, playing, scenarios
-from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR
+from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -131,11 +131,11 @@ def hil_dut(request: pytest.FixtureRequest) -> Dut:
 
 
 @pytest.fixture
-def hil_bench(hil_rig: Rig, hil_dut: Dut) -> Bench:
+def hil_bench(request: pytest.FixtureRequest, hil_rig: Rig, hil_dut: Dut) -> Bench:
     """Both on one table."""
     from analogrig.bench import Bench
 
-    return Bench(hil_rig, hil_dut)
+    return Bench(hil_rig, hil_dut, time_limit_s=time_limit_s(request.config))
 
 
 @pytest.fixture

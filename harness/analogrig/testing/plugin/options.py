@@ -105,6 +105,19 @@ def _no_profile(value: str) -> str:
     return "" if value in PROFILES else f"must be one of {', '.join(PROFILES)}, not {value!r}"
 
 
+def _seconds(value: str) -> float | None:
+    """A time limit; None: it cannot be one."""
+    try:
+        seconds = float(value)
+    except ValueError:
+        return None
+    return seconds if 1e-3 <= seconds <= 1e9 else None
+
+
+def _no_seconds(value: str) -> str:
+    return f"must be seconds from 0.001 to 1e9, not {value!r}" if value and _seconds(value) is None else ""
+
+
 RIG = Option(
     "hil_rig", "ANALOGRIG_RIG", "emulator", "what plays the scenarios: a shipped name, a .toml file, recording:FILE"
 )
@@ -128,7 +141,20 @@ HIL_PROFILE = Option(
     "hil_profile", "ANALOGRIG_HIL_PROFILE", "ci", f"how much the properties try: {', '.join(PROFILES)}", _no_profile
 )
 
-OPTIONS = (RIG, DUT, SCENARIO_DIR, RUNS_DIR, HIL_PROFILE)
+TIME_LIMIT = Option(
+    "hil_time_limit",
+    "ANALOGRIG_TIME_LIMIT",
+    "",
+    "longest time of one play in seconds; a play that takes longer is INCONCLUSIVE",
+    _no_seconds,
+)
+
+OPTIONS = (RIG, DUT, SCENARIO_DIR, RUNS_DIR, HIL_PROFILE, TIME_LIMIT)
+
+
+def time_limit_s(config: pytest.Config) -> float | None:
+    """Longest time of one play; None: there is no limit."""
+    return _seconds(TIME_LIMIT.said(config).value)
 
 
 def add(parser: pytest.Parser) -> None:

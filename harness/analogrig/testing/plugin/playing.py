@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR
+from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -116,7 +116,7 @@ class Player:
         """The same for another rig or device."""
         from analogrig.bench import Bench
 
-        return Player(self.item, Bench(rig, dut))
+        return Player(self.item, Bench(rig, dut, time_limit_s=time_limit_s(self.item.config)))
 
     def note(self, finding: Finding, seed: int) -> None:
         """What was found of the plays from a seed on."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from analogrig.testing.plugin.devices import Devices, check_owner
-from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR
+from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, time_limit_s
 from analogrig.testing.plugin.playing import Player
 
 if TYPE_CHECKING:
@@ -90,7 +90,8 @@ class ScenarioItem(pytest.Item):
         devices, name = self.config.stash[DEVICES], self._device(scenario)
         with open_rig(self._rig(scenario)) as rig:
             try:
-                finding = self._found(Player(self, Bench(rig, devices.lease(name))), scenario)
+                bench = Bench(rig, devices.lease(name), time_limit_s=time_limit_s(self.config))
+                finding = self._found(Player(self, bench), scenario)
             finally:
                 if name == scenario.dut:
                     devices.release(name)
