@@ -78,16 +78,21 @@ def _show(text: str) -> None:
 
 
 def _print(text: str, stream: TextIO, number: int) -> OSError | None:
-    """Write text below the progress line, if there is one. Return the error; the stream then discards all output."""
+    """Write text below the progress line, if there is one. Return the error, if any."""
     with ProgressLine.lock:
-        if text and ProgressLine.unfinished:
+        if ProgressLine.unfinished is not None:
             ProgressLine.unfinished.end()
-        try:
-            stream.write(text)
-            stream.flush()
-        except OSError as error:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
-            return error
+        return _write(text, stream, number)
+
+
+def _write(text: str, stream: TextIO, number: int) -> OSError | None:
+    """Write text. Return the error, if any: the stream then discards all output, also what it still holds."""
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        return error
     return None
 
 
@@ -143,10 +148,12 @@ class ProgressLine:
             return
         self._next_s = self._clock() + _PROGRESS_S
         with self.lock:
-            if ProgressLine.unfinished is self:
-                ProgressLine.unfinished = None
-            _print(f"\r{text:<{self._width}}", sys.stderr, 2)
-            ProgressLine.unfinished, self._width = self, len(text)
+            if ProgressLine.unfinished is not None and ProgressLine.unfinished is not self:
+                ProgressLine.unfinished.end()
+            # Before the text is written: Ctrl-C may come at any time, and no message may continue the line.
+            ProgressLine.unfinished = self
+            width, self._width = self._width, len(text)
+            _write(f"\r{text:<{width}}", sys.stderr, 2)
             if is_last:
                 self.end()
 
@@ -154,8 +161,8 @@ class ProgressLine:
         """End the line, if it was shown."""
         with self.lock:
             if ProgressLine.unfinished is self:
+                _write("\n", sys.stderr, 2)
                 ProgressLine.unfinished = None
-                _print("\n", sys.stderr, 2)
             self._width = 0
 
 
