@@ -185,7 +185,7 @@ $(VENV)/.requirements: requirements.lock
 	    { echo "$(VENV) was not made by this Makefile: remove it, or make VENV=another" >&2; exit 1; }
 	@uv --version >/dev/null 2>&1 || $(PYTHON) -c 'import ensurepip' 2>/dev/null || \
 	    { echo "$(PYTHON) cannot make environments: apt-get install python3-venv" >&2; exit 1; }
-	@echo "making $(VENV) from requirements.lock"
+	@echo "making $(VENV) from requirements.lock, which takes a minute"
 	@rm -rf $(VENV) && mkdir $(VENV) && touch $(VENV)/.made-by-make
 	@if uv --version >/dev/null 2>&1; then \
 	    uv venv --quiet --allow-existing --python "$$(command -v $(PYTHON))" $(VENV) && \
@@ -203,6 +203,7 @@ $(VENV)/.installed: $(VENV)/.requirements pyproject.toml setup.py
 
 # All products come from one command, whichever is out of date.
 $(PRODUCTS) &: $(NATIVE_SOURCES) | $(VENV)/.installed
+	@echo "compiling the emulator's engine and the device"
 	@$(BIN)/python setup.py --quiet build_products --inplace
 
 $(BUILD)/strict/%.ok: $(NATIVE_SOURCES) setup.py Makefile | $(VENV)/.installed

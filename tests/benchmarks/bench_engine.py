@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import re
 import resource
 import shutil
 import subprocess
@@ -59,10 +60,11 @@ TOLERATED_LSB = 0.2
 ACCURACIES = (
     Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=5e-5),
     Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=7.0, max_step_s=1e-5),
+    Accuracy(reltol=1e-3, vntol_v=1e-6, trtol=1.0, max_step_s=8e-6),
     Accuracy(reltol=1e-4, vntol_v=1e-6, trtol=7.0, max_step_s=5e-6),
     Accuracy(reltol=1e-6, vntol_v=1e-7, trtol=1.0, max_step_s=1e-4),
 )
-"""What ngspice is offered; each is tried with and without time points on the samples."""
+"""Settings of ngspice; each is tried with every deck of `variants`."""
 
 
 def best_s(job: Callable[[], object]) -> float:
@@ -174,8 +176,27 @@ def decks(samples: int, tweaks: Sequence[Tweak]) -> Iterator[str]:
     turns = [(sample, computer.dials_for(**settings)) for sample, settings in tweaks]
     for accuracy in ACCURACIES:
         deck = to_spice(computer.circuit, samples=samples, edges=edges, turns=turns, nodes=["u5"], accuracy=accuracy)
-        yield deck
-        yield "".join(line for line in deck.splitlines(keepends=True) if not line.startswith("Vtimepoints"))
+        yield from variants(deck)
+
+
+def variants(deck: str) -> Iterator[str]:
+    """A deck with time points on every sample, with time points at the start alone, and so with leaner op-amps.
+
+    Without any time point at the start ngspice's first step is too long, and it misses the first edge by 0.3 LSB.
+    """
+    yield deck
+    at_start = _replaced(r"^(X\S* clock\S* time_points period=)\S+$", r"\g<1>1", deck)
+    yield at_start
+    thevenin = r"^Einner inner 0 state 0 1\nRout inner out \{max\(rout, 1e-4\)\}$"
+    yield _replaced(thevenin, "Gout 0 out state 0 {1 / max(rout, 1e-4)}\nRout out 0 {max(rout, 1e-4)}", at_start)
+
+
+def _replaced(expression: str, by: str, deck: str) -> str:
+    """The deck with its one match replaced: a deck that is no longer written so must not be measured by mistake."""
+    out, count = re.subn(expression, by, deck, flags=re.MULTILINE)
+    if count != 1:
+        raise ValueError(f"the deck has {count} matches of {expression!r}: adapt tests/benchmarks to the deck's text")
+    return out
 
 
 def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:

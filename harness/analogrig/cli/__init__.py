@@ -1,4 +1,4 @@
-"""The command ``analogrig``: a module for each of its commands, and what they share.
+"""The command ``analogrig``: one module for each of its commands, and their common options and output.
 
 Everything heavy is imported inside the command that needs it, so that ``--help`` answers at once.
 """
@@ -16,10 +16,12 @@ from analogrig.cli import (
     certify,
     compare,
     compare_rigs,
+    completion,
     doctor,
     effects,
     emulate,
     judge,
+    listing,
     netlist,
     replay,
     run,
@@ -43,15 +45,20 @@ _COMMANDS = (
     compare_rigs,
     effects,
     netlist,
+    listing,
+    completion,
 )
 """Each has ``add(commands)``; in the order of ``--help``."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status. Every failure is one line on standard error."""
+    """Run one command and return its exit status. Every failure is one line on standard error."""
     open_standard_streams()
     try:
-        arguments = _parser().parse_args(argv)
+        parser = _parser()
+        if completion.VARIABLE in os.environ:
+            completion.complete(parser)
+        arguments = parser.parse_args(argv)
         return int(arguments.command(arguments))
     except KeyboardInterrupt:
         return complain("interrupted", INTERRUPTED)
@@ -60,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explain(error: Exception) -> int:
-    """What ended a command, in one line."""
+    """Print in one line the error that ended a command; return the exit status."""
     from analogrig.errors import AnalogrigError
     from analogrig_emulator.errors import EmulatorError
 
@@ -76,7 +83,13 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="analogrig",
         description="Hardware in the loop for embedded parameter estimators: a rig, a link, a device, a verdict.",
-        epilog="Exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted.",
+        epilog="exit status: 0 passed, 1 failed verdict, 2 usage or configuration, 3 inconclusive, 130 interrupted\n\n"
+        "examples:\n"
+        "  analogrig run\n"
+        "  analogrig list scenarios\n"
+        "  analogrig run --scenario slow --dut inproc --out build/slow\n"
+        "  analogrig run --help",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
@@ -86,14 +99,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """Report a usage error in one line."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(USAGE, f"analogrig: {message} (see {self.prog} --help)\n")
 
 
 class _Version(argparse.Action):
-    """Asks the installed distribution, and only when asked."""
+    """Print the version of the installed distribution, which takes time to look up."""
 
     def __init__(self, option_strings: Sequence[str], dest: str) -> None:
         super().__init__(option_strings, dest, nargs=0, help="show the version and exit")

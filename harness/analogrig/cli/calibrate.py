@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_rig, seed
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
+from analogrig.cli.options import add_command, add_json, add_rig, add_seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json, working
 
 if TYPE_CHECKING:
     from analogrig.hardware.calibration.fit import Calibration, Estimate
@@ -23,33 +22,45 @@ _SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, 
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("calibrate", help="fit the emulator to a rig's recordings, and keep it as its twin")
+    command = add_command(
+        commands,
+        "calibrate",
+        "fit the emulator to a rig's recordings, and keep it as the rig's twin",
+        "calibrate --rig emulator-real --out build/twin.toml",
+        "calibrate --rig bench --op-amp 741 --components polyester",
+    )
     add_rig(command)
     command.add_argument(
         "--out",
         type=Path,
         default=Path("build/twin.toml"),
         metavar="FILE.toml",
-        help="the twin, for --rig (default: %(default)s)",
+        help="file of the twin, for --rig (default: %(default)s)",
     )
     command.add_argument(
-        "--program", choices=("front", "shock"), default="front", help="what is patched on it (%(default)s)"
+        "--program",
+        choices=("front", "shock"),
+        default="front",
+        help="program of the computer (default: %(default)s)",
     )
-    command.add_argument("--op-amp", default="tl07x", choices=("tl07x", "741", "opa627", "ideal"), help="(%(default)s)")
+    command.add_argument(
+        "--op-amp",
+        default="tl07x",
+        choices=("tl07x", "741", "opa627", "ideal"),
+        help="type of the amplifiers (default: %(default)s)",
+    )
     command.add_argument(
         "--components",
         choices=("nominal", "polyester", "polypropylene"),
-        help="its capacitors (default: those that fit best)",
+        help="type of the capacitors (default: the type that fits best)",
     )
     command.add_argument(
         "--pots",
         choices=("coefficient", "dial"),
-        help="what its pots are set by (default: coefficient, unless dial fits better)",
+        help="quantity that the pots are set by (default: coefficient, unless dial fits better)",
     )
-    command.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="of what is drawn of an emulated rig (%(default)d)"
-    )
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_seed(command)
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -72,13 +83,17 @@ def _run(arguments: argparse.Namespace) -> int:
             pots=(arguments.pots,) if arguments.pots else POTS,
             progress=progress_line("fits"),
         )
-        check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
+        with working("checking the twin"):
+            check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if check_lsb <= MOST_LSB:
         with replacing(arguments.out) as file:
             file.write(_toml(found, arguments.rig, arguments.program, check_lsb).encode("utf-8"))
-    show(json.dumps(_as_json(found, check_lsb, arguments)) if arguments.json else _table(found, check_lsb, arguments))
+    if arguments.json:
+        show_json(_as_json(found, check_lsb, arguments))
+    else:
+        show(_table(found, check_lsb, arguments))
     return PASSED if check_lsb <= MOST_LSB else FAILED
 
 
@@ -170,17 +185,13 @@ def _toml(found: Calibration, rig: str, program: str, check_lsb: float) -> str:
 
 
 def _as_json(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> dict[str, Any]:
-    from math import isfinite
-
     return {
         "rig": arguments.rig,
         "program": arguments.program,
         "file": str(arguments.out) if check_lsb <= MOST_LSB else None,
         "components": found.twin.computer.components,
         "pots": found.twin.computer.pots,
-        "estimates": [
-            {**vars(each), "known_to": each.known_to if isfinite(each.known_to) else None} for each in found.estimates
-        ],
+        "estimates": [vars(each) for each in found.estimates],
         "chi_square": found.chi_square,
         "freedom": found.freedom,
         "caveats": _caveats(found),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, watched
+from analogrig.cli.options import CAMPAIGN, FILE, add_command, add_json
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, show_json, watched
 
 if TYPE_CHECKING:
     from analogrig.campaigns.conduct import Tally
@@ -23,15 +23,23 @@ MOST_WORKERS = 16
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser(
-        "campaign", help="many trials over plants, changes, noise, rigs and devices, to one file of results"
+    command = add_command(
+        commands,
+        "campaign",
+        "play many trials over plants, changes, noise, rigs and devices",
+        "campaign pot-plane",
+        "campaign my-campaign.toml --workers 4 --out results.json",
+        "campaign pot-plane --cluster tcp://host:8786",
     )
-    command.add_argument("spec", metavar="SPEC", help="a shipped name or a .toml file; see harness/README.md")
+    command.add_argument("spec", metavar=CAMPAIGN, help="shipped name or .toml file")
     command.add_argument(
-        "--out", type=Path, metavar="FILE", help="the results; beside them a page (default: build/campaign/NAME.json)"
+        "--out",
+        type=Path,
+        metavar=FILE,
+        help="file of the results, with a page beside it (default: build/campaign/NAME.json)",
     )
     add_workers(command)
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -40,10 +48,10 @@ def add_workers(command: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         metavar="N",
-        help="processes (default: one for each processor, or for a device of its own)",
+        help="number of processes (default: one for each processor; one for a device that cannot be shared)",
     )
     command.add_argument(
-        "--cluster", metavar="URL", help="the scheduler of a Dask cluster that plays instead, such as tcp://host:8786"
+        "--cluster", metavar="URL", help="scheduler of a Dask cluster to play on instead, such as tcp://host:8786"
     )
 
 
@@ -82,7 +90,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
     write_page(results, page)
     if arguments.json:
-        show(json.dumps({**as_json(results), "results": str(out), "page": str(page)}))
+        show_json({**as_json(results), "results": str(out), "page": str(page)})
     else:
         show(f"{text(results)}\nresults: {out}\npage:    {page}")
     return STATUS[results.outcome()]

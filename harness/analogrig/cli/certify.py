@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
-from analogrig.cli.options import add_rig, seed
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, watched
+from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, watched
 
 if TYPE_CHECKING:
     from analogrig.campaigns.certificate import Certificate, Question
@@ -22,13 +21,26 @@ _STATUS = {"certified": PASSED, "refuted": FAILED, "inconclusive": INCONCLUSIVE}
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("certify", help="whether a device raises false alarms rarely enough, with proof")
-    command.add_argument(
-        "--far", type=float, default=1e-5, metavar="RATE", help="false alarms per sample (%(default)g)"
+    command = add_command(
+        commands,
+        "certify",
+        "prove with confidence that a device raises false alarms rarely enough",
+        "certify --far 1e-4 --confidence 0.99 --dut inproc",
+        "certify --sequential --dut inproc",
+        "certify --rare --far 1e-7 --dut inproc",
     )
-    command.add_argument("--confidence", type=float, default=0.999, metavar="P", help="of the answer (%(default)g)")
     command.add_argument(
-        "--allowed", type=int, default=5, metavar="N", help="alarms that a test of fixed length forgives (%(default)d)"
+        "--far", type=float, default=1e-5, metavar="RATE", help="false-alarm rate per sample (default: %(default)g)"
+    )
+    command.add_argument(
+        "--confidence", type=float, default=0.999, metavar="P", help="confidence level (default: %(default)g)"
+    )
+    command.add_argument(
+        "--allowed",
+        type=int,
+        default=5,
+        metavar="N",
+        help="most alarms with which a test of fixed length passes (default: %(default)d)",
     )
     command.add_argument("--sequential", action="store_true", help="stop as soon as the answer is certain")
     command.add_argument(
@@ -37,14 +49,21 @@ def add(commands: Any) -> None:
         nargs="?",
         const=_ESTIMATES,
         metavar="N",
-        help=f"for rates too rare to be waited for: N estimates from branches with louder noise ({_ESTIMATES})",
+        help=f"estimate a rare rate from N branches with more noise (default: {_ESTIMATES})",
     )
-    command.add_argument("--scenario", default="healthy", metavar="NAME", help="one without changes (%(default)s)")
+    command.add_argument(
+        "--scenario", default="healthy", metavar=SCENARIO, help="scenario without changes (default: %(default)s)"
+    )
     add_rig(command)
-    command.add_argument("--dut", default=os.environ.get("ANALOGRIG_DUT", "host"), metavar="NAME", help="the device")
-    command.add_argument("--seed", type=seed, default=0, metavar="N", help="of the first run (%(default)d)")
+    command.add_argument(
+        "--dut",
+        default=os.environ.get("ANALOGRIG_DUT", "host"),
+        metavar=DUT,
+        help="device (default: $ANALOGRIG_DUT or host)",
+    )
+    add_seed(command)
     add_workers(command)
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a sentence")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -71,7 +90,10 @@ def _run(arguments: argparse.Namespace) -> int:
             answer = certify(question, crew, _progress())
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
-    show(json.dumps(_as_json(question, answer)) if arguments.json else _sentence(question, answer))
+    if arguments.json:
+        show_json(_as_json(question, answer))
+    else:
+        show(_sentence(question, answer))
     return _STATUS[answer.outcome]
 
 

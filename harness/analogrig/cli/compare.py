@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+from analogrig.cli.options import FILE, add_command, add_json
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, working
 
 if TYPE_CHECKING:
     from analogrig.campaigns.comparison import Comparison
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser(
-        "compare", help="whether B is worse than A beyond chance: two campaigns or folders of runs"
+    command = add_command(
+        commands,
+        "compare",
+        "test two campaigns or folders of runs for differences beyond chance",
+        "compare before.json after.json",
+        "compare runs/before runs/after --alpha 0.05 --json",
     )
-    command.add_argument("a", type=Path, metavar="A", help="results of a campaign, or a folder of recordings")
-    command.add_argument("b", type=Path, metavar="B", help="the same, of the newer build")
+    command.add_argument("a", type=Path, metavar=FILE, help="A: results of a campaign, or a folder of recordings")
+    command.add_argument("b", type=Path, metavar=FILE, help="B: the same of the newer build")
     command.add_argument(
-        "--alpha", type=_probability, default=0.01, metavar="P", help="chance of any wrong word (%(default)g)"
+        "--alpha", type=_probability, default=0.01, metavar="P", help="family-wise error rate (default: %(default)g)"
     )
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -42,8 +46,12 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.comparison import PAIRED, compare
     from analogrig.campaigns.sides import load, matched
 
-    found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
-    show(json.dumps(asdict(found)) if arguments.json else _text(found))
+    with working(f"comparing {arguments.a} and {arguments.b}"):
+        found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
+    if arguments.json:
+        show_json(asdict(found))
+    else:
+        show(_text(found))
     if not found.differences:
         return complain("INCONCLUSIVE: the two sides have nothing that can be compared", INCONCLUSIVE)
     ours, theirs = found.inconclusive

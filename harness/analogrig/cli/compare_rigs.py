@@ -3,30 +3,49 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import RIG_NAMES, add_dut, changes_of_dut, count, seed
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
+from analogrig.cli.options import (
+    RIG,
+    RIG_NAMES,
+    SCENARIO,
+    add_command,
+    add_dut,
+    add_json,
+    add_seed,
+    changes_of_dut,
+    count,
+)
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
 
 if TYPE_CHECKING:
     from analogrig.hardware.rig_comparison import RigComparison
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser(
-        "compare-rigs", help="how far rig B is from rig A, in LSB and in samples of latency, with confidence"
+    command = add_command(
+        commands,
+        "compare-rigs",
+        "measure how far rig B is from rig A, in signals and in verdicts",
+        "compare-rigs emulator emulator-skewed --dut inproc --plays 4",
+        "compare-rigs emulator my-bench.toml --most-lsb 4 --json",
     )
-    command.add_argument("a", metavar="A", help=f"a rig: {RIG_NAMES}")
-    command.add_argument("b", metavar="B", help="the other")
-    command.add_argument("--scenario", default="thesis", metavar="NAME", help="shipped or a .toml file (%(default)s)")
-    command.add_argument("--plays", type=count, default=10, metavar="N", help="on each of them (%(default)d)")
-    command.add_argument("--seed", type=seed, default=0, metavar="N", help="of the first play (%(default)d)")
-    command.add_argument("--confidence", type=float, default=0.95, metavar="P", help="of all bounds (%(default)g)")
-    command.add_argument("--most-lsb", type=float, metavar="LSB", help="fails if the rms difference may be more")
-    command.add_argument("--most-samples", type=float, metavar="N", help="fails if that of latencies may be more")
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    command.add_argument("a", metavar=RIG, help=f"A: {RIG_NAMES}")
+    command.add_argument("b", metavar=RIG, help="B: the same")
+    command.add_argument(
+        "--scenario", default="thesis", metavar=SCENARIO, help="shipped name or .toml file (default: %(default)s)"
+    )
+    command.add_argument(
+        "--plays", type=count, default=10, metavar="N", help="number of plays on each rig (default: %(default)d)"
+    )
+    add_seed(command)
+    command.add_argument(
+        "--confidence", type=float, default=0.95, metavar="P", help="confidence of all bounds (default: %(default)g)"
+    )
+    command.add_argument("--most-lsb", type=float, metavar="LSB", help="largest rms difference of the signals")
+    command.add_argument("--most-samples", type=float, metavar="N", help="largest difference of mean latencies")
+    add_json(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
     command.set_defaults(command=_run)
 
@@ -56,7 +75,10 @@ def _run(arguments: argparse.Namespace) -> int:
         found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))
     if not isinstance(found, RigComparison):
         return complain(f"INCONCLUSIVE: nothing can be compared: {found[0]}", INCONCLUSIVE)
-    show(json.dumps(asdict(found) | {"sentence": found.sentence}) if arguments.json else _text(found))
+    if arguments.json:
+        show_json(asdict(found) | {"sentence": found.sentence})
+    else:
+        show(_text(found))
     return FAILED if _differ(found, arguments) else PASSED
 
 

@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_rig, seed
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
+from analogrig.cli.options import add_command, add_json, add_rig, add_seed
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, working
 
 if TYPE_CHECKING:
     from analogrig.hardware.self_test.findings import Check, Findings
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("doctor", help="what is wrong with a rig: leads, ranges, gains, skew, noise, clocks")
+    command = add_command(
+        commands,
+        "doctor",
+        "test a rig: leads, ranges, gains, skew, noise, clocks",
+        "doctor --rig emulator",
+        "doctor --rig emulator-skewed --json",
+        "doctor --rig bench --program shock",
+    )
     add_rig(command)
     command.add_argument(
         "--program",
         choices=("front", "shock"),
-        help="what is wired on the computer (default: what the rig says, or front)",
+        help="program of the computer (default: that of the rig, or front)",
     )
-    command.add_argument("--seed", type=seed, default=0, metavar="N", help="of all that is random (%(default)d)")
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_seed(command)
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -35,10 +41,14 @@ def _run(arguments: argparse.Namespace) -> int:
     with open_rig(arguments.rig, self_test=False) as rig:
         program = arguments.program or str(rig.description().get("plant", "front"))
         try:
-            findings = self_test(rig, arguments.seed, program)
+            with working(f"self-test of {arguments.rig}"):
+                findings = self_test(rig, arguments.seed, program)
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
-    show(json.dumps(_as_json(findings, arguments.seed)) if arguments.json else _text(findings))
+    if arguments.json:
+        show_json(_as_json(findings, arguments.seed))
+    else:
+        show(_text(findings))
     if findings.having("wrong"):
         return FAILED
     return PASSED if findings.well else INCONCLUSIVE
@@ -65,7 +75,7 @@ def _line(check: Check) -> str:
 
 
 def _as_json(findings: Findings, seed: int) -> dict[str, Any]:
-    checks = [{"state": check.state, **_finite(vars(check))} for check in findings.checks]
+    checks = [{"state": check.state, **vars(check)} for check in findings.checks]
     return {
         "rig": findings.rig,
         "program": findings.program,
@@ -73,11 +83,4 @@ def _as_json(findings: Findings, seed: int) -> dict[str, Any]:
         "well": findings.well,
         "checks": checks,
         "reasons": list(findings.reasons),
-    }
-
-
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no NaN: what was not measured is null."""
-    return {
-        key: value if not isinstance(value, float) or math.isfinite(value) else None for key, value in values.items()
     }

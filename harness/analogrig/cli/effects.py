@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.terminal import PASSED, show
+from analogrig.cli.options import FILE, add_command, add_json
+from analogrig.cli.terminal import PASSED, show, show_json, working
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("effects", help="what matters at 12 bits: each fault of the machine by itself")
-    command.add_argument("--set", choices=("shock", "front"), help="one parameter set instead of both")
-    command.add_argument("--out", type=Path, metavar="FILE", help="also draw it, as an .svg file")
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    command = add_command(
+        commands,
+        "effects",
+        "measure each fault of a real machine by itself, in LSB at 12 bits",
+        "effects --set front",
+        "effects --out build/effects.svg",
+    )
+    command.add_argument("--set", choices=("shock", "front"), help="parameter set (default: both)")
+    command.add_argument("--out", type=Path, metavar=FILE, help="picture of the table, an .svg file")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -25,8 +31,12 @@ def _run(arguments: argparse.Namespace) -> int:
         from analogrig.errors import ConfigurationError
 
         raise ConfigurationError(f"{arguments.out}: the file's name must end with .svg")
-    table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
+    with working("playing each fault"):
+        table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
     if arguments.out is not None:
         effects.write_picture(table, arguments.out)
-    show(json.dumps(effects.as_json(table)) if arguments.json else effects.text(table))
+    if arguments.json:
+        show_json(effects.as_json(table))
+    else:
+        show(effects.text(table))
     return PASSED

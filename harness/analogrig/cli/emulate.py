@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_what_to_play, opened
-from analogrig.cli.terminal import PASSED, progress_line, show
+from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, opened
+from analogrig.cli.terminal import PASSED, progress_line, show, show_json
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("emulate", help="the rig alone: write volts and codes to a file")
+    command = add_command(
+        commands,
+        "emulate",
+        "play a scenario on a rig alone, and write volts and codes to a file",
+        "emulate --out build/signals.csv",
+        "emulate --scenario slow --program bump-stop --seed 7 --out build/signals.npz",
+    )
     add_what_to_play(command)
     command.add_argument(
         "--out",
         type=Path,
         default=Path("build/signals.csv"),
-        metavar="FILE",
-        help=".csv or .npz (default: %(default)s)",
+        metavar=FILE,
+        help="file of the signals, .csv or .npz (default: %(default)s)",
     )
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -32,7 +37,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with opened(arguments) as (rig, scenario, seed):
         written = write_signals(rig, scenario, seed, arguments.out, progress=progress_line())
     if arguments.json:
-        show(json.dumps({"file": str(arguments.out), "seed": seed, **written}))
+        show_json({"file": str(arguments.out), "seed": seed, **written})
     else:
         show(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
         show(f"overload lamps: {lamps_text(written['overloads'])}")

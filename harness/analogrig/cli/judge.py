@@ -6,13 +6,19 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_capture, add_output, recorded
+from analogrig.cli.options import FILE, add_capture, add_command, add_output, recorded
 from analogrig.cli.playing import conclude, prepare
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("judge", help="judge a recorded run, or a CAN log that was captured elsewhere")
-    command.add_argument("file", type=Path, metavar="FILE", help="a recording (run.npz), or a CAN log")
+    command = add_command(
+        commands,
+        "judge",
+        "judge a recorded run or a CAN log, without a device",
+        "judge build/run/run.npz",
+        "judge build/can/can.log --scenario thesis --json",
+    )
+    command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
     add_output(command, default=Path("build/judge"))
     command.set_defaults(command=_run)

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import add_what_to_play, opened
-from analogrig.cli.terminal import PASSED, show
+from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, opened
+from analogrig.cli.terminal import PASSED, show, show_json, show_plain
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("netlist", help="the emulated computer as a SPICE deck, which ngspice runs unchanged")
+    command = add_command(
+        commands,
+        "netlist",
+        "write the emulated computer as a SPICE deck for ngspice",
+        "netlist --out build/thesis.cir",
+        "netlist --program two-mass --seed 7",
+    )
     add_what_to_play(command)
-    command.add_argument("--out", type=Path, metavar="FILE", help="where the deck goes (default: standard output)")
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
+    command.add_argument("--out", type=Path, metavar=FILE, help="file of the deck (default: standard output)")
+    add_json(command)
     command.set_defaults(command=_run)
 
 
@@ -31,9 +36,9 @@ def _run(arguments: argparse.Namespace) -> int:
             file.write(text.encode("ascii"))
     if arguments.json:
         where = {"deck": text} if arguments.out is None else {"file": str(arguments.out)}
-        show(json.dumps({**where, "samples": deck.samples, "seed": seed}))
+        show_json({**where, "samples": deck.samples, "seed": seed})
     elif arguments.out is None:
-        show(text.rstrip("\n"))
+        show_plain(text.rstrip("\n"))
     else:
         show(f"{arguments.out}: {deck.samples} samples; run it with: ngspice -b -r out.raw {arguments.out}")
     return PASSED

@@ -16,38 +16,63 @@ if TYPE_CHECKING:
 
 DEFAULT_SCENARIO = "thesis"
 
+PROGRAMS = {
+    "front": "front suspension of a racing motorcycle: mass, damper, spring",
+    "shock": "single shock absorber on a test bench",
+    "bump-stop": "front suspension with a second spring towards the end of its travel",
+    "two-mass": "front suspension on its wheel and tyre",
+}
+"""Descriptions of the programs. The names are those of analogrig_emulator.PROGRAMS, which takes 0.1 s to import."""
 
-RIG_NAMES = "shipped name, that of a table of your rigs file, FILE.toml or FILE.toml:NAME"
+SCENARIO, CAMPAIGN, RIG, DUT, FILE = "SCENARIO", "CAMPAIGN", "RIG", "DUT", "FILE"
+"""Metavars. They say what an option takes, and `completion` completes by them."""
+
+RIG_NAMES = "shipped name, table of your rigs file, FILE.toml or FILE.toml:NAME"
 RIG_HELP = f"{RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)"
+
+
+def add_command(commands: Any, name: str, does: str, *examples: str) -> argparse.ArgumentParser:
+    """Add a command, with its examples at the end of its help.
+
+    :param does: one line in the imperative, for the list of commands and its own help.
+    :param examples: arguments after ``analogrig``.
+    """
+    command: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=does,
+        description=f"{does[0].upper()}{does[1:]}.",
+        epilog="\n".join(["examples:", *(f"  analogrig {example}" for example in examples)]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    return command
 
 
 def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
     """``default``: when the environment names none."""
-    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar="NAME", help=words)
+    command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar=RIG, help=words)
 
 
 def add_what_to_play(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--scenario",
-        metavar="NAME",
-        help=f"a shipped name or a .toml file (default: {DEFAULT_SCENARIO}, or that recorded)",
+        metavar=SCENARIO,
+        help=f"shipped name or .toml file (default: {DEFAULT_SCENARIO}, or that of the recording)",
     )
     command.add_argument(
-        "--program", choices=PROGRAMS, help="what is wired on the computer, instead of the scenario's plant.set"
+        "--program", choices=PROGRAMS, help="program of the computer, instead of the scenario's plant.set"
     )
     add_rig(
         command, f"{RIG_NAMES}, or recording:FILE (default: $ANALOGRIG_RIG, that of the scenario, or emulator)", None
     )
-    command.add_argument(
-        "--seed",
-        type=seed,
-        metavar="N",
-        help="of all that is random (default: that of the scenario or recording, else the same as ever)",
-    )
+    add_seed(command, default=None, shown="that of the scenario or recording, else 1995")
 
 
-PROGRAMS = ("front", "shock", "bump-stop", "two-mass")
-"""Those of analogrig_emulator.PROGRAMS, which would take a tenth of a second to ask."""
+def add_seed(command: argparse.ArgumentParser, default: int | None = 0, shown: str = "%(default)d") -> None:
+    command.add_argument("--seed", type=seed, default=default, metavar="N", help=f"random seed (default: {shown})")
+
+
+def add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
 
 def seed(text: str) -> int:
@@ -95,32 +120,32 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
     command.add_argument(
         "--dut",
         default=default,
-        metavar="NAME",
+        metavar=DUT,
         help="shipped name, .toml file, inproc[:LIBRARY], qemu-m3, qemu-m4, qemu-m7[:ELF], serial:URL, or"
         f" can:INTERFACE[/CHANNEL][?KEY=VALUE&...] (default: {shown})",
     )
     command.add_argument(
         "--exchange",
         choices=("sample", "block", "stream"),
-        help="how samples go to the device, instead of as described",
-    )
-    command.add_argument("--baud", type=int, metavar="N", help="of the line; without a real one its time is reported")
-    command.add_argument(
-        "--bitrate", type=int, metavar="N", help="of a CAN bus; without a real one its time is reported"
+        help="override the device's exchange mode",
     )
     command.add_argument(
-        "--wire-faults", metavar="FAULTS", help="spoil the line: flip@0.001,reset@to:81,seed=7; see harness/README.md"
+        "--baud", type=int, metavar="N", help="baud rate of the serial line; computes the line time where there is none"
     )
     command.add_argument(
-        "--report-interval", type=int, metavar="N", help="the device reports its estimate every N samples"
+        "--bitrate", type=int, metavar="N", help="bit rate of the CAN bus; computes the line time where there is none"
     )
+    command.add_argument(
+        "--wire-faults", metavar="FAULTS", help="faults to inject into the line, such as flip@0.001,reset@to:81,seed=7"
+    )
+    command.add_argument("--report-interval", type=int, metavar="N", help="samples between estimates from the device")
     command.add_argument(
         "--real-time",
         type=factor,
         nargs="?",
         const=1.0,
         metavar="FACTOR",
-        help="samples go out as the machine takes them, or FACTOR times slower; a stream, unless --exchange is given",
+        help="send samples at the machine's rate, or FACTOR times slower; implies --exchange stream",
     )
 
 
@@ -128,8 +153,7 @@ def add_can_log(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--can-log",
         choices=("log", "blf", "asc", "mf4", "none"),
-        help="the CAN frames of the run, as can.log (candump), can.blf, can.asc or can.mf4 beside run.npz (default: log"
-        " on a CAN bus)",
+        help="format of the CAN log beside run.npz: candump, BLF, ASC or MF4 (default: log on a CAN bus)",
     )
 
 
@@ -139,9 +163,9 @@ def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run
         type=Path,
         default=default,
         metavar="DIR",
-        help="where run.npz and report.html go (default: %(default)s)",
+        help="folder for run.npz and report.html (default: %(default)s)",
     )
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+    add_json(command)
 
 
 def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -179,13 +203,11 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
 def add_capture(command: argparse.ArgumentParser) -> None:
     """What a CAN log does not say itself."""
     command.add_argument(
-        "--scenario", metavar="NAME", help="what was played: shipped name or .toml file; a run.npz says it itself"
+        "--scenario", metavar=SCENARIO, help="scenario of a CAN log: shipped name or .toml file (run.npz holds its own)"
     )
-    add_rig(command, f"on which a CAN log was captured: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
-    command.add_argument(
-        "--dbc", type=Path, metavar="FILE", help="the messages of a CAN log, if not those of this build"
-    )
-    command.add_argument("--run", type=count, metavar="N", help="which of several runs in a CAN log, from 1")
+    add_rig(command, f"rig of a CAN log: {RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)")
+    command.add_argument("--dbc", type=Path, metavar=FILE, help="message catalogue of a CAN log (default: ours)")
+    command.add_argument("--run", type=count, metavar="N", help="number of the run in a CAN log, from 1")
     command.add_argument(
         "--most-lost", type=count, default=0, metavar="N", help="samples that a CAN log may lack (default: %(default)s)"
     )

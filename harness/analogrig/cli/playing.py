@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show, show_json, working
 
 if TYPE_CHECKING:
     from analogrig.judging.verdict import Verdict
@@ -118,15 +117,16 @@ def conclude(run: Run, arguments: argparse.Namespace) -> int:
     from analogrig.reporting import write_report
     from analogrig.reporting.summary import summary
 
-    verdict = judge(run)
-    try:
-        run.save(arguments.out / RUN_FILE)
-        write_report(run, verdict, arguments.out / REPORT_FILE)
-        unkept = None
-    except RecordingError as error:
-        unkept = error
+    unkept = None
+    with working("judging, writing run and report"):
+        verdict = judge(run)
+        try:
+            run.save(arguments.out / RUN_FILE)
+            write_report(run, verdict, arguments.out / REPORT_FILE)
+        except RecordingError as error:
+            unkept = error
     if arguments.json:
-        show(json.dumps(_as_json(run, verdict, arguments.out), allow_nan=False))
+        show_json(_as_json(run, verdict, arguments.out))
     else:
         show(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
     if unkept is not None:

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import (
+    FILE,
     add_can_log,
     add_capture,
+    add_command,
     add_dut,
     add_output,
     add_time_limit,
@@ -20,8 +22,15 @@ from analogrig.cli.playing import can_log, play, prepare
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("replay", help="play a recorded run through a device again, and judge it")
-    command.add_argument("file", type=Path, metavar="FILE", help="a recording (run.npz), or a CAN log")
+    command = add_command(
+        commands,
+        "replay",
+        "play a recorded run through a device again, and judge it",
+        "replay build/run/run.npz",
+        "replay build/run/run.npz --dut mean-between-faults --out build/mean",
+        "replay build/can/can.log --scenario thesis --dut inproc",
+    )
+    command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
     add_dut(command, default=None, shown="that of the recording")
     add_output(command, default=Path("build/replay"))

@@ -8,6 +8,7 @@ from typing import Any
 
 from analogrig.cli.options import (
     add_can_log,
+    add_command,
     add_dut,
     add_output,
     add_time_limit,
@@ -19,7 +20,14 @@ from analogrig.cli.playing import can_log, play, prepare
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("run", help="play a scenario on a rig, through a device, and judge what it says")
+    command = add_command(
+        commands,
+        "run",
+        "play a scenario on a rig through a device, and judge the device's alarms",
+        "run --seed 7",
+        "run --scenario slow --dut inproc --out build/slow",
+        "run --rig emulator-0-10v --dut qemu-m4 --json",
+    )
     add_what_to_play(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")
     add_output(command)

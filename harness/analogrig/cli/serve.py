@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import PROGRAMS, seed
-from analogrig.cli.terminal import PASSED, complain, show
+from analogrig.cli.options import PROGRAMS, RIG, add_command, add_json, add_seed
+from analogrig.cli.terminal import PASSED, complain, show, show_json
 
 if TYPE_CHECKING:
+    import asyncio
+
     from analogrig.hardware.simulator.server import Server
 
 DEFAULT_PORT = 5000
@@ -19,36 +21,46 @@ DEFAULT_PORT = 5000
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("serve", help="the emulated rig as an instrument: a Red Pitaya on a TCP port")
+    command = add_command(
+        commands,
+        "serve",
+        "serve an emulated rig as a Red Pitaya on a TCP port",
+        "serve --port 5000",
+        "serve --rig emulator-real --defect inputs.skew_s=5e-6",
+        "serve -- analogrig run --rig red-pitaya",
+    )
     command.add_argument(
         "--rig",
         default="emulator",
-        metavar="NAME",
-        help="an emulated rig: shipped name or .toml file, with a table [instrument] if it has one (%(default)s)",
+        metavar=RIG,
+        help="emulated rig: shipped name or .toml file, which may have a table [instrument] (default: %(default)s)",
     )
     command.add_argument(
-        "--plant", choices=PROGRAMS, default="front", help="what is wired on the computer (%(default)s)"
+        "--plant", choices=PROGRAMS, default="front", help="program of the computer (default: %(default)s)"
     )
-    command.add_argument("--seed", type=seed, metavar="N", help="of all that is random (default: the same as ever)")
+    add_seed(command, default=None, shown="1995")
     command.add_argument(
         "--defect",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="a line of the table [instrument], such as wiring.swapped=true; any number of them",
+        help="defect of the instrument: a key of the table [instrument], such as wiring.swapped=true; may be repeated",
     )
     command.add_argument(
-        "--host", default="127.0.0.1", metavar="ADDRESS", help="where to listen: this machine alone (%(default)s)"
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen on (default: %(default)s)"
     )
     command.add_argument(
-        "--port", type=port, default=DEFAULT_PORT, metavar="N", help="0 takes any that is free (%(default)d)"
+        "--port", type=port, default=DEFAULT_PORT, metavar="N", help="TCP port; 0: any free one (default: %(default)d)"
     )
     command.add_argument(
         "--real-time",
         action="store_true",
-        help="a record takes as long as it lasts, and a pot turns when it is turned (default: time passes in records)",
+        help="let a record take as long as it lasts, and pots turn by the clock (default: time passes in records)",
     )
-    command.add_argument("--json", action="store_true", help="print one JSON object instead of a sentence")
+    add_json(command)
+    command.add_argument(
+        "client", nargs="*", metavar="-- COMMAND", help="serve while this command runs, and return its exit status"
+    )
     command.set_defaults(command=_run)
 
 
@@ -71,12 +83,11 @@ def _run(arguments: argparse.Namespace) -> int:
     if described.left_out:
         complain(f"{described.name}: the instrument has no {', '.join(described.left_out)}", PASSED)
     names = {"rig": described.name, "plant": arguments.plant, "seed": drawn_from}
-    asyncio.run(_serve(server, arguments, names))
-    return PASSED
+    return asyncio.run(_serve(server, arguments, names))
 
 
-async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str, Any]) -> None:
-    """Until somebody says that it is enough."""
+async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
+    """Serve until SIGTERM or, if there is one, until the client ends. Return the exit status."""
     import asyncio
 
     enough = asyncio.Event()
@@ -85,9 +96,41 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
     address = f"[{host}]:{number}" if ":" in host else f"{host}:{number}"
     try:
         if arguments.json:
-            show(json.dumps({**names, "host": host, "port": number, "address": address}))
+            show_json({**names, "host": host, "port": number, "address": address})
         else:
             show(f"rig {names['rig']} ({names['plant']}, seed {names['seed']}) at {address}")
-        await enough.wait()
+        return await _client(arguments.client, enough) if arguments.client else await _waited(enough)
     finally:
         await server.close()
+
+
+async def _waited(enough: asyncio.Event) -> int:
+    await enough.wait()
+    return PASSED
+
+
+async def _client(command: Sequence[str], enough: asyncio.Event) -> int:
+    """Run a command to its end, or terminate it on SIGTERM. Return its exit status as a shell does.
+
+    :raises ConfigurationError: it cannot be started.
+    """
+    import asyncio
+
+    from analogrig.errors import ConfigurationError
+
+    try:
+        process = await asyncio.create_subprocess_exec(*command)
+    except OSError as error:
+        raise ConfigurationError(f"{command[0]}: cannot be started: {error.strerror or error}") from error
+    ended, stopped = asyncio.ensure_future(process.wait()), asyncio.ensure_future(enough.wait())
+    try:
+        await asyncio.wait({ended, stopped}, return_when=asyncio.FIRST_COMPLETED)
+        if not ended.done():
+            process.terminate()
+        status = await ended
+    except asyncio.CancelledError:  # Ctrl-C: the terminal has sent it to the command too
+        await process.wait()
+        raise
+    finally:
+        stopped.cancel()
+    return status if status >= 0 else 128 - status

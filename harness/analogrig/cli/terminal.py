@@ -1,12 +1,20 @@
-"""What every command says, and how: results on standard output, one line for each failure on standard error."""
+"""Output of every command: results on standard output, one line for each failure on standard error.
+
+Verdicts are coloured and progress is shown on terminals only. Files, pipes and ``--json`` get plain text.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 import os
+import re
 import sys
+import threading
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, TextIO
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 if TYPE_CHECKING:
     from analogrig.bench import Progress
@@ -15,27 +23,70 @@ PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit statuses."""
 
 STATUS = {"passed": PASSED, "failed": FAILED, "inconclusive": INCONCLUSIVE}
-"""Of a verdict's outcome."""
+"""Exit status by outcome of a verdict."""
 
+_GREEN, _RED, _YELLOW = 32, 31, 33
+_COLOURS = {
+    **dict.fromkeys(("PASSED", "CERTIFIED"), _GREEN),
+    **dict.fromkeys(("FAILED", "REFUTED", "WRONG", "WORSE"), _RED),
+    **dict.fromkeys(("INCONCLUSIVE", "NOT MEASURED"), _YELLOW),
+}
+"""SGR colour codes of the verdicts, which the results write in capitals."""
+
+_VERDICT = re.compile(rf"\b(?:{'|'.join(_COLOURS)})\b")
 
 _PROGRESS_S = 1.0
 
 
 def complain(message: str, status: int) -> int:
-    """One line on standard error; returns ``status``."""
-    _print(f"analogrig: {message}\n", sys.stderr, 2)
+    """Print one line on standard error; return ``status``."""
+    _print(_coloured(f"analogrig: {message}\n", sys.stderr), sys.stderr, 2)
     return status
 
 
 def show(text: str) -> None:
-    """To standard output. If nobody listens any more, that is no reason to change what the command has found."""
-    error = _print(f"{text}\n", sys.stdout, 1)
+    """Print text for people on standard output."""
+    _show(_coloured(f"{text}\n", sys.stdout))
+
+
+def show_plain(text: str) -> None:
+    """Print text for programs on standard output: never coloured, whatever the environment asks for."""
+    _show(f"{text}\n")
+
+
+def show_json(value: Any) -> None:
+    """Print one JSON object on standard output. JSON has no NaN or infinity: they become null."""
+    show_plain(json.dumps(_finite(value), allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    """Replace non-finite numbers by None, in tables and lists of any depth."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return value
+
+
+def _show(text: str) -> None:
+    """Print on standard output. A reader that is gone changes nothing about the command's status."""
+    error = _print(text, sys.stdout, 1)
     if error is not None:
         _print(f"analogrig: standard output: {error.strerror}\n", sys.stderr, 2)
 
 
 def _print(text: str, stream: TextIO, number: int) -> OSError | None:
-    """Returns why it could not be; from then on the stream swallows what it is given, also what it still holds."""
+    """Write text below the progress line, if there is one. Return the error, if any."""
+    with ProgressLine.lock:
+        if ProgressLine.unfinished is not None:
+            ProgressLine.unfinished.end()
+        return _write(text, stream, number)
+
+
+def _write(text: str, stream: TextIO, number: int) -> OSError | None:
+    """Write text. Return the error, if any: the stream then discards all output, also what it still holds."""
     try:
         stream.write(text)
         stream.flush()
@@ -45,40 +96,83 @@ def _print(text: str, stream: TextIO, number: int) -> OSError | None:
     return None
 
 
+def _coloured(text: str, stream: TextIO) -> str:
+    """Colour the verdicts if the stream takes colour."""
+    if not _takes_colour(stream):
+        return text
+    return _VERDICT.sub(lambda found: f"\x1b[{_COLOURS[found[0]]}m{found[0]}\x1b[0m", text)
+
+
+def _takes_colour(stream: TextIO) -> bool:
+    """NO_COLOR forbids, FORCE_COLOR or CLICOLOR_FORCE demand; else true on a terminal that is not dumb."""
+    if os.environ.get("NO_COLOR"):
+        return False
+    if any(os.environ.get(name, "0") not in {"", "0"} for name in ("FORCE_COLOR", "CLICOLOR_FORCE")):
+        return True
+    return _is_terminal(stream)
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    """True if the stream is a terminal that can overwrite a line."""
+    return stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
 def open_standard_streams() -> None:
-    """Whoever closed one of them wants to hear nothing; a file opened later must not take its place."""
+    """Open the standard streams that the caller closed, so that no file opened later takes their number."""
     for name, number in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
-            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - for as long as we live
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - for as long as the process lives
 
 
 class ProgressLine:
-    """A line on standard error that is written over: at most once a second, and only from the second second on."""
+    """A line on standard error that is overwritten: at most once a second, and not in the first second.
+
+    Whatever else is printed ends the line first, so that no message continues it.
+    """
+
+    lock: ClassVar[threading.RLock] = threading.RLock()
+    """Held while anything is printed: `working` prints from a thread."""
+    unfinished: ClassVar[ProgressLine | None] = None
+    """The line that the cursor is in."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._next_s = clock() + _PROGRESS_S
         self._width = 0
-        """Of what stands there."""
+        """Characters of the text shown last; 0: none."""
 
     def show(self, text: str, *, is_last: bool) -> None:
-        """The last one is shown if any was, and ends the line."""
+        """Show ``text``. The last text is shown if any was, and ends the line."""
         if self._clock() < self._next_s and not (is_last and self._width):
             return
         self._next_s = self._clock() + _PROGRESS_S
-        end = "\n" if is_last else ""
-        _print(f"\r{text:<{self._width}}{end}", sys.stderr, 2)
-        self._width = 0 if is_last else len(text)
+        with self.lock:
+            if ProgressLine.unfinished is not None and ProgressLine.unfinished is not self:
+                ProgressLine.unfinished.end()
+            # Before the text is written: Ctrl-C may come at any time, and no message may continue the line.
+            ProgressLine.unfinished = self
+            width, self._width = self._width, len(text)
+            _write(f"\r{text:<{width}}", sys.stderr, 2)
+            if is_last:
+                self.end()
+
+    def end(self) -> None:
+        """End the line, if it was shown."""
+        with self.lock:
+            if ProgressLine.unfinished is self:
+                _write("\n", sys.stderr, 2)
+                ProgressLine.unfinished = None
+            self._width = 0
 
 
 def watched() -> ProgressLine | None:
-    """None when nobody watches."""
-    return ProgressLine() if sys.stderr.isatty() else None
+    """A progress line; None if standard error is no terminal."""
+    return ProgressLine() if _is_terminal(sys.stderr) else None
 
 
 def progress_line(of: str = "samples") -> Progress | None:
-    """How many of how many, and percent; None when nobody watches."""
+    """A callback that shows how many of how many, and percent; None if standard error is no terminal."""
     line = watched()
     if line is None:
         return None
@@ -87,3 +181,26 @@ def progress_line(of: str = "samples") -> Progress | None:
         line.show(f"{done} of {asked} {of} ({done / asked:.0%})", is_last=done == asked)
 
     return show
+
+
+@contextlib.contextmanager
+def working(on: str) -> Iterator[None]:
+    """Show what the command works on and for how long, where there is nothing to count."""
+    line = watched()
+    if line is None:
+        yield
+        return
+    start_s, is_done = time.monotonic(), threading.Event()
+
+    def tell() -> None:
+        while not is_done.wait(_PROGRESS_S):
+            line.show(f"{on}: {time.monotonic() - start_s:.0f} s", is_last=False)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        thread.join()
+        line.end()

@@ -6,18 +6,25 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from analogrig.cli.options import add_command
 from analogrig.cli.playing import make_folder
-from analogrig.cli.terminal import PASSED, show
+from analogrig.cli.terminal import PASSED, show, show_plain, working
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("thesis", help="every figure, number and claim of the thesis, made again and judged")
+    command = add_command(
+        commands,
+        "thesis",
+        "reproduce and judge every figure, number and claim of the thesis",
+        "thesis",
+        "thesis --out build/thesis --json",
+    )
     command.add_argument(
         "--out",
         type=Path,
         default=Path("build/thesis"),
         metavar="DIR",
-        help="where thesis.html, claims.json and recordings/ go (default: %(default)s)",
+        help="folder for thesis.html, claims.json and recordings/ (default: %(default)s)",
     )
     command.add_argument("--json", action="store_true", help="print claims.json instead of the list of claims")
     command.set_defaults(command=_run)
@@ -28,10 +35,11 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig_thesis.reproduction import PAGE
 
     make_folder(arguments.out)
-    reproduction = reproduce()
-    reproduction.write(arguments.out)
+    with working("simulating, playing, estimating"):
+        reproduction = reproduce()
+        reproduction.write(arguments.out)
     if arguments.json:
-        show(reproduction.claims().rstrip())
+        show_plain(reproduction.claims().rstrip())
         return PASSED
     for chapter in reproduction.chapters:
         for claim in chapter.claims:

@@ -53,9 +53,15 @@ class DeviceDescription:
     """What every device is described by: a file of fixtures/devices, or as much as the command line says."""
 
     kind: ClassVar[str]
+    usage: ClassVar[str]
+    """Spelling on the command line."""
+    summary: ClassVar[str]
+    """One line for `analogrig list`."""
     starting_s: ClassVar[float] = 0.0
     """It may take so long to start, before it hears anything."""
     name: str
+    description: str = ""
+    """One line for people."""
     exchange: Literal["sample", "block", "stream"] = "sample"
     """Samples go one at a time, in blocks, or before the last ones are answered; in blocks if the line carries them.
     The answers are the same."""
@@ -281,6 +287,8 @@ class HostDevice(EitherDevice):
     """A process of this computer, on a pseudo-terminal."""
 
     kind: ClassVar[str] = "host"
+    usage: ClassVar[str] = "host[?link=slcan]"
+    summary: ClassVar[str] = "device as a process of this computer, on a pseudo-terminal"
 
     @property
     def program(self) -> Path:
@@ -329,6 +337,8 @@ class InprocDevice(EitherDevice):
 
     CAN: ClassVar[str] = "can"
     kind: ClassVar[str] = "inproc"
+    usage: ClassVar[str] = "inproc[:LIBRARY]"
+    summary: ClassVar[str] = "device as a shared library in this process"
     library: str = ""
     """A device of your own as a shared library, built from estimator_c and your core; empty: the project's."""
 
@@ -447,18 +457,24 @@ class QemuM3(QemuDevice):
     """Cortex-M3, without a floating-point unit."""
 
     kind, core, machine = "qemu-m3", "m3", "mps2-an385"
+    usage: ClassVar[str] = "qemu-m3[:ELF]"
+    summary: ClassVar[str] = "Cortex-M3 firmware on a board that QEMU emulates"
 
 
 class QemuM4(QemuDevice):
     """Cortex-M4F."""
 
     kind, core, machine = "qemu-m4", "m4", "mps2-an386"
+    usage: ClassVar[str] = "qemu-m4[:ELF]"
+    summary: ClassVar[str] = "Cortex-M4F firmware on a board that QEMU emulates"
 
 
 class QemuM7(QemuDevice):
     """Cortex-M7."""
 
     kind, core, machine = "qemu-m7", "m7", "mps2-an500"
+    usage: ClassVar[str] = "qemu-m7[:ELF]"
+    summary: ClassVar[str] = "Cortex-M7 firmware on a board that QEMU emulates"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -466,6 +482,8 @@ class SerialDevice(ByteDevice):
     """Whoever speaks at a serial port, or at any URL that pyserial can open."""
 
     kind: ClassVar[str] = "serial"
+    usage: ClassVar[str] = "serial:URL"
+    summary: ClassVar[str] = "board at a serial port, or at any URL of pyserial"
     url: str
     baud: int | None = DEFAULT_BAUD
 
@@ -496,6 +514,8 @@ class CanDevice(FrameDevice):
     """Whoever answers on a CAN bus that python-can can open."""
 
     kind: ClassVar[str] = "can"
+    usage: ClassVar[str] = "can:INTERFACE[/CHANNEL][?KEY=VALUE&...]"
+    summary: ClassVar[str] = "node on a CAN bus that python-can can open"
     interface: str = ""
     """As python-can names it; empty: as its own configuration says, and so for the channel."""
     channel: str = ""

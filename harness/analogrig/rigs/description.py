@@ -69,6 +69,15 @@ def described(name: str) -> tuple[Mapping[str, Any], str]:
     return _one_of(path, table, None) if "rig" in table else ({"name": path.stem, **table}, str(path))
 
 
+def own_rigs() -> tuple[str, Mapping[str, Any]]:
+    """The rigs file of ANALOGRIG_RIGS or of this folder, and its tables by name; ("", {}) if there is none.
+
+    :raises ConfigurationError: the file that the variable names is not there, or is no rigs file.
+    """
+    own = _rigs_file()
+    return ("", {}) if own is None else (str(own), _named(own, config.read_toml(own)))
+
+
 def _rigs_file() -> Path | None:
     """:raises ConfigurationError: the one that the environment names is not there."""
     if named := os.environ.get(RIGS_VARIABLE):

@@ -1,0 +1,112 @@
+"""Every link and every path in the README files leads somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[1]
+READMES = sorted(
+    path
+    for folder in (".", "emulator", "estimator_c", "harness", "tests/*")
+    for path in CHECKOUT.glob(f"{folder}/README.md")
+)
+
+MADE_UP = {
+    *(
+        "FILE.toml",
+        "bench.asc",
+        "bench.dbc",
+        "bench.toml",
+        "dut.toml",
+        "mine.toml",
+        "rigs.toml",
+        "scenario.toml",
+    ),  # files of a reader
+    *("claims.json", "report.html", "run.npz", "simulated.npz", "thesis.html"),  # results
+    *("/run", "generated/", "without/", "suite/"),  # in a guest, or beside the page
+}
+"""Paths of files that are not in this repository, and directories named by their last part."""
+
+IS_PATH = re.compile(r"\w[\w.-]+(?:/[\w.-]*)+|[\w-]+\.(?:py|c|h|toml|json|npz|html|css|js|dbc|ld|S)")
+
+NOT_OURS = re.compile(r"build/|\.venv/|/dev/|CLONE/|~|.*/dev/")
+
+
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(CHECKOUT))
+
+
+def without_blocks(text: str) -> str:
+    return re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+
+
+def tree() -> set[str]:
+    """Files and folders of the checkout by every end of their paths: a page may leave out what its reader knows."""
+    ends = set()
+    for path in CHECKOUT.rglob("*"):
+        parts = path.relative_to(CHECKOUT).parts
+        if parts[0] not in {".git", ".venv", "build"} and "__pycache__" not in parts:
+            ends |= {"/".join(parts[i:]) for i in range(len(parts))}
+    return ends
+
+
+TREE = tree()
+
+
+def anchors(path: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ +(.*)$", without_blocks(read(path)), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", READMES, ids=name)
+def test_every_relative_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    lost = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", without_blocks(read(page))):
+        if re.match(r"[a-z]+:", link):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file) if file else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            lost.append(link)
+    assert lost == []
+
+
+@pytest.mark.parametrize("page", READMES, ids=name)
+def test_every_path_in_backticks_exists(page: Path) -> None:
+    words = {word for code in re.findall(r"`([^`\n]+)`", without_blocks(read(page))) for word in code.split()}
+    paths = {word.removeprefix("PYTEST_ARGS=").strip('"') for word in words}
+    paths = {path for path in paths if IS_PATH.fullmatch(path) and path not in MADE_UP and not NOT_OURS.match(path)}
+    assert sorted(path for path in paths if path.rstrip("/") not in TREE) == []
+
+
+@pytest.mark.parametrize("page", READMES, ids=name)
+def test_every_module_run_by_python_exists(page: Path) -> None:
+    modules = re.findall(r"python -m ((?:tests|estimator_c|analogrig\w*)(?:\.\w+)*)", read(page))
+    assert (
+        sorted({each for each in modules if not {f"{each.replace('.', '/')}.py", each.replace(".", "/")} & TREE}) == []
+    )
+
+
+def test_every_module_of_the_table_exists_where_the_row_says() -> None:
+    table = (
+        read(CHECKOUT / "harness" / "README.md").partition("| module of `harness/analogrig` |")[2].partition("\n\n")[0]
+    )
+    rows = [row.split("|")[1:3] for row in table.splitlines()[2:]]
+    listed = {folder.strip(" `") for cell, _ in rows for folder in cell.split(",")}
+    package = CHECKOUT / "harness" / "analogrig"
+    public = {each for each in package.iterdir() if each.suffix in {"", ".py"} and each.name[0] not in "_."}
+    tracked = {each.name + ("" if each.suffix else "/") for each in public} - {"bin/", "fixtures/"}
+    assert {folder.partition("/")[0] + ("/" if "/" in folder else "") for folder in listed} == tracked
+    for cell, contents in rows:
+        folder = package / cell.split(",")[0].strip(" `")
+        for module in re.findall(r"`([\w/.]+)`", contents):
+            places = [folder / module, folder / f"{module}.py"]
+            assert any(place.exists() for place in places), f"{cell}: {module}"
