@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from analogrig.cli.options import add_allow, trust_of
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, watched
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def add(commands: Any) -> None:
         "--out", type=Path, metavar="FILE", help="the results; beside them a page (default: build/campaign/NAME.json)"
     )
     add_workers(command)
+    add_allow(command)
     command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     command.set_defaults(command=_run)
 
@@ -64,7 +66,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.spec import CampaignSpec
     from analogrig.errors import WorkerError
 
-    plan = Plan.of(CampaignSpec.load(arguments.spec))
+    plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
     page = page_of(out)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"

@@ -7,7 +7,7 @@ import json
 import os
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import RIG_NAMES, add_dut, changes_of_dut, count, seed
+from analogrig.cli.options import RIG_NAMES, add_allow, add_dut, changes_of_dut, count, seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def add(commands: Any) -> None:
     command.add_argument("--most-lsb", type=float, metavar="LSB", help="fails if the rms difference may be more")
     command.add_argument("--most-samples", type=float, metavar="N", help="fails if that of latencies may be more")
     command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    add_allow(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
     command.set_defaults(command=_run)
 
@@ -47,10 +48,11 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--plays must be 2 or more, not {arguments.plays}")
     scenario = Scenario.load(arguments.scenario)
     seeds = range(arguments.seed, arguments.seed + arguments.plays)
+    trust = trust_of(arguments)
     with (
-        open_rig(arguments.a) as a,
-        open_rig(arguments.b) as b,
-        open_dut(arguments.dut, **changes_of_dut(arguments)) as dut,
+        open_rig(arguments.a, allow=trust) as a,
+        open_rig(arguments.b, allow=trust) as b,
+        open_dut(arguments.dut, allow=trust, **changes_of_dut(arguments)) as dut,
     ):
         bench_a, bench_b = (Bench(rig, dut, real_time=arguments.real_time) for rig in (a, b))
         found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))

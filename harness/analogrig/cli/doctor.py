@@ -7,7 +7,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_rig, seed
+from analogrig.cli.options import add_rig, seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.hardware.self_test.conduct import self_test
     from analogrig.rigs.description import open_rig
 
-    with open_rig(arguments.rig, self_test=False) as rig:
+    with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:
         program = arguments.program or str(rig.description().get("plant", "front"))
         try:
             findings = self_test(rig, arguments.seed, program)

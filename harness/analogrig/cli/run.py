@@ -6,7 +6,7 @@ import argparse
 import os
 from typing import Any
 
-from analogrig.cli.options import add_can_log, add_dut, add_output, add_what_to_play, changes_of_dut, opened
+from analogrig.cli.options import add_can_log, add_dut, add_output, add_what_to_play, changes_of_dut, opened, trust_of
 from analogrig.cli.playing import can_log, play, prepare
 
 
@@ -20,12 +20,11 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.devices.devices import of_scenario
     from analogrig.protocol.dut import open_dut
 
     with opened(arguments) as (rig, scenario, seed):
-        device = of_scenario(scenario.dut, arguments.dut, "host")
+        device = arguments.dut or scenario.dut or "host"
         prepare(arguments.out, rig)
         log = can_log(rig, arguments)
-        with open_dut(device, listener=log, **changes_of_dut(arguments)) as dut:
+        with open_dut(device, allow=trust_of(arguments), listener=log, **changes_of_dut(arguments)) as dut:
             return play(rig, dut, scenario, seed, arguments, log)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from analogrig.testing.plugin.devices import Devices, check_owner
-from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR
+from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, trust_of
 from analogrig.testing.plugin.playing import Player
 
 if TYPE_CHECKING:
@@ -87,10 +87,10 @@ class ScenarioItem(pytest.Item):
 
         check_owner(self)
         scenario = Scenario.load(str(self.path))
-        devices, name = self.config.stash[DEVICES], self._device(scenario)
-        with open_rig(self._rig(scenario)) as rig:
+        devices, name, trust = self.config.stash[DEVICES], self._device(scenario), trust_of(self.config)
+        with open_rig(self._rig(scenario), allow=trust) as rig:
             try:
-                finding = self._found(Player(self, Bench(rig, devices.lease(name))), scenario)
+                finding = self._found(Player(self, Bench(rig, devices.lease(name, trust))), scenario)
             finally:
                 if name == scenario.dut:
                     devices.release(name)
@@ -123,10 +123,8 @@ class ScenarioItem(pytest.Item):
         return given.value if given else scenario.rig or RIG.otherwise(self.config).value
 
     def _device(self, scenario: Scenario) -> str:
-        from analogrig.devices.devices import of_scenario
-
         given = DUT.given(self.config)
-        return of_scenario(scenario.dut, given.value if given else "", DUT.otherwise(self.config).value)
+        return given.value if given else scenario.dut or DUT.otherwise(self.config).value
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         from analogrig.errors import AnalogrigError
