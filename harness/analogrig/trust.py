@@ -1,7 +1,7 @@
 """Decide what a file may order: the one place for all commands, the pytest plugin and the Python API.
 
-A description of a rig or a device states its *things*: the libraries, programs and addresses that opening it would load,
-run or connect to. A thing is trusted if
+A description of a rig or a device states its *things*: the libraries, programs and addresses that opening it would
+load, run or connect to. A thing is trusted if
 
 * the command line, the environment or the calling code names it,
 * ``--allow`` names it, or
@@ -44,14 +44,14 @@ class Thing:
 
     @property
     def is_path(self) -> bool:
-        return self.kind in ("library", "firmware", "command", "serial port") and os.path.isabs(self.name)
+        return self.kind in ("library", "firmware", "command", "serial port") and Path(self.name).is_absolute()
 
     def shown(self) -> str:
         """Its name as a user would type it here."""
         if not self.is_path:
             return self.name
         relative = os.path.relpath(self.name)
-        return self.name if relative.startswith("..") else os.path.join(".", relative)
+        return self.name if relative.startswith("..") else f"./{relative}"
 
     def sentence(self) -> str:
         text = " ".join((self.order, shlex.join((self.shown(), *self.arguments)) if self.arguments else self.shown()))
@@ -80,8 +80,8 @@ class FiledName(str):
         new.file = file
         return new
 
-    def __getnewargs__(self) -> tuple[str, str]:
-        return str(self), self.file
+    def __reduce__(self) -> tuple[type[FiledName], tuple[str, str]]:
+        return FiledName, (str(self), self.file)
 
 
 def beside(file: Path, name: str) -> str:

@@ -168,9 +168,7 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
     from analogrig.scenario import DEFAULT_SEED, Scenario
 
     asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
-    with open_rig(
-        arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG, allow=trust_of(arguments)
-    ) as rig:
+    with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG, allow=trust_of(arguments)) as rig:
         recording = rig if isinstance(rig, RecordingRig) else None
         scenario = asked or (recording.scenario() if recording else Scenario.load(DEFAULT_SCENARIO))
         if arguments.program is not None:

@@ -182,10 +182,6 @@ def _value(cls: type[DeviceDescription], key: str, text: str) -> Any:
     return text
 
 
-def _as_text(value: bool | float | str) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ByteDevice(DeviceDescription):
     """A device that is reached by bytes."""
@@ -607,7 +603,8 @@ class CanDevice(FrameDevice):
         """Options are part of the name: python-can takes hosts, ports and driver libraries as such."""
         if not self.only_one:
             return ()
-        options = urlencode(sorted((key, _as_text(value)) for key, value in self.options.items()), quote_via=quote)
+        texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in self.options.items()}
+        options = urlencode(sorted(texts.items()), quote_via=quote)
         return (Thing("CAN bus", f"{self.only_one}{'?' if options else ''}{options}", "the device opens the CAN bus"),)
 
 

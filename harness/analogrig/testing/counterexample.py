@@ -4,7 +4,6 @@ it."""
 from __future__ import annotations
 
 import dataclasses
-import os
 import shlex
 import shutil
 import tomllib
@@ -87,7 +86,7 @@ class Counterexample:
         conditions, device = self.run.conditions, self._device()
         scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
         scenario["seed"] = conditions.seed if self.seed is None else self.seed
-        is_name = bool(device) and all(os.path.isabs(each) for each in _named_paths(device))
+        is_name = bool(device) and all(Path(each).is_absolute() for each in _named_paths(device))
         scenario["dut"] = device if is_name else DEVICE_FILE
         tables = {SCENARIO_FILE: scenario}
         if not is_name:
