@@ -42,7 +42,7 @@ def trust_of(config: pytest.Config, dut: str | None) -> Trust:
 def from_command_line(config: pytest.Config, flag: str, value: str) -> str:
     """The value of an option; one that the ini file's addopts give is the file's."""
     words = _addopts(config)
-    if flag not in words and f"{flag}={value}" not in words:
+    if value not in words and f"{flag}={value}" not in words:
         return value
     from analogrig.trust import FiledName
 
