@@ -7,6 +7,7 @@ counts connections, a terminal that knows whether it was opened.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import fcntl
@@ -41,6 +42,9 @@ from analogrig.scenario import Scenario
 from analogrig.trust import FiledName, Thing, Trust, beside
 from tests.harness.served import served
 
+pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")
+"""The spy:// of pyserial does not close its file."""
+
 REFUSED = 2
 """Exit status: usage or configuration."""
 
@@ -70,6 +74,10 @@ inputs.displacement = {{ input = 2, range = "HV" }}
 # ------------------------------------------------------------------------------------------------------- the witnesses
 
 
+_OPEN = contextlib.ExitStack()
+"""Witnesses of the test, closed at its end."""
+
+
 class Witness(Protocol):
     def happened(self) -> bool:
         """True if the thing was loaded, run or connected to since the beginning."""
@@ -89,7 +97,7 @@ class Listens:
     """A port at which connections are counted; nobody takes them."""
 
     def __init__(self) -> None:
-        self.socket = socket.create_server(("127.0.0.1", 0))
+        self.socket = _OPEN.enter_context(socket.create_server(("127.0.0.1", 0)))
         self.port = int(self.socket.getsockname()[1])
 
     def happened(self) -> bool:
@@ -104,6 +112,7 @@ class Terminal:
 
     def __init__(self) -> None:
         self.fd = os.open("/dev/ptmx", os.O_RDWR | os.O_NOCTTY)
+        _OPEN.callback(os.close, self.fd)
         fcntl.ioctl(self.fd, self.SET_LOCK, struct.pack("i", 0))
         (number,) = struct.unpack("i", fcntl.ioctl(self.fd, self.GET_NUMBER, struct.pack("i", 0)))
         self.path = f"/dev/pts/{number}"
@@ -150,14 +159,15 @@ def instrument() -> Iterator[str]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Where the user is; the files are in the folder ``theirs``. What runs may leave the file ``witness``."""
     for variable in [name for name in os.environ if name.startswith("ANALOGRIG_") and name != "ANALOGRIG_FIRMWARE"]:
         monkeypatch.delenv(variable)
     monkeypatch.setenv("TRUST_WITNESS", str(tmp_path / "witness"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "theirs").mkdir()
-    return tmp_path
+    with _OPEN:
+        yield tmp_path
 
 
 def executable(path: Path) -> Path:

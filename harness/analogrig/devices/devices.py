@@ -634,12 +634,11 @@ def trusted(name: str, trust: Trust) -> DeviceDescription:
 
 
 def named_things(name: str) -> tuple[Thing, ...]:
-    """Things that ``name`` itself states, not a file that it refers to.
-
-    :raises ConfigurationError: as ``describe``.
-    """
-    description, file = _read(name)
-    return () if file else description.things
+    """Things that ``name`` itself states, not a file that it refers to; none if it means no device."""
+    with contextlib.suppress(ConfigurationError):
+        description, file = _read(name)
+        return () if file else description.things
+    return ()
 
 
 def _read(name: str) -> tuple[DeviceDescription, str]:

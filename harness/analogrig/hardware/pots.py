@@ -101,6 +101,8 @@ class CommandPots(_Boxed):
         super().__post_init__()
         if not self.arguments or not self.arguments[0]:
             raise ValueError("arguments must begin with the program")
+        if _PLACEHOLDER.search(self.arguments[0]):  # --allow names a program, not as many as a file likes to make of it
+            raise ValueError(f"arguments must begin with the program, without placeholders, not {self.arguments[0]!r}")
         _check_placeholders("arguments", " ".join(self.arguments))
 
     @property

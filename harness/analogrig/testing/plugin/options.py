@@ -148,14 +148,12 @@ def add(parser: pytest.Parser) -> None:
 
 def check(config: pytest.Config) -> None:
     """:raises pytest.UsageError: an option cannot be what it is."""
+    trusting.check(config)
     for option in OPTIONS:
         option.said(config)
 
 
 def trust_of(config: pytest.Config) -> Trust:
-    """Things that a file may name in this session.
-
-    :raises ConfigurationError, pytest.UsageError: as ``trusting.trust_of``.
-    """
+    """Things that a file may name in this session."""
     given = DUT.given(config)
     return trusting.trust_of(config, given.value if given else None)

@@ -23,18 +23,20 @@ def add(group: pytest.OptionGroup) -> None:
     )
 
 
+def check(config: pytest.Config) -> None:
+    """:raises pytest.UsageError: the ini file allows something."""
+    if any(word.partition("=")[0] == FLAG for word in _addopts(config)):
+        raise pytest.UsageError(f"{config.inipath}: addopts: {FLAG} is for the command line or conftest.py")
+
+
 def trust_of(config: pytest.Config, dut: str | None) -> Trust:
     """Things that the command line, the environment or conftest.py allows.
 
     :param dut: device that the command line or the environment names.
-    :raises ConfigurationError: there is no such device.
-    :raises pytest.UsageError: the ini file allows something.
     """
     from analogrig.devices.devices import named_things
     from analogrig.trust import Trust, file_of
 
-    if any(word.partition("=")[0] == FLAG for word in _addopts(config)):
-        raise pytest.UsageError(f"{config.inipath}: addopts: {FLAG} is for the command line or conftest.py")
     trust = Trust(config.getoption(FLAG), option=FLAG)
     return trust if not dut or file_of(dut) else trust.also(named_things(dut))
 
