@@ -103,7 +103,7 @@ class Counterexample:
 
     def _device(self) -> str:
         """The name that describes it; empty: it takes a file."""
-        names = (self.dut, str(self.run.conditions.dut["name"]))
+        names = (str(self.dut), str(self.run.conditions.dut["name"]))  # as the command line would read them
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
 
 
