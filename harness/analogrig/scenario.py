@@ -13,6 +13,7 @@ import numpy as np
 from analogrig import config
 from analogrig.plant import Plant
 from analogrig.run import Segment
+from analogrig.trust import FiledName, beside
 from analogrig_emulator.excitation import Excitation
 from analogrig_emulator.suspension import PROGRAMS
 
@@ -186,15 +187,14 @@ class Scenario:
         """
         path = config.locate("scenarios", name)
         scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
-        rig, dut = (
-            str(path.parent / each) if each.endswith(".toml") else each for each in (scenario.rig, scenario.dut)
-        )
+        rig, dut = (beside(path, each) for each in (scenario.rig, scenario.dut))
         return dataclasses.replace(scenario, rig=rig, dut=dut)
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:
-        """From TOML values; ``where`` leads every error."""
-        return config.build(cls, {"name": default_name, **table}, where)
+        """From TOML values; ``where``, the file that holds them, leads every error."""
+        scenario = config.build(cls, {"name": default_name, **table}, where)
+        return dataclasses.replace(scenario, dut=FiledName(scenario.dut, where)) if scenario.dut else scenario
 
     def as_table(self) -> dict[str, Any]:
         """The same as plain values, so that ``from_table`` gives an equal scenario again."""

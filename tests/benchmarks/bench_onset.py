@@ -21,8 +21,8 @@ from analogrig.hardware.by_hand import Tweak, doubts
 from analogrig.hardware.onset.jump import NoOnset, Onset, onset
 from analogrig.hardware.onset.turn import SlowTurn
 from analogrig.judging.statistics import lower_rate
-from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
+from tests.harness.allowed import open_allowed
 from tests.harness.onsets import Clock, Several, Trial, still
 from tests.harness.served import served
 
@@ -113,7 +113,7 @@ def _served() -> Iterator[Rig]:
     with (
         served() as instrument,
         tempfile.TemporaryDirectory() as folder,
-        open_rig(str(instrument.rigs_file(Path(folder)))) as rig,
+        open_allowed(str(instrument.rigs_file(Path(folder)))) as rig,
     ):
         yield rig
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -52,10 +52,10 @@ damping_n_s_per_m = [2500.0, 3021.0]
 """
 
 
-def planned(tmp_path: Path, spec: str = SPEC) -> Plan:
+def planned(tmp_path: Path, spec: str = SPEC, allow: Sequence[str] = ()) -> Plan:
     path = tmp_path / "spec.toml"
     path.write_text(spec)
-    return Plan.of(CampaignSpec.load(str(path)))
+    return Plan.of(CampaignSpec.load(str(path)), allow)
 
 
 @pytest.fixture(scope="module")
@@ -515,8 +515,10 @@ def test_command_says_what_came_out_and_writes_the_page(
 
 
 def test_campaign_whose_devices_cannot_be_had_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n")
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json")]) == 3
+    ports = ("/dev/absent", "/dev/lacking")
+    planned(tmp_path, "trials = 2\nsamples = 300\ndevices = ['serial:/dev/absent', 'serial:/dev/lacking']\n", ports)
+    allowed = [word for port in ports for word in ("--allow", port)]
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(tmp_path / "out.json"), *allowed]) == 3
     complaint = capsys.readouterr().err
     assert "INCONCLUSIVE: no device can be had: cannot open /dev/absent" in complaint
     assert complaint.count("\n") == 1
@@ -528,9 +530,10 @@ def test_device_that_does_not_answer_leaves_the_others_their_results(
 ) -> None:
     master, slave = os.openpty()
     (tmp_path / "mute.toml").write_text(f"kind = 'serial'\nurl = '{os.ttyname(slave)}'\ntimeout_s = 0.05\n")
-    planned(tmp_path, f"trials = 3\nsamples = 400\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n")
+    spec = f"trials = 3\nsamples = 400\ndevices = ['{tmp_path / 'mute.toml'}', 'inproc']\n"
+    planned(tmp_path, spec, [os.ttyname(slave)])
     out = tmp_path / "out.json"
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 3
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", os.ttyname(slave)]) == 3
     os.close(master)
     os.close(slave)
     said = capsys.readouterr()
@@ -598,7 +601,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
 ) -> None:
     library, out = changed_library(tmp_path), tmp_path / "out.json"
     spec = f"trials = 2\nsamples = 300\ndevices = ['inproc:{library}']\n"
-    plan = planned(tmp_path, spec)
+    plan = planned(tmp_path, spec, [str(library)])
     with Journal(journal_of(out), plan) as journal:
         journal.add(Chunk((0, 0)), play_chunk(plan.as_json(), (0, 0)))
     kept = journal_of(out).read_bytes()
@@ -607,7 +610,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     close_devices()
     with pytest.raises(ConfigurationError, match=r"own\.so is another build than the one that the campaign was begun"):
         play_chunk(plan.as_json(), (0, 0))
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out)]) == 2
+    assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", str(library)]) == 2
     complaint = capsys.readouterr().err
     before, after = plan.devices[0]["build"], planned(tmp_path, spec).devices[0]["build"]
     assert f"devices[0].build is '{before}' there and '{after}' here" in complaint
@@ -731,8 +734,9 @@ def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
 
 
 def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    planned(tmp_path, "devices = ['serial:/dev/absent']\n")
-    assert main(["campaign", str(tmp_path / "spec.toml"), "--workers", "2", "--out", str(tmp_path / "out.json")]) == 2
+    planned(tmp_path, "devices = ['serial:/dev/absent']\n", ["/dev/absent"])
+    options = ["--workers", "2", "--out", str(tmp_path / "out.json"), "--allow", "/dev/absent"]
+    assert main(["campaign", str(tmp_path / "spec.toml"), *options]) == 2
     assert "serial:/dev/absent is one device" in capsys.readouterr().err
 
 

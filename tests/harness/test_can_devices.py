@@ -112,8 +112,8 @@ def test_option_that_a_device_has_not_is_named(capsys: pytest.CaptureFixture[str
 
 def test_device_on_a_bus_is_not_opened_again_on_the_word_of_a_recording() -> None:
     recorded = CanDevice(name="bob", interface="socketcan", channel="can0").as_table()
-    with pytest.raises(ConfigurationError, match="was can:socketcan/can0, .* say --dut can:socketcan/can0, or an"):
-        reopen_dut(recorded)
+    with pytest.raises(ConfigurationError, match="CAN bus can:socketcan/can0, which no file may order: pass"):
+        reopen_dut(recorded, "run.npz")
 
 
 # ---- python-can's own configuration

@@ -223,7 +223,7 @@ def test_recorded_device_is_the_same_again() -> None:
         dut.start()
         first, record = feed(dut, 0, N), dict(dut.description())
     assert record["identity"]["firmware"] == "LIBRARY"
-    with reopen_dut(record) as dut:
+    with reopen_dut(record, "run.npz") as dut:
         assert {**dut.description(), "identity": None} == {**record, "identity": None}
         dut.start()
         assert_same(feed(dut, 0, N), first)

@@ -13,6 +13,7 @@ from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE, NiDaqmx, levels_v
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
+from tests.harness.allowed import open_allowed
 from tests.harness.ni_stand_in import Card, DaqError, Error, library
 
 RIG = """\
@@ -46,7 +47,7 @@ def rigs_file(tmp_path: Path) -> str:
 
 
 def test_signals_are_those_of_the_emulated_rig(card: Card, rigs_file: str) -> None:
-    with open_rig(rigs_file) as real, open_rig("emulator-ideal") as emulated:
+    with open_allowed(rigs_file) as real, open_rig("emulator-ideal") as emulated:
         measured, exact = (
             np.concatenate([block.volts[:, :2] for block in rig.perform(SCENARIO, 1).blocks])
             for rig in (real, emulated)
@@ -91,7 +92,7 @@ def test_error_of_the_card_is_one_line_of_its_kind_and_the_output_is_left_at_0_v
     code: int, kind: type[RigError], card: Card, rigs_file: str
 ) -> None:
     card.failing = DaqError(f"It does not go.\nDevice: Dev1\nStatus Code: {code}", code)
-    with open_rig(rigs_file) as rig, pytest.raises(RigError) as caught:
+    with open_allowed(rigs_file) as rig, pytest.raises(RigError) as caught:
         list(rig.perform(SCENARIO, 1).blocks)
     assert type(caught.value) is kind
     assert str(caught.value) == "instrument Dev1: the record: It does not go."
@@ -110,7 +111,7 @@ def test_without_the_driver_of_ni_the_rig_cannot_be_had(card: Card, monkeypatch:
 
 def test_record_that_is_too_short_is_an_error(card: Card, rigs_file: str) -> None:
     card.lost_n = 5
-    with open_rig(rigs_file) as rig, pytest.raises(RecordIncomplete, match="395 of 400 samples"):
+    with open_allowed(rigs_file) as rig, pytest.raises(RecordIncomplete, match="395 of 400 samples"):
         list(rig.perform(SCENARIO, 1).blocks)
 
 
@@ -127,7 +128,7 @@ def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypat
 def test_rig_tests_itself_well(card: Card, rigs_file: str) -> None:
     file = Path(rigs_file)
     file.write_text(RIG.replace("self_test = false", "self_test = true"))
-    with open_rig(rigs_file) as rig:
+    with open_allowed(rigs_file) as rig:
         performance = rig.perform(SCENARIO, 1)
         assert sum(len(block.codes) for block in performance.blocks) == SCENARIO.samples
     assert not performance.hindsight().caveats
@@ -138,5 +139,5 @@ def test_without_the_package_the_line_that_installs_it_is_named(
     rigs_file: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "nidaqmx", None)
-    with open_rig(rigs_file) as rig, pytest.raises(ConfigurationError, match=r"pip install 'analogrig\[nidaqmx\]'"):
+    with open_allowed(rigs_file) as rig, pytest.raises(ConfigurationError, match=r"pip install 'analogrig\[nidaqmx\]'"):
         next(rig.perform(SCENARIO, 1).blocks)

@@ -12,9 +12,9 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.judging.verdict import judge
 from analogrig.protocol.dut import open_dut
-from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario, Tweak
+from tests.harness.allowed import open_allowed
 from tests.harness.served import Served, served
 
 PROGRAM = """\
@@ -55,7 +55,7 @@ def rig(instrument: Served, folder: Path, program: str) -> str:
 
 
 def played(name: str) -> Run:
-    with open_rig(name) as opened, open_dut("inproc") as dut:
+    with open_allowed(name) as opened, open_dut("inproc") as dut:
         return Bench(opened, dut).play(SCENARIO, 1)
 
 
@@ -77,7 +77,7 @@ def test_instants_of_a_users_command_are_learned_and_the_run_is_judged(clocked: 
 
 def test_pots_that_did_not_turn_are_found_out(clocked: Served, tmp_path: Path) -> None:
     name = rig(clocked, tmp_path, PROGRAM)
-    with open_rig(name) as opened, open_dut("inproc") as dut:
+    with open_allowed(name) as opened, open_dut("inproc") as dut:
         bench = Bench(opened, dut)
         bench.play(dataclasses.replace(SCENARIO, tweaks=(), samples=500), 1)
         (tmp_path / "turn.py").write_text("")  # ends with status 0, and does nothing

@@ -19,7 +19,7 @@ import analogrig.reporting  # these two for the runs in this process, which forg
 import analogrig.testing.properties.experiments  # noqa: F401
 from analogrig import cli, config
 from analogrig.bench import Bench
-from analogrig.devices.devices import host_child, of_scenario
+from analogrig.devices.devices import host_child
 from analogrig.errors import ConfigurationError
 from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
@@ -498,27 +498,8 @@ def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytes
     (folder / "one.toml").write_text(SHORT.format(head='dut = "inproc:./evil.so"', expect=""))
     result = run(user, "--hil-scenario-dir", "suite")
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*the scenario is for inproc:./evil.so, which is not opened on the word of a file: *"])
-
-
-@pytest.mark.parametrize(
-    ("filed", "given", "otherwise", "device"),
-    [
-        ("", "", "host", "host"),
-        ("inproc", "", "host", "inproc"),
-        ("inproc", "qemu-m4", "host", "qemu-m4"),
-        ("serial:/dev/ttyACM0", "host", "host", "host"),
-        ("board.toml", "serial:/dev/ttyACM0", "host", "board.toml"),
-        ("board.toml", "", "serial:/dev/ttyACM0", "board.toml"),
-        ("board.toml", "serial:/dev/ttyACM1", "host", "serial:/dev/ttyACM1"),
-    ],
-)
-def test_device_of_a_scenario_is_that_of_its_file_unless_the_user_names_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filed: str, given: str, otherwise: str, device: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("board.toml").write_text('kind = "serial"\nurl = "/dev/ttyACM0"\nbaud = 9600\n')
-    assert of_scenario(filed, given, otherwise) == device
+    said = "the device loads the library ./suite/evil.so, which no file may order: pass --hil-allow ./suite/evil.so"
+    result.stdout.fnmatch_lines([f"*{said}*"])
 
 
 FALLS_APART = """

@@ -213,10 +213,10 @@ def test_own_firmware_is_named_by_its_path_and_not_run_on_the_word_of_a_recordin
     shutil.copyfile(FOLDER / "analogrig-m4.elf", image)
     with connect(describe(f"qemu-m4:{image}")) as dut:
         record = dict(dut.description())
-    with pytest.raises(ConfigurationError, match=f"say --dut qemu-m4:{image}, or another"):
-        reopen_dut(record)
+    with pytest.raises(ConfigurationError, match=f"run.npz: the device boots the firmware {image}, which no file may "):
+        reopen_dut(record, "run.npz")
     own = {**record, "firmware": None}
-    with reopen_dut({key: value for key, value in own.items() if value is not None}) as dut:
+    with reopen_dut({key: value for key, value in own.items() if value is not None}, "run.npz") as dut:
         assert dut.description()["kind"] == "qemu-m4"
 
 

@@ -32,6 +32,7 @@ from analogrig.rigs.rig import Performance
 from analogrig.run import Run
 from analogrig.scenario import PlantChoice, Scenario, Tweak
 from analogrig_emulator.excitation import Excitation
+from tests.harness.allowed import open_allowed
 from tests.harness.processes import LONG_S
 from tests.harness.served import RIG, ROOT, Served, served
 
@@ -53,7 +54,7 @@ def bench(ideal: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str
 
 
 def played(rig: str, scenario: Scenario, seed: int) -> Run:
-    with open_rig(rig) as opened, open_dut("inproc") as dut:
+    with open_allowed(rig) as opened, open_dut("inproc") as dut:
         return Bench(opened, dut).play(scenario, seed)
 
 
@@ -66,7 +67,7 @@ def volts(performance: Performance) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_signals_are_those_of_the_emulated_rig_to_the_converters_step(bench: str, seed: int) -> None:
-    with open_rig(bench) as real, open_rig("emulator-ideal") as emulated:
+    with open_allowed(bench) as real, open_rig("emulator-ideal") as emulated:
         measured, exact = volts(real.perform(THESIS, seed)), volts(emulated.perform(THESIS, seed))
     half_step_v = 0.5 * 40.0 / (1 << 14)
     # 0.05 samples between sample and pot, as the tweak of a real machine comes between two; so much x moves meanwhile
@@ -89,7 +90,7 @@ def test_each_play_begins_with_the_pots_of_its_scenario(ideal: Served, tmp_path:
     """Without noise all its records are the same, to the bit."""
     file = ideal.rigs_file(tmp_path)
     file.write_text(file.read_text().replace('range = "HV"', 'range = "HV", noise_lsb = 0.0'))
-    with open_rig(str(file)) as rig:
+    with open_allowed(str(file)) as rig:
         first, again = (volts(rig.perform(THESIS, 1)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
 
@@ -121,7 +122,7 @@ WAVEFORMS = [
 @pytest.mark.parametrize("excitation", WAVEFORMS)
 def test_waveforms_are_those_that_were_asked_for(bench: str, excitation: Excitation) -> None:
     scenario = Scenario(600, excitation, name="waveform")
-    with open_rig(bench) as real, open_rig("emulator-ideal") as emulated:
+    with open_allowed(bench) as real, open_rig("emulator-ideal") as emulated:
         measured, exact = volts(real.perform(scenario, 1)), volts(emulated.perform(scenario, 1))
     np.testing.assert_allclose(measured, exact, atol=0.002)
 
@@ -146,7 +147,7 @@ self_test = false
     with served("--rig", "emulator-ideal", *defects) as instrument:
         file = tmp_path / "rigs.toml"
         file.write_text(wired.format(address=instrument.address))
-        with open_rig(f"{file}:other") as real, open_rig("emulator-ideal") as emulated:
+        with open_allowed(f"{file}:other") as real, open_rig("emulator-ideal") as emulated:
             measured, exact = volts(real.perform(SHORT, 1)), volts(emulated.perform(SHORT, 1))
     np.testing.assert_allclose(measured[0], [exact[0, 0], 0.5 * 0.6], atol=0.005)  # at rest under the stage's offset
     np.testing.assert_allclose(measured[200:], exact[200:], atol=0.005)
@@ -180,18 +181,18 @@ def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
         file = tmp_path / "rigs.toml"
         address = f"127.0.0.1:{listening.getsockname()[1]}"
         file.write_text(RIG.format(address=address, self_test="false").replace("2.0", "0.5"))
-        with open_rig(str(file)) as rig, pytest.raises(RigTimeout, match=r"no (whole )?answer within 0.5 s"):
+        with open_allowed(str(file)) as rig, pytest.raises(RigTimeout, match=r"no (whole )?answer within 0.5 s"):
             next(rig.perform(SHORT, 1).blocks)
         done.set()
         thread.join(LONG_S)
 
 
 def test_instrument_belongs_to_one_who_plays(bench: str) -> None:
-    with open_rig(bench) as first, open_rig(bench) as second:
+    with open_allowed(bench) as first, open_allowed(bench) as second:
         next(first.perform(SHORT, 1).blocks)
         with pytest.raises(RigClosed, match="somebody else on this machine plays on it"):
             next(second.perform(SHORT, 1).blocks)
-    with open_rig(bench) as third:
+    with open_allowed(bench) as third:
         next(third.perform(SHORT, 1).blocks)
 
 
@@ -199,7 +200,7 @@ def test_run_after_one_that_failed_is_a_good_one(tmp_path: Path) -> None:
     second = ("--defect", "acquisition.drop_out_record=2")
     with served("--defect", 'acquisition.drop_out="zeros"', *second) as instrument:
         file = instrument.rigs_file(tmp_path)
-        with open_rig(str(file)) as rig, open_dut("inproc") as dut:
+        with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
             table = Bench(rig, dut)
             outcomes = [judge(table.play(SHORT, 1)).outcome for _ in range(2)]
     assert outcomes == ["inconclusive", "passed"]
@@ -210,7 +211,7 @@ def test_record_of_the_play_before_is_found_out(tmp_path: Path) -> None:
     fourth = ("--defect", "acquisition.stale_n=2", "--defect", "acquisition.drop_out_record=4")
     with (
         served(*fourth) as instrument,
-        open_rig(str(instrument.rigs_file(tmp_path))) as rig,
+        open_allowed(str(instrument.rigs_file(tmp_path))) as rig,
         open_dut("inproc") as dut,
     ):
         first, second, third = (judge(Bench(rig, dut).play(SHORT, 1)) for _ in range(3))
@@ -242,7 +243,7 @@ def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
         return instrument
 
     scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])
-    description = config.build(RealDescription, described_rig(bench)[0], "bench")
+    description = config.build(RealDescription, described_rig(bench).table, "bench")
     with RealRig(description, connected) as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, 1))
     assert verdict.outcome == "inconclusive"
@@ -259,7 +260,7 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
         file = instrument.rigs_file(tmp_path)
         if "drop_out" in defect:
             file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 2.0"))
-        with open_rig(str(file)) as rig:
+        with open_allowed(str(file)) as rig:
             blocks = rig.perform(SHORT, 1).blocks
             with pytest.raises(FAILURES[defect], match=instrument.address):
                 next(blocks)
@@ -290,7 +291,7 @@ def test_what_is_no_instrument_is_a_named_error(answer: bytes | None, error: typ
         file.write_text(
             RIG.format(address=f"127.0.0.1:{listening.getsockname()[1]}", self_test="false").replace("60.0", "0.2")
         )
-        with open_rig(str(file)) as rig, pytest.raises(error):
+        with open_allowed(str(file)) as rig, pytest.raises(error):
             next(rig.perform(SHORT, 1).blocks)
         done.set()
         thread.join(LONG_S)
@@ -315,7 +316,7 @@ def output_state(address: str) -> str:
 
 
 def test_generator_is_off_while_the_device_works_and_afterwards(bench: str, ideal: Served) -> None:
-    with open_rig(bench) as rig:
+    with open_allowed(bench) as rig:
         for _ in rig.perform(SHORT, 1).blocks:
             assert output_state(ideal.address) == "OFF"
     assert output_state(ideal.address) == "OFF"
@@ -328,7 +329,11 @@ def test_run_that_is_ended_leaves_the_generator_off(number: signal.Signals, stat
         file = instrument.rigs_file(tmp_path)
         command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
         with subprocess.Popen(
-            [*command, "--rig", str(file)], cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [*command, "--rig", str(file), "--allow", instrument.address],
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
         ) as process:
             while output_state(instrument.address) != "ON":  # as soon as it plays; it then waits for its record
                 assert process.poll() is None
@@ -355,6 +360,10 @@ WRONG = {
     "gain = 10.0": ("gain = 10.0\ngenerator.offset_v = 50.0", "limits.force_v"),
     "redpitaya://": ("picoscope://", "give it as redpitaya://HOST[:PORT] or nidaqmx://CARD"),
     "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
+    'pots.kind = "instrument"\n': (
+        'pots = { kind = "serial", url = "nosuch://x", line = "{pot} {dial}" }\n',
+        "pots: url nosuch://x: invalid URL, protocol 'nosuch' not known",
+    ),
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
     "timeout_s = 60.0": ("timeout_s = 60.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
     "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
@@ -369,7 +378,7 @@ def test_contradictory_description_is_one_line_with_file_and_key(right: str, tmp
     wrong, said = WRONG[right]
     name = described(tmp_path, lambda text: text.replace(right, wrong, 1))
     with pytest.raises(ConfigurationError) as caught:
-        open_rig(name)
+        open_allowed(name)
     assert said in str(caught.value)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -377,7 +386,7 @@ def test_contradictory_description_is_one_line_with_file_and_key(right: str, tmp
 
 def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_path: Path) -> None:
     name = described(tmp_path, lambda text: text + "limits.force_v = [0.0, 8.0]\nlimits.dials.M = [0.0, 0.5]\n")
-    with open_rig(name) as rig:  # there is no instrument: nothing is sent
+    with open_allowed(name) as rig:  # there is no instrument: nothing is sent
         with pytest.raises(ConfigurationError, match=r"force of 0.1 V to 9.9 V exceeds limits.force_v"):
             rig.perform(THESIS, 1)
         mild = dataclasses.replace(THESIS, excitation=dataclasses.replace(THESIS.excitation, high_v=7.0))
@@ -401,7 +410,7 @@ def test_scenario_beyond_the_rigs_limits_is_refused_before_anything_moves(tmp_pa
     ],
 )
 def test_scenario_that_the_rig_cannot_play_is_refused(scenario: Scenario, said: str, tmp_path: Path) -> None:
-    with open_rig(described(tmp_path, str)) as rig, pytest.raises(ConfigurationError, match=said):
+    with open_allowed(described(tmp_path, str)) as rig, pytest.raises(ConfigurationError, match=said):
         rig.perform(scenario, 1)
 
 
@@ -411,19 +420,19 @@ def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pyte
     file.write_text(both.format(address="127.0.0.1:1", self_test="false"))
     monkeypatch.delenv("ANALOGRIG_RIGS", raising=False)
     monkeypatch.chdir(tmp_path)
-    with open_rig("bench") as rig:
+    with open_allowed("bench") as rig:
         assert rig.description()["name"] == "bench"
-    with open_rig(f"{file}:shock") as rig:
+    with open_allowed(f"{file}:shock") as rig:
         assert rig.description()["plant"] == "shock"
     with open_rig("emulator") as rig:
         assert rig.description()["kind"] == "emulator"
     with pytest.raises(ConfigurationError, match=r"holds 2 rigs: say .*:NAME, one of bench, shock"):
-        open_rig(str(file))
+        open_allowed(str(file))
     with pytest.raises(ConfigurationError, match=r"no rig is called 'bank' .* there are bench, shock, emulator"):
-        open_rig("bank")
+        open_allowed("bank")
     monkeypatch.setenv("ANALOGRIG_RIGS", str(tmp_path / "absent.toml"))
     with pytest.raises(ConfigurationError, match=r"ANALOGRIG_RIGS: .*absent.toml: no such file"):
-        open_rig("bench")
+        open_allowed("bench")
 
 
 # ---- the self-test comes before any verdict
@@ -471,7 +480,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
             [
                 *(sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0"),
                 *("--pyargs", "analogrig.testing.properties", "--hil-rig", "bench", "--hil-dut", "inproc"),
-                *("--hil-runs-dir", str(tmp_path / "runs")),
+                *("--hil-runs-dir", str(tmp_path / "runs"), "--hil-allow", instrument.address),
             ],
             cwd=tmp_path,
             env={**environment, "PYTHONPATH": str(ROOT)},
@@ -485,7 +494,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
 
 def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Path) -> None:
     name = described(tmp_path, lambda text: text.replace('pots.kind = "instrument"', 'pots.kind = "none"'))
-    with open_rig(name) as rig:
+    with open_allowed(name) as rig:
         assert "tweak" not in rig.capabilities
         with pytest.raises(ConfigurationError, match=r"tweaks\[0\] at sample 1200: nobody turns the pots"):
             rig.perform(THESIS, 1)

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,13 +20,16 @@ from analogrig import config
 from analogrig.campaigns import build
 from analogrig.campaigns.difference import differences, named
 from analogrig.campaigns.spec import AXES, MAX_CELLS, MAX_TRIALS, CampaignSpec
-from analogrig.devices.devices import DeviceDescription, describe, from_table
+from analogrig.devices.devices import DeviceDescription, from_table, trusted
 from analogrig.errors import ConfigurationError
+from analogrig.hardware.real import RealRig
+from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario, Tweak
+from analogrig.trust import Trust
 
 _DRAWS = 20_000
 """Of the seeds: the stream of the campaign's own draws, apart from those of the rig."""
@@ -100,16 +103,21 @@ class Plan:
         return len(self.rigs) * len(self.devices) * combinations
 
     @classmethod
-    def of(cls, spec: CampaignSpec) -> Plan:
-        """:raises ConfigurationError: a rig, device or scenario is absent or wrong, or a cell cannot be played."""
+    def of(cls, spec: CampaignSpec, allow: Trust | Iterable[str] = ()) -> Plan:
+        """The plan of a campaign; its rigs and devices are checked here, so that workers need not.
+
+        :param allow: things that a file may name (``analogrig.trust``).
+        :raises ConfigurationError: a rig, device or scenario is absent or wrong, or a cell cannot be played; or a file
+            names what is not allowed.
+        """
         scenario = Scenario.load(spec.scenario)
         if spec.samples is not None:
             scenario = dataclasses.replace(scenario, samples=spec.samples)
         plan = cls(
             spec=spec,
             scenario=scenario.as_table(),
-            rigs=tuple(rig_table(name) for name in spec.rigs),
-            devices=tuple(device_table(name) for name in spec.devices),
+            rigs=tuple(rig_table(name, allow) for name in spec.rigs),
+            devices=tuple(device_table(name, allow) for name in spec.devices),
             analogrig=build.of_analogrig(),
         )
         plan._check()
@@ -218,15 +226,15 @@ def open_table(table: Mapping[str, Any]) -> Rig:
     """
     if "card" in table:
         return EmulatorRig(config.build(EmulatorDescription, table, f"rig {table['name']}"))
-    return open_rig(table["name"])
+    return RealRig(config.build(RealDescription, table["described"], f"rig {table['name']}"))
 
 
-def device_table(name: str) -> Mapping[str, Any]:
+def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
     """A device by its name, as plain values that ``device_of`` takes, with its ``build``.
 
-    :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read.
+    :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read or is not allowed.
     """
-    device = describe(name)
+    device = trusted(name, Trust.of(allow))
     return {**device.as_table(), "build": build.of_device(device)}
 
 
@@ -258,12 +266,12 @@ def _only_one(table: Mapping[str, Any]) -> str:
     return "" if "card" in table else device_of(table).only_one
 
 
-def rig_table(name: str) -> Mapping[str, Any]:
-    """A rig by its name, as plain values that ``open_table`` takes; a real one is opened by its name again.
+def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
+    """A rig by its name, as plain values that ``open_table`` takes.
 
-    :raises ConfigurationError: there is none, or it can play but one scenario.
+    :raises ConfigurationError: there is none, or it can play but one scenario, or it names what is not allowed.
     """
-    with open_rig(name) as rig:
+    with open_rig(name, allow=allow) as rig:
         if isinstance(rig, RecordingRig):
             raise ConfigurationError(
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.scenario import MAX_SAMPLES
+from analogrig.trust import beside
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
@@ -135,4 +137,5 @@ class CampaignSpec:
         spec = config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
         if "/" in spec.name or spec.name in {"", ".", ".."} or not spec.name.isprintable():
             raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
-        return spec
+        rigs, devices = (tuple(beside(path, each) for each in names) for names in (spec.rigs, spec.devices))
+        return dataclasses.replace(spec, scenario=beside(path, spec.scenario), rigs=rigs, devices=devices)

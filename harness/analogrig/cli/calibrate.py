@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_command, add_json, add_rig, add_seed
+from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json, working
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
     try:
-        with open_rig(arguments.rig) as rig:
+        with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
             recordings = _recorded(rig, arguments)
         found = calibrate(
             recordings[:-1],

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import CAMPAIGN, FILE, add_command, add_json
+from analogrig.cli.options import CAMPAIGN, FILE, add_allow, add_command, add_json, trust_of
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, show_json, watched
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def add(commands: Any) -> None:
         help="file of the results, with a page beside it (default: build/campaign/NAME.json)",
     )
     add_workers(command)
+    add_allow(command)
     add_json(command)
     command.set_defaults(command=_run)
 
@@ -72,7 +73,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.spec import CampaignSpec
     from analogrig.errors import WorkerError
 
-    plan = Plan.of(CampaignSpec.load(arguments.spec))
+    plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
     page = page_of(out)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
-from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed
+from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, watched
 
 if TYPE_CHECKING:
@@ -74,9 +74,10 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import DeviceError, LinkError, RigError, WorkerError
     from analogrig.scenario import Scenario
 
+    trust = trust_of(arguments)
     question = question_of(
-        rig_table(arguments.rig),
-        device_table(arguments.dut),
+        rig_table(arguments.rig, trust),
+        device_table(arguments.dut, trust),
         Scenario.load(arguments.scenario),
         far=arguments.far,
         confidence=arguments.confidence,

@@ -10,12 +10,14 @@ from analogrig.cli.options import (
     RIG,
     RIG_NAMES,
     SCENARIO,
+    add_allow,
     add_command,
     add_dut,
     add_json,
     add_seed,
     changes_of_dut,
     count,
+    trust_of,
 )
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
 
@@ -46,6 +48,7 @@ def add(commands: Any) -> None:
     command.add_argument("--most-lsb", type=float, metavar="LSB", help="largest rms difference of the signals")
     command.add_argument("--most-samples", type=float, metavar="N", help="largest difference of mean latencies")
     add_json(command)
+    add_allow(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", "host"))
     command.set_defaults(command=_run)
 
@@ -66,10 +69,11 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"--plays must be 2 or more, not {arguments.plays}")
     scenario = Scenario.load(arguments.scenario)
     seeds = range(arguments.seed, arguments.seed + arguments.plays)
+    trust = trust_of(arguments)
     with (
-        open_rig(arguments.a) as a,
-        open_rig(arguments.b) as b,
-        open_dut(arguments.dut, **changes_of_dut(arguments)) as dut,
+        open_rig(arguments.a, allow=trust) as a,
+        open_rig(arguments.b, allow=trust) as b,
+        open_dut(arguments.dut, allow=trust, **changes_of_dut(arguments)) as dut,
     ):
         bench_a, bench_b = (Bench(rig, dut, real_time=arguments.real_time) for rig in (a, b))
         found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))

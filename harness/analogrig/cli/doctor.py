@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_command, add_json, add_rig, add_seed
+from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, working
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.hardware.self_test.conduct import self_test
     from analogrig.rigs.description import open_rig
 
-    with open_rig(arguments.rig, self_test=False) as rig:
+    with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:
         program = arguments.program or str(rig.description().get("plant", "front"))
         try:
             with working(f"self-test of {arguments.rig}"):

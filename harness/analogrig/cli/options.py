@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
+    from analogrig.trust import Trust
 
 DEFAULT_SCENARIO = "thesis"
 
@@ -50,6 +51,26 @@ def add_command(commands: Any, name: str, does: str, *examples: str) -> argparse
 def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
     """``default``: when the environment names none."""
     command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar=RIG, help=words)
+    add_allow(command)
+
+
+def add_allow(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--allow",
+        action="append",
+        default=[],
+        metavar="THING",
+        help="library, firmware, command, serial port, CAN bus or HOST:PORT that a file may name (repeatable)",
+    )
+
+
+def trust_of(arguments: argparse.Namespace) -> Trust:
+    """Things that the command line names: those of --allow, and what --dut states itself."""
+    from analogrig.devices.devices import named_things
+    from analogrig.trust import OPTION, Trust
+
+    trust, dut = Trust(arguments.allow, option=OPTION), getattr(arguments, "dut", None)
+    return trust.also(named_things(dut)) if dut else trust
 
 
 def add_what_to_play(command: argparse.ArgumentParser) -> None:
@@ -190,7 +211,7 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
     from analogrig.scenario import DEFAULT_SEED, Scenario
 
     asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
-    with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG) as rig:
+    with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG, allow=trust_of(arguments)) as rig:
         recording = rig if isinstance(rig, RecordingRig) else None
         scenario = asked or (recording.scenario() if recording else Scenario.load(DEFAULT_SCENARIO))
         if arguments.program is not None:
@@ -236,7 +257,7 @@ def recorded(arguments: argparse.Namespace) -> Run:
         return run if scenario is None else retold(run, scenario)
     if scenario is None:
         raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
-    with open_rig(arguments.rig) as rig:
+    with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
         return captured_run(
             arguments.file,
             scenario,

@@ -17,6 +17,7 @@ from analogrig.cli.options import (
     changes_of_dut,
     is_capture,
     recorded,
+    trust_of,
 )
 from analogrig.cli.playing import can_log, play, prepare
 
@@ -50,6 +51,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with RecordingRig.of(recorded(arguments), arguments.file) as rig:
         prepare(arguments.out, rig)
         log = can_log(rig, arguments)
-        changes = {"listener": log, **changes_of_dut(arguments)}
-        with open_dut(named, **changes) if named else reopen_dut(rig.run.conditions.dut, **changes) as dut:
+        changes = {"allow": trust_of(arguments), "listener": log, **changes_of_dut(arguments)}
+        device, file = rig.run.conditions.dut, str(arguments.file)
+        with open_dut(named, **changes) if named else reopen_dut(device, file, **changes) as dut:
             return play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments, log)

@@ -15,6 +15,7 @@ from analogrig.cli.options import (
     add_what_to_play,
     changes_of_dut,
     opened,
+    trust_of,
 )
 from analogrig.cli.playing import can_log, play, prepare
 
@@ -37,12 +38,11 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.devices.devices import of_scenario
     from analogrig.protocol.dut import open_dut
 
     with opened(arguments) as (rig, scenario, seed):
-        device = of_scenario(scenario.dut, arguments.dut, "host")
+        device = arguments.dut or scenario.dut or "host"
         prepare(arguments.out, rig)
         log = can_log(rig, arguments)
-        with open_dut(device, listener=log, **changes_of_dut(arguments)) as dut:
+        with open_dut(device, allow=trust_of(arguments), listener=log, **changes_of_dut(arguments)) as dut:
             return play(rig, dut, scenario, seed, arguments, log)

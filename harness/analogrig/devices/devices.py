@@ -17,7 +17,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
-from urllib.parse import unquote
+from urllib.parse import quote, unquote, urlencode
 
 from analogrig import config, device_program
 from analogrig.errors import ConfigurationError, LinkError
@@ -28,6 +28,7 @@ from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import DEFAULT_BAUD, LIBRARY, DescriptorWire, MemoryWire, PortWire, Wire
 from analogrig.links.wire_faults import WireFaults
 from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.trust import Thing, Trust, file_of, folder_of, placed, placed_port
 
 if TYPE_CHECKING:  # python-can takes longer to import than all the rest
     from analogrig.links.can_bus import CanBus, PythonCanBus
@@ -143,15 +144,18 @@ class DeviceDescription:
         return None
 
     @property
-    def elsewhere(self) -> str:
-        """As the command line names it, if it is not safe to open it on the word of a recording."""
-        return ""
+    def things(self) -> tuple[Thing, ...]:
+        """Things that opening it would load, run or connect to, except those of analogrig itself."""
+        return ()
+
+    def placed(self, folder: Path) -> Self:  # noqa: ARG002
+        """The same with absolute paths, where its own are relative to ``folder``."""
+        return self
 
     @property
     def only_one(self) -> str:
-        """As the command line names it, if there is one of it, which two processes cannot both have; "" for any that
-        each can start or load for itself."""
-        return self.elsewhere
+        """Its name on the command line if two processes cannot share it; empty if each can open one of its own."""
+        return ""
 
     def as_table(self) -> dict[str, Any]:
         """In plain values, from which the same can be made."""
@@ -356,12 +360,11 @@ class InprocDevice(EitherDevice):
         return Path(self.library).absolute() if self.library else LIBRARY
 
     @property
-    def elsewhere(self) -> str:
-        return f"{self.kind}:{self.library}" if self.library else ""
+    def things(self) -> tuple[Thing, ...]:
+        return (Thing("library", self.library, "the device loads the library"),) if self.library else ()
 
-    @property
-    def only_one(self) -> str:
-        return ""
+    def placed(self, folder: Path) -> Self:
+        return dataclasses.replace(self, library=placed(self.library, folder))
 
     def wire(self) -> Wire:
         return MemoryWire(boot_nonce=secrets.randbits(32), library=self.program)
@@ -424,13 +427,12 @@ class QemuDevice(EitherDevice):
         return Child(command, f"QEMU ({self.machine})", inherited=inherited)
 
     @property
-    def elsewhere(self) -> str:
-        """Firmware may ask its debugger for any file of this computer."""
-        return f"{self.kind}:{self.firmware}" if self.firmware else ""
+    def things(self) -> tuple[Thing, ...]:
+        """Firmware can open any file of this computer by semihosting."""
+        return (Thing("firmware", self.firmware, "the device boots the firmware"),) if self.firmware else ()
 
-    @property
-    def only_one(self) -> str:
-        return ""
+    def placed(self, folder: Path) -> Self:
+        return dataclasses.replace(self, firmware=placed(self.firmware, folder)) if self.firmware else self
 
     @property
     def program(self) -> Path:
@@ -501,7 +503,14 @@ class SerialDevice(ByteDevice):
         return f"the line was opened at {self.baud} baud"
 
     @property
-    def elsewhere(self) -> str:
+    def things(self) -> tuple[Thing, ...]:
+        return (Thing("serial port", self.url, "the device opens the serial port"),)
+
+    def placed(self, folder: Path) -> Self:
+        return dataclasses.replace(self, url=placed_port(self.url, folder))
+
+    @property
+    def only_one(self) -> str:
         return f"{self.kind}:{self.url}"
 
 
@@ -604,10 +613,19 @@ class CanDevice(FrameDevice):
         return f"the bus was opened as {self.kind}:{link_name}: is the device on it, at the same bit rate?"
 
     @property
-    def elsewhere(self) -> str:
+    def only_one(self) -> str:
         if self.interface == "virtual":
             return ""
         return f"{self.kind}:{self.interface}{'/' if self.channel else ''}{self.channel}"
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Options are part of the name: python-can takes hosts, ports and driver libraries as such."""
+        if not self.only_one:
+            return ()
+        texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in self.options.items()}
+        options = urlencode(sorted(texts.items()), quote_via=quote)
+        return (Thing("CAN bus", f"{self.only_one}{'?' if options else ''}{options}", "the device opens the CAN bus"),)
 
 
 KINDS: Mapping[str, type[DeviceDescription]] = {
@@ -618,14 +636,39 @@ KINDS: Mapping[str, type[DeviceDescription]] = {
 def describe(name: str) -> DeviceDescription:
     """The device that ``name`` means: a shipped or own description, or a kind with what belongs to it after a colon.
 
+    To look at it only: what a file names must not be opened unless ``trusted`` has checked it.
+
     :raises ConfigurationError: there is none, or it is wrong.
     """
+    return _read(name)[0]
+
+
+def trusted(name: str, trust: Trust) -> DeviceDescription:
+    """As ``describe``, for a device that shall be opened.
+
+    :raises ConfigurationError: as ``describe``; or a file orders a thing that is not trusted.
+    """
+    description, file = _read(name)
+    trust.check(description.things, file or file_of(name))
+    return description
+
+
+def named_things(name: str) -> tuple[Thing, ...]:
+    """Things that ``name`` itself states, not a file that it refers to; none if it means no device."""
+    with contextlib.suppress(ConfigurationError):
+        description, file = _read(name)
+        return () if file else description.things
+    return ()
+
+
+def _read(name: str) -> tuple[DeviceDescription, str]:
+    """The description, and the file that holds it; empty if the name says all."""
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
-        return KINDS[kind].named(name, name[len(kind) :].removeprefix(":"))
+        return KINDS[kind].named(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
     _check_not_compiled(name)
     path = config.locate("devices", name)
-    return from_table({"name": path.stem, **config.read_toml(path)}, str(path))
+    return from_table({"name": path.stem, **config.read_toml(path)}, str(path)).placed(path.parent), str(path)
 
 
 def _check_not_compiled(name: str) -> None:
@@ -641,24 +684,6 @@ def _check_not_compiled(name: str) -> None:
             f"{name}: is compiled, and describes no device: say inproc:{name} if it is a library of your own,"
             f" qemu-m4:{name} if it is firmware"
         )
-
-
-def of_scenario(filed: str, given: str, otherwise: str) -> str:
-    """The device to play a scenario on: the one that the user has given, that of the scenario's file, or another.
-
-    What a file names elsewhere is not opened on its word alone: the user must have named the same.
-
-    :raises ConfigurationError: the user has not; or there is no such device.
-    """
-    if not filed or not (place := describe(filed).elsewhere):
-        return given or filed or otherwise
-    if given:
-        return filed if describe(given).elsewhere == place else given
-    if describe(otherwise).elsewhere == place:
-        return filed
-    raise ConfigurationError(
-        f"the scenario is for {place}, which is not opened on the word of a file: say --dut {place}, or another"
-    )
 
 
 def recorded(description: Mapping[str, Any]) -> DeviceDescription:

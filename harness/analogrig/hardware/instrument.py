@@ -111,6 +111,11 @@ class Instrument(ABC):
         """Whether one could be found at what stands behind ``scheme://``."""
 
     @classmethod
+    def place(cls, address: str) -> str:
+        """Name of what ``open`` connects to, for the option ``--allow``."""
+        return address
+
+    @classmethod
     @abstractmethod
     def open(cls, address: str, timeout_s: float) -> Instrument:
         """The one at an address that is one, in a known state, the generator off.

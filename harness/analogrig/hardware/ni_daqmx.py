@@ -63,6 +63,10 @@ class NiDaqmx(Instrument):
         return re.fullmatch(r"[A-Za-z0-9][\w-]*", address) is not None
 
     @classmethod
+    def place(cls, address: str) -> str:
+        return f"nidaqmx://{address}"
+
+    @classmethod
     def open(cls, address: str, timeout_s: float) -> NiDaqmx:
         """:raises ConfigurationError: the package nidaqmx is not installed, or NI's driver is not.
         :raises RigError: the card is not there.

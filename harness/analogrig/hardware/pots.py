@@ -8,6 +8,7 @@ Dials go from 0 to 1; how far each pot may be turned is for the caller to check,
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import re
 import select
@@ -19,12 +20,13 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol, Self
 
 import serial
 
 from analogrig.errors import ConfigurationError, LinkError, RigError
 from analogrig.links.wire import DEFAULT_BAUD, PortWire
+from analogrig.trust import Thing, placed, placed_port
 
 TERMINAL = Path("/dev/tty")
 """Where the operator is, whatever standard input and output are."""
@@ -99,7 +101,22 @@ class CommandPots(_Boxed):
         super().__post_init__()
         if not self.arguments or not self.arguments[0]:
             raise ValueError("arguments must begin with the program")
+        if _PLACEHOLDER.search(self.arguments[0]):  # --allow names a program, not as many as a file likes to make of it
+            raise ValueError(f"arguments must begin with the program, without placeholders, not {self.arguments[0]!r}")
         _check_placeholders("arguments", " ".join(self.arguments))
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Its program; a name without a slash is looked for on the PATH."""
+        return (Thing("command", self.arguments[0], "pots run the command", self.arguments[1:]),)
+
+    def placed(self, folder: Path) -> Self:
+        """The same with an absolute program path, where its own is relative to ``folder``."""
+        program, *rest = self.arguments
+        return dataclasses.replace(self, arguments=(placed(program, folder) if "/" in program else program, *rest))
+
+    def check(self) -> None:
+        """Nothing is known before it is started."""
 
     def open(self) -> Pots:
         return _Command(self)
@@ -122,16 +139,30 @@ class SerialPots(_Boxed):
         super().__post_init__()
         if not self.url:
             raise ValueError("url must say where the box is: a serial port, or any URL of pyserial")
-        try:
-            serial.serial_for_url(self.url, do_not_open=True)
-        except ValueError as error:
-            raise ValueError(f"url {self.url}: {error}") from error
-        except OSError:  # what is not there may be there when it is opened
-            pass
         if not 1 <= self.baud <= 100_000_000:
             raise ValueError(f"baud must be 1 to 100000000, not {self.baud}")
         _check_placeholders("line", self.line)
         _check_placeholders("reply", self.reply, needed=False)
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        return (Thing("serial port", self.url, "pots open the serial port"),)
+
+    def placed(self, folder: Path) -> Self:
+        """The same with an absolute port, where its own is relative to ``folder``."""
+        return dataclasses.replace(self, url=placed_port(self.url, folder))
+
+    def check(self) -> None:
+        """Find out before anything plays whether pyserial knows such a URL; even that may open files (``spy://``).
+
+        :raises ConfigurationError: it does not.
+        """
+        try:
+            serial.serial_for_url(self.url, do_not_open=True)
+        except OSError:  # what is not there may be there when it is opened
+            pass
+        except Exception as error:  # as PortWire
+            raise ConfigurationError(f"pots: url {self.url}: {error}") from error
 
     def open(self) -> Pots:
         """:raises RigError: the line cannot be opened.
@@ -140,8 +171,20 @@ class SerialPots(_Boxed):
         return _Box(self)
 
 
+class Harmless:
+    """Pots whose description names nothing outside analogrig."""
+
+    things: ClassVar[tuple[Thing, ...]] = ()
+
+    def placed(self, folder: Path) -> Self:  # noqa: ARG002
+        return self
+
+    def check(self) -> None:
+        """There is nothing to find out."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class OperatorPots:
+class OperatorPots(Harmless):
     """Whoever sits at the terminal."""
 
     kind: Literal["operator"]
@@ -152,7 +195,7 @@ class OperatorPots:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoPots:
+class NoPots(Harmless):
     """Nobody: they stand where they stand."""
 
     kind: Literal["none"]

@@ -72,10 +72,14 @@ class RedPitaya(Instrument):
         return found and not (split.path or split.query or split.fragment or split.username or " " in address)
 
     @classmethod
+    def place(cls, address: str) -> str:
+        host, port = _host_and_port(address)
+        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+    @classmethod
     def open(cls, address: str, timeout_s: float) -> RedPitaya:
         """:raises RigError: nobody answers there."""
-        split = urlsplit(f"//{address}")
-        connection = ScpiConnection(str(split.hostname), split.port or PORT, timeout_s)
+        connection = ScpiConnection(*_host_and_port(address), timeout_s)
         try:
             return cls(connection, timeout_s)
         except BaseException:
@@ -228,6 +232,11 @@ class RedPitaya(Instrument):
             raise RecordIncomplete(
                 f"{self.name}: its buffer is not filled: nothing but zeros from sample {start} to {end - 1}"
             )
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    split = urlsplit(f"//{address}")
+    return str(split.hostname), split.port or PORT
 
 
 class _PotBox:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Self
 
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import Datasheet
-from analogrig.hardware.pots import PotsDescription
+from analogrig.hardware.instrument import Datasheet, located
+from analogrig.hardware.pots import Harmless, PotsDescription
 from analogrig.run import MEASURED
+from analogrig.trust import Thing
 from analogrig_emulator import SuspensionComputer
 
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
@@ -90,7 +92,7 @@ class Scaling:
 
 
 @dataclass(frozen=True)
-class InstrumentPots:
+class InstrumentPots(Harmless):
     """The instrument turns the pots itself, at exact instants."""
 
     kind: Literal["instrument"]
@@ -128,6 +130,19 @@ class RealDescription:
         for name, least, most in (("settle_s", 0.0, 10.0), ("timeout_s", 0.01, 3600.0)):
             if not least <= getattr(self, name) <= most:
                 raise ValueError(f"{name} must be {least:g} to {most:g}, not {getattr(self, name):g}")
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Things that playing on it would run or connect to.
+
+        :raises ConfigurationError: the instrument has no such address.
+        """
+        kind, address = located(self.instrument)
+        return (Thing("address", kind.place(address), "the rig connects to"), *self.pots.things)
+
+    def placed(self, folder: Path) -> Self:
+        """The same with absolute paths, where its own are relative to ``folder``."""
+        return dataclasses.replace(self, pots=self.pots.placed(folder))
 
 
 def check_wiring(description: RealDescription, instrument: Datasheet) -> None:

@@ -13,13 +13,14 @@ import struct
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.devices import DeviceDescription, describe, recorded
+from analogrig.devices.devices import DeviceDescription, recorded, trusted
 from analogrig.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -51,6 +52,7 @@ from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.protocol.exchange import Exchange, Packing, RaisedAlarm, Replies, most_answers
 from analogrig.protocol.pace import Pace, check_line
+from analogrig.trust import Trust
 
 _HELLO_AGAIN_S = 0.25
 """A board that resets when its port is opened does not hear the first call."""
@@ -380,31 +382,34 @@ def _answered(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterato
         yield exchange.take(answered, end - n + answered)
 
 
-def open_dut(name: str, *, listener: CanListener | None = None, **changes: Any) -> Dut:
+def open_dut(
+    name: str, *, allow: Trust | Iterable[str] = (), listener: CanListener | None = None, **changes: Any
+) -> Dut:
     """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
 
     On a CAN bus, ``listener`` is told every frame from the opening of the bus on.
 
     ``changes`` are fields of its description that shall be otherwise; None: as described.
 
-    :raises ConfigurationError: there is none, or it is wrong.
+    :param allow: libraries, firmware, ports and buses that a file may name (``analogrig.trust``).
+    :raises ConfigurationError: there is none, or it is wrong, or a file names what is not allowed.
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    return connect(_changed(describe(name), changes), listener)
+    return connect(_changed(trusted(name, Trust.of(allow)), changes), listener)
 
 
-def reopen_dut(description: Mapping[str, Any], *, listener: CanListener | None = None, **changes: Any) -> Dut:
-    """A device as in a record of ``Dut.description()``; errors as ``open_dut``.
-
-    What a file names is not opened on its word alone: a device elsewhere must be named again.
-    """
-    described = recorded(description)
-    if described.elsewhere:
-        raise ConfigurationError(
-            f"the recorded device was {described.elsewhere}, and is not opened on the word of a recording:"
-            f" say --dut {described.elsewhere}, or another"
-        )
+def reopen_dut(
+    description: Mapping[str, Any],
+    file: str,
+    *,
+    allow: Trust | Iterable[str] = (),
+    listener: CanListener | None = None,
+    **changes: Any,
+) -> Dut:
+    """A device as in a record of ``Dut.description()`` that ``file`` holds; parameters and errors as ``open_dut``."""
+    described = recorded(description).placed(Path(file).parent)
+    Trust.of(allow).check(described.things, file)
     return connect(_changed(described, changes), listener)
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
@@ -15,6 +16,7 @@ from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
+from analogrig.trust import Trust
 
 DEFAULT_RIG = "emulator"
 """When neither the user nor the scenario says another."""
@@ -23,33 +25,63 @@ RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
 """The rigs of a laboratory: the file that the variable names, else that of the folder one is in."""
 
 
-def open_rig(name: str, *, self_test: bool = True) -> Rig:
+def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] = ()) -> Rig:
     """The rig of a shipped or own description, of a table ``[rig.NAME]`` of a rigs file, or ``recording:FILE``.
 
     A name stands for a table of the file that ANALOGRIG_RIGS names, of rigs.toml in this folder, or for a shipped rig,
     in this order; FILE.toml for a rig that is described there, and FILE.toml:NAME for one of several.
 
     :param self_test: False: no rig tests itself before it plays, whatever its description says.
-    :raises ConfigurationError: there is none, or its description is wrong.
+    :param allow: addresses, ports and commands that a description may name (``analogrig.trust``).
+    :raises ConfigurationError: there is none, or its description is wrong, or names what is not allowed.
     :raises RecordingError: the recording cannot be read.
     """
+    return _made(name, Trust.of(allow), self_test=self_test)
+
+
+def looked_at(name: str) -> Rig:
+    """As ``open_rig``, for a rig that shall not be played on; whatever a file names is accepted."""
+    return _made(name, None)
+
+
+def _made(name: str, trust: Trust | None, *, self_test: bool = True) -> Rig:
     kind, _, rest = name.partition(":")
     if kind == "recording" and rest:
         return RecordingRig.open(Path(rest))
-    table, where = described(name)
-    if table.get("kind", "emulator") == "real":
-        description = config.build(RealDescription, table, where)
-        try:
-            return RealRig(dataclasses.replace(description, self_test=description.self_test and self_test))
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{where}: {error}") from error
-    emulated = config.build(EmulatorDescription, table, where)
-    with emulator_errors(f"{where}: "):
-        return EmulatorRig(emulated)
+    table, where, file = described(name)
+    if table.get("kind", "emulator") != "real":
+        emulated = config.build(EmulatorDescription, table, where)
+        with emulator_errors(f"{where}: "):
+            return EmulatorRig(emulated)
+    with _names(where):
+        description = config.build(RealDescription, table, where).placed(file.parent)
+        if trust is not None:
+            trust.check(description.things, str(file), where)
+            description.pots.check()
+        return RealRig(dataclasses.replace(description, self_test=description.self_test and self_test))
 
 
-def described(name: str) -> tuple[Mapping[str, Any], str]:
-    """The table that describes the rig ``name``, its name included, and where it is.
+@contextlib.contextmanager
+def _names(where: str) -> Iterator[None]:
+    """Have errors begin with the place."""
+    try:
+        yield
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
+
+
+class Described(NamedTuple):
+    """A rig as a file describes it."""
+
+    table: Mapping[str, Any]
+    """With its name."""
+    where: str
+    """File and table, for errors."""
+    file: Path
+
+
+def described(name: str) -> Described:
+    """The table that describes the rig ``name``, and where it is.
 
     :raises ConfigurationError: there is none.
     """
@@ -66,7 +98,7 @@ def described(name: str) -> tuple[Mapping[str, Any], str]:
             raise ConfigurationError(f"no rig is called {name!r} in {own}, nor is one shipped: there are {there}")
     path = config.locate("rigs", name)
     table = config.read_toml(path)
-    return _one_of(path, table, None) if "rig" in table else ({"name": path.stem, **table}, str(path))
+    return _one_of(path, table, None) if "rig" in table else Described({"name": path.stem, **table}, str(path), path)
 
 
 def own_rigs() -> tuple[str, Mapping[str, Any]]:
@@ -101,11 +133,11 @@ def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
     return rigs
 
 
-def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> tuple[Mapping[str, Any], str]:
+def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> Described:
     rigs = _named(path, table)
     if wanted is None and len(rigs) > 1:
         raise ConfigurationError(f"{path}: holds {len(rigs)} rigs: say {path}:NAME, one of {', '.join(rigs)}")
     name = wanted or next(iter(rigs))
     if name not in rigs:
         raise ConfigurationError(f"{path}: holds no rig {name!r}: there are {', '.join(rigs)}")
-    return {"name": name, **rigs[name]}, f"{path}: rig.{name}"
+    return Described({"name": name, **rigs[name]}, f"{path}: rig.{name}", path)

@@ -14,6 +14,7 @@ from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
 from analogrig.run import CHANNELS, Run
 from analogrig.scenario import Scenario
+from analogrig.trust import FiledName
 
 
 class RecordingRig:
@@ -45,7 +46,8 @@ class RecordingRig:
         """The scenario that was recorded. If the recording ended before its time, so does what is played of it: its run
         is then not valid either."""
         scenario = Scenario.from_table(self.run.conditions.scenario, self._name)
-        return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked)
+        dut = FiledName(scenario.dut, str(self.path))
+        return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked, dut=dut)
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         conditions = self.run.conditions

@@ -6,14 +6,17 @@ from __future__ import annotations
 import dataclasses
 import shlex
 import shutil
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from analogrig import config
-from analogrig.devices.devices import recorded
+from analogrig.devices.devices import describe, recorded
+from analogrig.hardware.wiring import RealDescription
 from analogrig.run import Run
 from analogrig.scenario import Statement
+from analogrig.trust import Thing
 
 SCENARIO_FILE, RIG_FILE, DEVICE_FILE = "scenario.toml", "rig.toml", "dut.toml"
 RUN_FILE, REPORT_FILE = "run.npz", "report.html"
@@ -38,14 +41,15 @@ class Counterexample:
         words = ["analogrig", "run", "--scenario", str(scenario)]
         if self.seed not in (None, self.run.conditions.seed):
             words += ["--seed", str(self.run.conditions.seed)]
-        return shlex.join([*words, "--dut", self._device() or str(scenario.with_name(DEVICE_FILE))])
+        device = self._device()
+        words += ["--dut", device or str(scenario.with_name(DEVICE_FILE))]
+        of_device = () if device else recorded(self.run.conditions.dut).things
+        return shlex.join([*words, *_allowed("--allow", (*of_device, *_rig_things(self.run)))])
 
     def suite_command(self, folder: Path) -> str:
-        """The line that judges it again, as a test; with the device, if it is not opened on the word of a file."""
-        place = recorded(self.run.conditions.dut).elsewhere
-        return shlex.join(
-            ["pytest", str(folder), "--hil-scenario-dir", str(folder), *(("--hil-dut", place) if place else ())]
-        )
+        """The line that judges it again, as a test; it allows what the files name."""
+        things = (*recorded(self.run.conditions.dut).things, *_rig_things(self.run))
+        return shlex.join(["pytest", str(folder), "--hil-scenario-dir", str(folder), *_allowed("--hil-allow", things)])
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
@@ -82,9 +86,10 @@ class Counterexample:
         conditions, device = self.run.conditions, self._device()
         scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
         scenario["seed"] = conditions.seed if self.seed is None else self.seed
-        scenario["dut"] = device or DEVICE_FILE
+        is_name = bool(device) and all(Path(each).is_absolute() for each in _named_paths(device))
+        scenario["dut"] = device if is_name else DEVICE_FILE
         tables = {SCENARIO_FILE: scenario}
-        if not device:
+        if not is_name:
             tables[DEVICE_FILE] = {key: value for key, value in _settings(conditions.dut).items() if key != "name"}
         name = str(conditions.rig["name"])
         if name in config.names("rigs") and _is_rig(name, self.run):
@@ -98,8 +103,27 @@ class Counterexample:
 
     def _device(self) -> str:
         """The name that describes it; empty: it takes a file."""
-        names = (self.dut, str(self.run.conditions.dut["name"]))
+        names = (str(self.dut), str(self.run.conditions.dut["name"]))  # as the command line would read them
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
+
+
+def _named_paths(device: str) -> list[str]:
+    """Paths in the name of a device, as they are written there."""
+    where = device.partition(":")[2].partition("?")[0]
+    return [where] if any(thing.is_path for thing in describe(device).things) else []
+
+
+def _rig_things(run: Run) -> tuple[Thing, ...]:
+    """Things that the rig of a run stated."""
+    table = run.conditions.rig
+    if table.get("kind") != "real":
+        return ()
+    plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
+    return config.build(RealDescription, plain, "the recorded rig").things
+
+
+def _allowed(option: str, things: Iterable[Thing]) -> list[str]:
+    return [word for thing in things for word in (option, thing.shown())]
 
 
 def _take_the_place(new: Path, folder: Path) -> None:
@@ -143,17 +167,15 @@ def _is_scenario(name: str, run: Run) -> bool:
 
 def _is_rig(name: str, run: Run) -> bool:
     from analogrig.errors import AnalogrigError
-    from analogrig.rigs.description import open_rig
+    from analogrig.rigs.description import looked_at
 
     try:
-        with open_rig(name) as opened:
-            return dict(opened.description()) == dict(run.conditions.rig)
+        return dict(looked_at(name).description()) == dict(run.conditions.rig)
     except AnalogrigError:
         return False
 
 
 def _is_device(name: str, run: Run) -> bool:
-    from analogrig.devices.devices import describe
     from analogrig.errors import AnalogrigError
 
     try:

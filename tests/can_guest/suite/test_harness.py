@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import can
 import pytest
@@ -33,7 +34,7 @@ RESTARTED = can.Message(arbitration_id=0x100, is_extended_id=False, is_error_fra
 Listener = Callable[[can.Message], object]
 
 
-def play(dut: str, listener: Listener | None = None, **changes: object) -> Run:
+def play(dut: str, listener: Listener | None = None, **changes: Any) -> Run:
     """A short scenario."""
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=SAMPLES)
     with open_rig("emulator") as rig, open_dut(dut, listener=listener, **changes) as opened:

@@ -107,7 +107,7 @@ def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     devices.check_owner(request.node)
     said = RIG.asked(request)
     with playing.in_one_line(said.by):
-        opened = open_rig(said.value)
+        opened = open_rig(said.value, allow=options.trust_of(request.config))
     with opened:
         _skip_unless_able(request.node, opened, said.value)
         yield opened
@@ -127,7 +127,7 @@ def hil_dut(request: pytest.FixtureRequest) -> Dut:
     devices.check_owner(request.node)
     said = DUT.asked(request)
     with playing.in_one_line(said.by):
-        return request.config.stash[scenarios.DEVICES].lease(said.value)
+        return request.config.stash[scenarios.DEVICES].lease(said.value, options.trust_of(request.config))
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from analogrig.testing.plugin.options import DUT, RIG
 
 if TYPE_CHECKING:
     from analogrig.protocol.dut import Dut
+    from analogrig.trust import Trust
 
 _TOLD = "analogrig_owned"
 """What a worker is told: the folder in which it says which tests need what there is one of."""
@@ -41,15 +42,16 @@ class Devices:
     _open: dict[str, Dut] = field(default_factory=dict)
     _described: dict[str, Any] = field(default_factory=dict)
 
-    def lease(self, name: str) -> Dut:
+    def lease(self, name: str, trust: Trust) -> Dut:
         """A device that is there, reset and configured as described, whatever the test before has done to it.
 
-        :raises AnalogrigError: it cannot be reached.
+        :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
-        from analogrig.devices.devices import describe
+        from analogrig.devices.devices import trusted
         from analogrig.errors import AnalogrigError
         from analogrig.protocol.dut import open_dut
 
+        only_one = trusted(name, trust).only_one
         dut = self._open.pop(name, None)
         if dut is not None:
             try:
@@ -59,8 +61,8 @@ class Devices:
                 dut.close()
                 dut = None
         if dut is None:
-            self._let_go(describe(name).only_one)
-            dut = open_dut(name)
+            self._let_go(only_one)
+            dut = open_dut(name, allow=trust)
             self._described[name] = dut.estimator
         self._open[name] = dut
         return dut

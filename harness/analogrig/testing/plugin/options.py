@@ -6,8 +6,14 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+from analogrig.testing.plugin import trusting
+
+if TYPE_CHECKING:
+    from analogrig.trust import Trust
 
 PROFILES = ("ci", "nightly", "soak")
 
@@ -50,13 +56,13 @@ class Option:
         if on_command_line is not None and not str(on_command_line):
             raise pytest.UsageError(f"{self.flag}: is empty")
         if on_command_line is not None:
-            return Said(str(on_command_line), self.flag)
+            return Said(trusting.from_command_line(config, self.flag, str(on_command_line)), self.flag)
         in_environment = os.environ.get(self.variable)
         return Said(in_environment, self.variable) if in_environment else None
 
     def otherwise(self, config: pytest.Config) -> Said:
         """By the ini file, or nobody."""
-        in_file = str(config.getini(self.ini))
+        in_file = trusting.from_ini(config, str(config.getini(self.ini)), is_name=self in (RIG, DUT))
         return Said(in_file, f"{config.inipath}: {self.ini}") if in_file else Said(self.default, self.flag)
 
     def said(self, config: pytest.Config) -> Said:
@@ -163,9 +169,17 @@ def add(parser: pytest.Parser) -> None:
         told = f"{option.help} (also {option.variable}, ini {option.ini}; default: {option.default or 'none'})"
         group.addoption(option.flag, metavar=option.name.rpartition("_")[2].upper(), help=told)
         parser.addini(option.ini, option.help, default="")
+    trusting.add(group)
 
 
 def check(config: pytest.Config) -> None:
     """:raises pytest.UsageError: an option cannot be what it is."""
+    trusting.check(config)
     for option in OPTIONS:
         option.said(config)
+
+
+def trust_of(config: pytest.Config) -> Trust:
+    """Things that a file may name in this session."""
+    given = DUT.given(config)
+    return trusting.trust_of(config, given.value if given else None)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from analogrig.testing.plugin.devices import Devices, check_owner
-from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, time_limit_s
+from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, time_limit_s, trust_of
 from analogrig.testing.plugin.playing import Player
 
 if TYPE_CHECKING:
@@ -87,10 +87,10 @@ class ScenarioItem(pytest.Item):
 
         check_owner(self)
         scenario = Scenario.load(str(self.path))
-        devices, name = self.config.stash[DEVICES], self._device(scenario)
-        with open_rig(self._rig(scenario)) as rig:
+        devices, name, trust = self.config.stash[DEVICES], self._device(scenario), trust_of(self.config)
+        with open_rig(self._rig(scenario), allow=trust) as rig:
             try:
-                bench = Bench(rig, devices.lease(name), time_limit_s=time_limit_s(self.config))
+                bench = Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config))
                 finding = self._found(Player(self, bench), scenario)
             finally:
                 if name == scenario.dut:
@@ -124,10 +124,8 @@ class ScenarioItem(pytest.Item):
         return given.value if given else scenario.rig or RIG.otherwise(self.config).value
 
     def _device(self, scenario: Scenario) -> str:
-        from analogrig.devices.devices import of_scenario
-
         given = DUT.given(self.config)
-        return of_scenario(scenario.dut, given.value if given else "", DUT.otherwise(self.config).value)
+        return given.value if given else scenario.dut or DUT.otherwise(self.config).value
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         from analogrig.errors import AnalogrigError

@@ -1,0 +1,29 @@
+"""Rigs of a test's own files, with all that these name allowed."""
+
+from __future__ import annotations
+
+from analogrig import config
+from analogrig.errors import ConfigurationError
+from analogrig.hardware.wiring import RealDescription
+from analogrig.rigs.description import described, open_rig
+from analogrig.rigs.rig import Rig
+
+
+def named_by(rig: str) -> tuple[str, ...]:
+    """Names of the things that the file of a rig names; none if it is wrong."""
+    try:
+        table, where, file = described(rig)
+        things = config.build(RealDescription, table, where).placed(file.parent).things
+    except ConfigurationError:
+        return ()
+    return tuple(thing.name for thing in things)
+
+
+def allowing(rig: str) -> list[str]:
+    """The same as words of the command line."""
+    return [word for name in named_by(rig) for word in ("--allow", name)]
+
+
+def open_allowed(rig: str) -> Rig:
+    """As ``open_rig``."""
+    return open_rig(rig, allow=named_by(rig))
