@@ -24,6 +24,7 @@ if "ANALOGRIG_WHEELS" not in os.environ:
 
 __all__ = ["distributions", "environment", "users_environment", "wheel"]  # the fixtures of tests/wheels.py
 
+
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 

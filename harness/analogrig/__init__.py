@@ -1,1 +1,148 @@
-"""The harness: plays a scenario on a rig, through a device, and judges what it says. README.md tells how."""
+"""Hardware in the loop for embedded parameter estimators.
+
+A rig plays a scenario, a device under test answers with alarms and estimates, and the run is judged:
+
+    >>> from analogrig import Bench, Scenario, judge, open_dut, open_rig
+    >>> scenario = Scenario.load("thesis")  # a shipped name or a .toml file
+    >>> with open_rig("emulator") as rig, open_dut("inproc") as dut:
+    ...     run = Bench(rig, dut).play(scenario, seed=3)
+    >>> run.samples, run.theta.shape
+    (1800, (1800, 6))
+    >>> verdict = judge(run)
+    >>> verdict.outcome
+    'passed'
+    >>> all(change.latency_n is not None for change in verdict.tweaks)
+    True
+
+The names in ``__all__`` are the public interface, and so are their documented members. Everything else in the packages
+``analogrig``, ``analogrig_emulator`` and ``analogrig_thesis`` is private: it may move or change in any version.
+
+=============  =========================================================================================
+play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Dut``, ``EstimatorConfig``
+describe       ``Scenario``, ``Excitation``, ``Plant``, ``PlantChoice``, ``Tweak``, ``Expectations``
+judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``TweakVerdict``, ``detectable``, ``write_report``
+test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_seed``, ``strategies``
+errors         ``AnalogrigError`` and its kinds; ``EmulatorError``
+=============  =========================================================================================
+
+``strategies`` (a module) and ``with_some_seed`` need the extra ``analogrig[pytest]``. Importing ``analogrig`` loads
+nothing else: each name loads what it needs on first use.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analogrig.bench import Bench
+    from analogrig.errors import (
+        AnalogrigError,
+        ConfigurationError,
+        DeviceError,
+        LinkError,
+        LinkTimeout,
+        RecordingError,
+        RigError,
+    )
+    from analogrig.judging.information import detectable
+    from analogrig.judging.verdict import TweakVerdict, Verdict, judge
+    from analogrig.plant import Plant
+    from analogrig.protocol.dut import Dut, open_dut
+    from analogrig.protocol.estimator_config import EstimatorConfig
+    from analogrig.reporting.page import write_report
+    from analogrig.rigs.description import open_rig
+    from analogrig.rigs.rig import Rig
+    from analogrig.run import Conditions, Run
+    from analogrig.scenario import Expectations, PlantChoice, Scenario, Tweak
+    from analogrig.testing import strategies
+    from analogrig.testing.experiment import Play
+    from analogrig.testing.played import Played, rate_below
+    from analogrig.testing.properties import with_some_seed
+    from analogrig.testing.statement import Finding
+    from analogrig_emulator.errors import EmulatorError
+    from analogrig_emulator.excitation import Excitation
+
+    __version__: str
+    """Version of the installed package."""
+else:
+    _MODULES = {
+        "analogrig.bench": "Bench",
+        "analogrig.protocol.estimator_config": "EstimatorConfig",
+        "analogrig.errors": (
+            "AnalogrigError ConfigurationError DeviceError LinkError LinkTimeout RecordingError RigError"
+        ),
+        "analogrig.judging.information": "detectable",
+        "analogrig.judging.verdict": "TweakVerdict Verdict judge",
+        "analogrig.plant": "Plant",
+        "analogrig.protocol.dut": "Dut open_dut",
+        "analogrig.reporting.page": "write_report",
+        "analogrig.rigs.description": "open_rig",
+        "analogrig.rigs.rig": "Rig",
+        "analogrig.run": "Conditions Run",
+        "analogrig.scenario": "Expectations PlantChoice Scenario Tweak",
+        "analogrig.testing.experiment": "Play",
+        "analogrig.testing.played": "Played rate_below",
+        "analogrig.testing.properties": "with_some_seed",
+        "analogrig.testing.statement": "Finding",
+        "analogrig_emulator.errors": "EmulatorError",
+        "analogrig_emulator.excitation": "Excitation",
+    }
+
+    def __getattr__(name: str) -> object:
+        """Load a public name on first use."""
+        import importlib
+        import importlib.metadata
+
+        if name == "__version__":
+            found = importlib.metadata.version("analogrig")
+        elif name == "strategies":
+            found = importlib.import_module("analogrig.testing.strategies")
+        else:
+            module = next((module for module, names in _MODULES.items() if name in names.split()), None)
+            if module is None:
+                raise AttributeError(f"module 'analogrig' has no attribute {name!r}; public names: analogrig.__all__")
+            found = getattr(importlib.import_module(module), name)
+        globals()[name] = found
+        return found
+
+    def __dir__() -> list[str]:
+        """List the public names, loaded or not."""
+        return sorted({*globals(), *__all__})
+
+
+__all__ = [
+    "AnalogrigError",
+    "Bench",
+    "Conditions",
+    "ConfigurationError",
+    "DeviceError",
+    "Dut",
+    "EmulatorError",
+    "EstimatorConfig",
+    "Excitation",
+    "Expectations",
+    "Finding",
+    "LinkError",
+    "LinkTimeout",
+    "Plant",
+    "PlantChoice",
+    "Play",
+    "Played",
+    "RecordingError",
+    "Rig",
+    "RigError",
+    "Run",
+    "Scenario",
+    "Tweak",
+    "TweakVerdict",
+    "Verdict",
+    "__version__",
+    "detectable",
+    "judge",
+    "open_dut",
+    "open_rig",
+    "rate_below",
+    "strategies",
+    "with_some_seed",
+    "write_report",
+]

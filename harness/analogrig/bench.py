@@ -119,7 +119,12 @@ def _undisturbed(pace: Pace | None) -> Iterator[None]:
 
 
 class Bench:
-    """Joins a rig and a device; the device is configured and its handshake is done."""
+    """A rig and a device, joined to play scenarios.
+
+    The device is configured and its handshake is done, as ``open_dut`` returns it. ``progress`` is called after each
+    block with the samples done and the samples asked. ``real_time`` stretches the time of the machine to that of the
+    wall clock by this factor; None: lock-step, where no sample is late.
+    """
 
     def __init__(
         self,
@@ -144,7 +149,7 @@ class Bench:
         self._clock = clock
 
     def play(self, scenario: Scenario, seed: int) -> Run:
-        """Play ``scenario`` and collect what the device answers: in lock-step, where nothing is late, or in real time.
+        """Play ``scenario`` and collect the answers of the device, in lock-step or in real time.
 
         In real time the messages of samples that are late are counted, and make the run invalid. What the emulated
         machine does is worked out before.

@@ -74,7 +74,7 @@ class LinkError(AnalogrigError):
 
 
 class LinkTimeout(LinkError):  # noqa: N818 - the word of the field
-    """Nothing came in time."""
+    """No answer came within the time-out."""
 
 
 class LinkClosed(LinkError):  # noqa: N818 - the word of the field

@@ -25,7 +25,10 @@ MOST_PARAMETER = 1e12
 
 @dataclass(frozen=True)
 class Plant:
-    """M x'' + B x' + K x = F (thesis Equ 2.3)."""
+    """Mass in kg, damping in N s/m and stiffness in N/m of M x'' + B x' + K x = F (thesis Equ 2.3).
+
+    ValueError: a parameter is not positive, or 1e12 or more.
+    """
 
     mass_kg: float
     damping_n_s_per_m: float

@@ -144,7 +144,10 @@ class Segment:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What was true when the run was made; the header of the file."""
+    """Conditions of a run: seed, sample times, the true plant, and the descriptions of scenario, rig, device and link.
+
+    They are the header of the file. Instants are sample indices, times are in seconds.
+    """
 
     seed: int
     samples_asked: int
@@ -187,7 +190,10 @@ class Conditions:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Codes, estimates and alarms of one play. n samples, p parameters; n may be less than ``samples_asked``."""
+    """Codes, estimates and alarms of one play: n samples, p parameters; n may be less than ``samples_asked``.
+
+    ``save`` and ``load`` keep a run in one file and raise RecordingError. A verdict needs nothing else (``judge``).
+    """
 
     conditions: Conditions
     codes: NDArray[np.uint16]

@@ -42,7 +42,10 @@ MISSING = "clipped and missing for the device"
 
 @dataclass(frozen=True)
 class PlantChoice:
-    """The program on the computer and where its pots stand at the start."""
+    """Program on the computer and initial settings of its pots: mass in kg, damping in N s/m, stiffness in N/m.
+
+    None: the value of the program. ValueError: a value is not positive.
+    """
 
     set: Literal["front", "shock", "bump-stop", "two-mass"] = "front"
     mass_kg: float | None = None
@@ -62,9 +65,10 @@ class PlantChoice:
 
 @dataclass(frozen=True)
 class Tweak:
-    """Pots that jump at the instant of one sample; the next sample is the first that can tell.
+    """Change of pots at the instant of a sample: mass in kg, damping in N s/m, stiffness in N/m; None: unchanged.
 
-    With ramp_n they turn evenly from that instant on, and arrive ramp_n samples later.
+    The next sample is the first that shows it. With ``ramp_n`` the pots turn evenly from that instant on, and arrive
+    ``ramp_n`` samples later. ValueError: nothing changes, or a value is out of range.
     """
 
     sample: int
@@ -89,7 +93,7 @@ class Tweak:
 
 @dataclass(frozen=True)
 class Expectations:
-    """What a scenario asks of the device; its ``[expect]`` table."""
+    """Requirements of a scenario on the device; its ``[expect]`` table. ValueError: a value is out of range."""
 
     missed: int = 0
     """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
@@ -142,7 +146,11 @@ class Statement:
 
 @dataclass(frozen=True)
 class Scenario:
-    """``fixtures/scenarios/*.toml``, or a user's own file."""
+    """Excitation, plant and changes of one play, in samples, and the expectations of the device.
+
+    ``load`` reads a shipped scenario by name or a .toml file, and raises ConfigurationError. ValueError: a value is out
+    of range.
+    """
 
     samples: int
     excitation: Excitation

@@ -103,17 +103,17 @@ def test_play_of_a_scenario_is_a_test_and_junit_knows_its_figures(user: pytest.P
 LEVELS = {
     "default": ("emulator", "host", "None", "build/runs", "ci"),
     "ini": ("emulator-ideal", "inproc", "of_ini", "runs/ini", "soak"),
-    "environment": ("emulator-0-10v", "any-edges", "of_environment", "runs/environment", "nightly"),
+    "environment": ("emulator-0-10v", "any-edges", "of_ini", "runs/environment", "nightly"),
     "command line": ("emulator-skewed", "inproc?exchange=block", "of_command_line", "runs/command_line", "ci"),
     "indirect": ("emulator-real", "mean-between-faults", "of_indirect", "runs/indirect", "soak"),
 }
-VARIABLES = (
-    "ANALOGRIG_RIG",
-    "ANALOGRIG_DUT",
-    "ANALOGRIG_SCENARIO_DIR",
-    "ANALOGRIG_RUNS_DIR",
-    "ANALOGRIG_HIL_PROFILE",
-)
+VARIABLES = {
+    "hil_rig": "ANALOGRIG_RIG",
+    "hil_dut": "ANALOGRIG_DUT",
+    "hil_scenario_dir": "ANALOGRIG_SCENARIO_DIR",  # none: a shell collects nothing in any repository
+    "hil_runs_dir": "ANALOGRIG_RUNS_DIR",
+    "hil_profile": "ANALOGRIG_HIL_PROFILE",
+}
 NAMES = ("hil_rig", "hil_dut", "hil_scenario_dir", "hil_runs_dir", "hil_profile")
 TELLS_ALL = """
 import pytest
@@ -133,14 +133,14 @@ def test_each_option_is_taken_from_parameter_then_command_line_then_environment_
         (line,) = [line for line in run(user, "-s", path.name, *arguments).outlines if "<" in line]
         told[level] = tuple(line.partition("< ")[2].removesuffix(" >").split())
 
-    for _, _, folder, *_ in LEVELS.values():
+    for folder in {level[2] for level in LEVELS.values()}:
         user.mkdir(folder)
     tell("default")
     options = [f"{name} = {value}" for name, value in zip(NAMES, LEVELS["ini"], strict=True)]
     user.makeini("\n".join(["[pytest]", *options]))
     tell("ini")
-    for variable, value in zip(VARIABLES, LEVELS["environment"], strict=True):
-        monkeypatch.setenv(variable, value)
+    for name, value in zip(NAMES, LEVELS["environment"], strict=True):
+        monkeypatch.setenv(VARIABLES[name], value if name != "hil_scenario_dir" else "of_indirect")
     tell("environment")
     given = [f"--{name.replace('_', '-')}={value}" for name, value in zip(NAMES, LEVELS["command line"], strict=True)]
     tell("command line", *given)
@@ -153,7 +153,7 @@ def test_each_option_is_taken_from_parameter_then_command_line_then_environment_
     assert told == LEVELS
 
 
-@pytest.mark.parametrize(
+WRONG = pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
         ("hil_profile", "tea", "must be one of ci, nightly, soak, not 'tea'"),
@@ -161,22 +161,36 @@ def test_each_option_is_taken_from_parameter_then_command_line_then_environment_
         ("hil_runs_dir", "short.toml/runs", "short.toml is no folder"),
     ],
 )
-def test_value_that_cannot_be_is_told_in_one_line_with_who_said_it(
+
+
+@WRONG
+def test_wrong_value_on_the_command_line_ends_the_session_in_one_line(
+    user: pytest.Pytester, name: str, value: str, complaint: str
+) -> None:
+    flag = f"--{name.replace('_', '-')}"
+    refused(user, f"{flag}={value}").stderr.fnmatch_lines([f"ERROR: {flag}: {complaint}"])
+    refused(user, f"{flag}=").stderr.fnmatch_lines([f"ERROR: {flag}: is empty"])
+
+
+@WRONG
+def test_wrong_value_elsewhere_fails_the_tests_that_ask_for_it_in_one_line_with_its_source(
     user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, name: str, value: str, complaint: str
 ) -> None:
-    path = user.makepyfile(
+    path = user.makepyfile(f"def test_of_ours({name}):\n    pass\n\ndef test_of_theirs():\n    pass\n")
+    user.makeini(f"[pytest]\n{name} = {value}")
+    result = run(user, path.name)
+    result.assert_outcomes(errors=1, passed=1)
+    result.stdout.fnmatch_lines([f"*tox.ini: {name}: {complaint}"])
+    if name != "hil_scenario_dir":
+        monkeypatch.setenv(VARIABLES[name], value)
+        result = run(user, path.name)
+        result.assert_outcomes(errors=1, passed=1)
+        result.stdout.fnmatch_lines([f"{VARIABLES[name]}: {complaint}"])
+    path.write_text(
         "import pytest\n\n"
         f"@pytest.mark.parametrize({name!r}, [{value!r}], indirect=True)\ndef test_it({name}):\n    pass\n"
     )
-    result = user.runpytest_inprocess("-p", "no:cacheprovider", path.name)
-    result.stdout.fnmatch_lines([f"parameter {name} of *::test_it*: {complaint}"])
-    user.makeini(f"[pytest]\n{name} = {value}")
-    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: *tox.ini: {name}: {complaint}"])
-    variable = VARIABLES[NAMES.index(name)]
-    monkeypatch.setenv(variable, value)
-    refused(user, path.name).stderr.fnmatch_lines([f"ERROR: {variable}: {complaint}"])
-    flag = f"--{name.replace('_', '-')}"
-    refused(user, path.name, f"{flag}={value}").stderr.fnmatch_lines([f"ERROR: {flag}: {complaint}"])
+    run(user, path.name).stdout.fnmatch_lines([f"parameter {name} of *::test_it*: {complaint}"])
 
 
 def test_rig_or_device_that_does_not_exist_fails_in_one_line_with_who_named_it(

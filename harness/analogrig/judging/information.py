@@ -107,10 +107,14 @@ class _Motion:
 
 
 def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096) -> bool:
-    """Whether every change of a scenario can be seen before the next: I(n) reaches ln ARL0 there.
+    """True if every change of a scenario is detectable before the next one: its information I(n) reaches ln ARL0.
 
-    Told beforehand, from plant and excitation as the scenario has them (its own phase, though one be drawn), for a
-    displacement channel with that noise (rms) and resolution; a run's bounds come from the force that was measured.
+    A prediction from the plant and the excitation of the scenario, with its own phase even if the seed draws one. The
+    bounds of a run come from the measured force.
+
+    :param arl0: average run length between false alarms, in samples.
+    :param noise_lsb: noise of the displacement channel, rms in LSB.
+    :param lsb_v: resolution of the displacement channel, in volts.
     """
     return all(bound is not None for bound in predicted_bounds(scenario, arl0, noise_lsb=noise_lsb, lsb_v=lsb_v))
 

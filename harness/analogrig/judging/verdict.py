@@ -64,7 +64,7 @@ class DiagnosisVerdict:
 
 @dataclass(frozen=True)
 class TweakVerdict:
-    """One change of the plant and how it was noticed. Latencies are samples from the change to the alarm."""
+    """Verdict on one change of the plant. Latencies and bounds are in samples, from the change to the alarm."""
 
     sample: int
     what: str
@@ -147,6 +147,11 @@ class SegmentEstimate:
 
 @dataclass(frozen=True)
 class Verdict:
+    """Verdict on a run: ``passed``, ``failed`` or ``inconclusive``, with the reasons and the figures behind it.
+
+    Instants are sample indices. An inconclusive verdict is never a passed one.
+    """
+
     outcome: Outcome
     reasons: tuple[str, ...]
     """Why it is not ``passed``; empty if it is."""
@@ -181,7 +186,10 @@ def missing_text(run: Run) -> str:
 
 
 def judge(run: Run) -> Verdict:
-    """Judge ``run`` by the expectations of the scenario it carries."""
+    """Verdict on ``run`` by the expectations of its scenario. The same run gives the same verdict.
+
+    :raises ConfigurationError: the recorded scenario has an expectation that is wrong.
+    """
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
     trigger = run.conditions.dut["estimator"]
     level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)

@@ -79,7 +79,11 @@ Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
 
 
 class Dut:
-    """A device behind a link. Every error names the device, what was expected and what came instead."""
+    """Device under test behind a link: configured by ``configure``, fed by ``Bench.play``, a context manager.
+
+    Methods raise LinkError if the link fails or the device does not answer in time, and DeviceError for a wrong answer.
+    Every message names the device, the expected answer and the actual one.
+    """
 
     def __init__(self, link: Link, description: DeviceDescription) -> None:
         """Take over ``link``; nothing is sent yet."""
@@ -385,14 +389,14 @@ def _answered(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterato
 def open_dut(
     name: str, *, allow: Trust | Iterable[str] = (), listener: CanListener | None = None, **changes: Any
 ) -> Dut:
-    """The device that ``name`` means (see ``devices.describe``); connected, configured, ready to start.
+    """Open a device by name: connected, configured and ready to start. Use it in a ``with`` statement.
 
-    On a CAN bus, ``listener`` is told every frame from the opening of the bus on.
-
-    ``changes`` are fields of its description that shall be otherwise; None: as described.
-
+    :param name: ``host``, ``inproc[:LIBRARY]``, ``qemu-m4[:ELF]``, ``serial:URL``, ``can:INTERFACE/CHANNEL``, a shipped
+        name or a .toml file; ``?key=value`` appended to a name overrides fields of the description.
     :param allow: libraries, firmware, ports and buses that a file may name (``analogrig.trust``).
-    :raises ConfigurationError: there is none, or it is wrong, or a file names what is not allowed.
+    :param listener: receives every frame of a CAN bus from its opening on.
+    :param changes: override fields of the description; None leaves a field as described.
+    :raises ConfigurationError: no such device, its description is wrong, or a file names what is not allowed.
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """

@@ -79,9 +79,9 @@ _NOT_WHOLE = frozenset(
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """What is fixed before a run; the defaults are those of est_config_default().
+    """Configuration of the estimator, fixed before a run; the defaults are those of est_config_default().
 
-    P is in units of the noise variance. The device itself has the last word on what is in range.
+    P is in units of the noise variance. The device rejects values out of its range (DeviceRefused, a DeviceError).
     """
 
     na: int = 2

@@ -23,7 +23,9 @@ SCRIPTS = (FOLDER / "uPlot.iife.min.js", FOLDER / "plots.js")
 
 
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
-    """Write the page: either all of it or nothing. The same run gives the same bytes.
+    """Write a run and its verdict as one HTML page without remote resources; the file appears whole or not at all.
+
+    The same run gives the same bytes.
 
     :raises RecordingError: the page cannot be written, or the build has not put uPlot in its place.
     """

@@ -26,14 +26,15 @@ RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
 
 
 def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] = ()) -> Rig:
-    """The rig of a shipped or own description, of a table ``[rig.NAME]`` of a rigs file, or ``recording:FILE``.
+    """Open a rig by name. Use it in a ``with`` statement: leaving it switches outputs off and closes connections.
 
-    A name stands for a table of the file that ANALOGRIG_RIGS names, of rigs.toml in this folder, or for a shipped rig,
-    in this order; FILE.toml for a rig that is described there, and FILE.toml:NAME for one of several.
+    ``recording:FILE`` replays a recording. A name stands for a table ``[rig.NAME]`` of the file that ANALOGRIG_RIGS
+    names, of rigs.toml in this folder, or for a shipped rig, in this order. FILE.toml stands for the rig described
+    there, FILE.toml:NAME for one of several.
 
-    :param self_test: False: no rig tests itself before it plays, whatever its description says.
+    :param self_test: False: skip the self-test that the description of a real rig may ask for.
     :param allow: addresses, ports and commands that a description may name (``analogrig.trust``).
-    :raises ConfigurationError: there is none, or its description is wrong, or names what is not allowed.
+    :raises ConfigurationError: no such rig, its description is wrong, or it names what is not allowed.
     :raises RecordingError: the recording cannot be read.
     """
     return _made(name, Trust.of(allow), self_test=self_test)

@@ -68,7 +68,11 @@ class Performance:
 
 
 class Rig(Protocol):
-    """Something that can play a scenario."""
+    """Instrument that plays scenarios and yields blocks of samples; a context manager.
+
+    ``open_rig`` returns one, ``Bench.play`` uses it. Methods raise RigError if the instrument fails, ConfigurationError
+    if it cannot play a scenario.
+    """
 
     capabilities: frozenset[str]
     """What it can do beyond sampling, of ``analogrig.rigs.CAPABILITIES``."""

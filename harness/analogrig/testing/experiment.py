@@ -26,7 +26,7 @@ Arguments = ParamSpec("Arguments")
 
 
 class Play(Protocol):
-    """The fixture ``hil_play``."""
+    """Callable of the fixture ``hil_play``: play a scenario on the rig and device of the session, return a Played."""
 
     @property
     def bench(self) -> Bench: ...

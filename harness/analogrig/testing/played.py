@@ -57,8 +57,11 @@ def _to_nobody(_: Finding) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Played:
-    """One play of a scenario, and its verdict. Of a play that is not valid nothing holds; the fixture ``hil_play``
-    hands one on only if it is asked to."""
+    """One play of a scenario, its verdict, and statements about it, each of which returns a Finding.
+
+    No statement holds for a play that is INCONCLUSIVE. ``hil_play`` fails the test instead of returning such a play,
+    unless called with ``allow_inconclusive=True``. ValueError: a limit of a statement is not finite.
+    """
 
     run: Run
     repeat: str = ""
@@ -184,10 +187,12 @@ def _too_late(tweak: TweakVerdict, within: float | None) -> str:
 
 
 def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
-    """The false alarms of these plays show a rate per sample below ``rate``; their number was fixed beforehand.
+    """Finding: with ``confidence`` (0 to 1) the false-alarm rate is below ``rate`` alarms per sample.
 
-    It does not hold if one of them is not valid. A play counts once, with the samples in which its trigger was armed
-    (``analogrig.judging.exposure``).
+    The number of plays must be fixed beforehand. The finding does not hold if one of them is not valid. A play counts
+    once, with the samples in which its trigger was armed (``analogrig.judging.exposure``).
+
+    :raises ValueError: ``rate`` or ``confidence`` is out of range.
     """
     plays = list({_samples_of(each.run): each for each in played}.values())
     finding = _rate_below(rate, plays, confidence)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Finding:
-    """Whether something holds, and why or why not. Its truth is that of the statement."""
+    """Result of a statement about plays: true or false in an ``if`` or ``assert``, and the reason in ``why``."""
 
     holds: bool
     why: str

@@ -1,5 +1,4 @@
-"""What a property can be tried on, as strategies of hypothesis: plants, changes, excitations, noise, cards, machines,
-faults of the line, and scenarios of all that.
+"""Strategies for hypothesis: plants, changes, excitations, noise, cards, computers, link faults, and whole scenarios.
 
 Each of them shrinks towards the usual: the front suspension with its own parameters, one jump of the stiffness, the
 square wave of the thesis, the ideal card. What is left of a scenario that fails is what matters. ``detectable`` of
@@ -12,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,6 +21,7 @@ from hypothesis import strategies as st
 from analogrig.plant import PARAMETERS, Plant
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.scenario import PLANTS, Expectations, PlantChoice, Scenario, Tweak
+from analogrig.testing import profiles
 from analogrig_emulator.excitation import Excitation
 from analogrig_emulator.suspension import PROGRAMS
 
@@ -49,9 +48,7 @@ QUIET_N = 1000
 MOST_DISPLACEMENT_V = 8.0
 """That a scenario may come to, at the most."""
 
-_EXAMPLES = {"ci": 15, "nightly": 300, "soak": 5000}
-
-for _name, _examples in _EXAMPLES.items():
+for _name, _examples in profiles.EXAMPLES.items():
     settings.register_profile(
         f"analogrig-{_name}",
         max_examples=_examples,
@@ -65,8 +62,12 @@ for _name, _examples in _EXAMPLES.items():
 
 
 def profile(name: str = "") -> settings:
-    """How much a property tries: ``ci`` (the same each time), ``nightly``, ``soak``; else that of --hil-profile."""
-    return settings.get_profile(f"analogrig-{name or os.environ.get('ANALOGRIG_HIL_PROFILE', 'ci')}")
+    """Settings of hypothesis for a property: 15 examples (``ci``, derandomised), 300 (``nightly``) or 5000 (``soak``).
+
+    :param name: one of these profiles; empty: that of --hil-profile, in a session without the plugin that of the
+        environment variable ANALOGRIG_HIL_PROFILE, else ``ci``.
+    """
+    return settings.get_profile(f"analogrig-{name or profiles.current()}")
 
 
 def _usually(usual: Any, others: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:

@@ -1,22 +1,26 @@
-"""The plugin for pytest: rigs, devices and plays as fixtures, scenario files as tests, and a file for what fails.
+"""The plugin for pytest: rigs, devices and plays as fixtures, scenario files as tests, counterexamples of failed tests.
 
-Loaded by every pytest in whose environment analogrig is installed, so nothing heavy is imported before a test asks.
-An option is taken from, in this order: indirect parametrization of its fixture, the command line, the environment
-(ANALOGRIG_RIG, ...), the ini file (hil_rig, ...), its default.
+Every pytest in whose environment analogrig is installed loads it. A session that uses none of its fixtures and options
+is therefore left as it is: every name carries the prefix ``hil``, nothing heavy is imported, no file is written or
+collected, the environment is not changed, and no setting of ours ends the session.
+
+The value of an option comes from, in this order: indirect parametrization of its fixture, the command line, the
+environment (ANALOGRIG_RIG, ...), the ini file (hil_rig, ...), its default.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Generator, Iterator
+import functools
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from analogrig.rigs import CAPABILITIES
+from analogrig.testing import profiles
 from analogrig.testing.plugin import devices, options, playing, scenarios
-from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
+from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, Option, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
@@ -31,17 +35,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     options.add(parser)
 
 
-_PROFILE_BEFORE = pytest.StashKey[str | None]()
+_PROFILE = pytest.StashKey[Callable[[], str]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
-    options.check(config)
-    profile = HIL_PROFILE.said(config).value
-    config.stash[_PROFILE_BEFORE] = os.environ.get(HIL_PROFILE.variable)
-    os.environ[HIL_PROFILE.variable] = profile  # analogrig.testing.strategies reads it where a test is defined
+    options.check_command_line(config)
+    profile: Callable[[], str] = functools.partial(_value_while_collecting, HIL_PROFILE, config)
+    config.stash[_PROFILE] = profile
+    profiles.begin_session(profile)
     config.stash[scenarios.DEVICES] = devices.Devices()
     devices.keep_with_owner(config)
     scenarios.add_folder(config)
@@ -50,19 +54,25 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     if (opened := config.stash.get(scenarios.DEVICES, None)) is not None:
         opened.close()
-    before = config.stash.get(_PROFILE_BEFORE, None)
-    if before is None:
-        os.environ.pop(HIL_PROFILE.variable, None)
-    else:
-        os.environ[HIL_PROFILE.variable] = before
+    if (profile := config.stash.get(_PROFILE, None)) is not None:
+        profiles.end_session(profile)
+
+
+def _value_while_collecting(option: Option, config: pytest.Config) -> str:
+    """:raises pytest.Collector.CollectError: the value is wrong; the test file that asks is not collected."""
+    said = option.said(config)
+    if complaint := option.complaint(said.value):
+        raise pytest.Collector.CollectError(f"{said.by}: {complaint}")
+    return said.value
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     return scenarios.collected(file_path, parent)
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
     _check_needs(items)
+    scenarios.add_complaint(session, items)
     devices.tell_owned(config, items)
 
 
@@ -160,9 +170,9 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    if call.when == "call":
+    if call.when == "call" and playing.has_played(item):
         item.user_properties.extend(playing.properties(item))
     report = yield
-    if report.when == "call" and report.failed and (left := playing.left_by(item)):
+    if report.when == "call" and report.failed and playing.has_played(item) and (left := playing.left_by(item)):
         report.sections.append(("analogrig", left))
     return report

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import pytest
 
-from analogrig.testing.plugin.options import DUT, RIG
+from analogrig.testing.plugin.options import DUT, RIG, Source
 
 if TYPE_CHECKING:
     from analogrig.protocol.dut import Dut
@@ -29,9 +29,9 @@ _SPREADING = ("load", "worksteal")
 
 @runtime_checkable
 class Equipped(Protocol):
-    """A test that says itself on what it plays."""
+    """An item that names its own rig and device; other plugins' items have no such method."""
 
-    def equipment(self) -> tuple[str, str]:
+    def hil_equipment(self) -> tuple[str, str]:
         """The names of rig and device; empty: unknown."""
 
 
@@ -120,18 +120,24 @@ def _owned(folder: Path) -> frozenset[str]:
 
 
 def keep_with_owner(config: pytest.Config) -> None:
-    """If the rig or the device of the options is one of which there is only one, and pytest-xdist has many workers.
+    """Have one worker of pytest-xdist run all tests of the session's rig and device, if there is only one of either.
 
-    :raises pytest.UsageError: tests are to be distributed in a way that does not go with that.
+    A name in the environment does not change how a session distributes its tests; see ``check_owner``.
+
+    :raises pytest.UsageError: the command line names such a rig or device, and a --dist that does not go with it.
     """
     dist, workers = config.getoption("dist", "no"), config.getoption("tx", None) or []
     if dist == "no" or len(workers) < 2:
         return
-    rig, dut = (option.given(config) or option.otherwise(config) for option in (RIG, DUT))
-    single = _single(rig.value if rig.value != RIG.default else "", dut.value if dut.value != DUT.default else "")
-    if single and dist not in _SPREADING:
-        raise pytest.UsageError(f"{single}, and --dist {dist} may not: say --dist load, or leave out -n")
-    if single:
+    said = [option.said(config) for option in (RIG, DUT)]
+
+    def single(*sources: Source) -> str:
+        return _single(*(each.value if each.source in sources else "" for each in said))
+
+    if dist not in _SPREADING:
+        if refused := single("command line"):
+            raise pytest.UsageError(f"{refused}, and --dist {dist} may not: use --dist load, or leave out -n")
+    elif single("command line", "ini file"):
         config.pluginmanager.register(OneOwner(Path(tempfile.mkdtemp(prefix="analogrig-"))))
 
 
@@ -148,16 +154,19 @@ def tell_owned(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
 
 
 def check_owner(item: pytest.Item) -> None:
-    """Fails a test that needs what another worker may have."""
+    """Fail a test whose rig or device another worker may have."""
     told = getattr(item.config, "workerinput", {})
     if told.get("workercount", 1) > 1 and _TOLD not in told and (single := single_of(item)):
-        pytest.fail(f"{single}: leave out -n, or name it for all tests (--hil-rig, --hil-dut)", pytrace=False)
+        pytest.fail(
+            f"{single}: leave out -n, or use --dist load and name it for all tests with --hil-rig or --hil-dut",
+            pytrace=False,
+        )
 
 
 def single_of(item: pytest.Item) -> str:
     """What a test needs of which there is one, and that one worker owns it; empty: nothing."""
     if isinstance(item, Equipped):
-        return _single(*item.equipment())
+        return _single(*item.hil_equipment())
     wanted = getattr(item, "fixturenames", ())
     rig, dut = (option.of(item) if option.name in wanted else "" for option in (RIG, DUT))
     return _single(rig, dut)
@@ -165,6 +174,8 @@ def single_of(item: pytest.Item) -> str:
 
 def _single(rig: str, dut: str) -> str:
     """Which of a rig and a device there is only one of; whether they exist at all will be found out by who asks."""
+    if not rig and not dut:
+        return ""
     from analogrig.devices.devices import describe
     from analogrig.errors import AnalogrigError
     from analogrig.rigs.description import described

@@ -1,4 +1,9 @@
-"""The options of the plugin, each under one name everywhere, and where a value of one came from."""
+"""The options of the plugin, and the source of each value.
+
+Every option has the name of its fixture, on the command line (``--hil-rig``) and in the ini file (``hil_rig``) too.
+Only a wrong value on the command line ends a session. The environment and the ini file may serve other programs, or
+other tests, than those that run: a wrong value there fails the tests that use it.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +11,29 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import pytest
 
+from analogrig.testing import profiles
 from analogrig.testing.plugin import trusting
 
 if TYPE_CHECKING:
     from analogrig.trust import Trust
 
-PROFILES = ("ci", "nightly", "soak")
+Source = Literal["parameter", "command line", "environment", "ini file", "default"]
 
 
 @dataclass(frozen=True)
 class Said:
-    """The value of an option, and who said it: the start of every complaint about it."""
+    """The value of an option, and its source: the start of every complaint about it."""
 
     value: str
     by: str
+    source: Source
 
 
-def _anything(_: str) -> str:
+def _accept(_: str) -> str:
     return ""
 
 
@@ -36,11 +43,11 @@ class Option:
 
     name: str
     variable: str
-    """Environment variable; the command line ``analogrig`` reads those of rig and device too."""
+    """Environment variable, empty for none; the command ``analogrig`` reads those of rig and device too."""
     default: str
     help: str
-    complaint: Callable[[str], str] = _anything
-    """What is wrong with a value; empty: nothing that can be told beforehand."""
+    complaint: Callable[[str], str] = _accept
+    """Return why a value is wrong; empty if nothing is known against it."""
 
     @property
     def ini(self) -> str:
@@ -51,50 +58,60 @@ class Option:
         return f"--{self.name.replace('_', '-')}"
 
     def given(self, config: pytest.Config) -> Said | None:
-        """By the command line, or the environment."""
-        on_command_line = config.getoption(self.flag)
-        if on_command_line is not None and not str(on_command_line):
-            raise pytest.UsageError(f"{self.flag}: is empty")
-        if on_command_line is not None:
-            return Said(trusting.from_command_line(config, self.flag, str(on_command_line)), self.flag)
-        in_environment = os.environ.get(self.variable)
-        return Said(in_environment, self.variable) if in_environment else None
+        """The value on the command line or in the environment; None without one."""
+        return self._on_command_line(config) or self._in_environment()
 
     def otherwise(self, config: pytest.Config) -> Said:
-        """By the ini file, or nobody."""
+        """The value in the ini file, else the default."""
         in_file = trusting.from_ini(config, str(config.getini(self.ini)), is_name=self in (RIG, DUT))
-        return Said(in_file, f"{config.inipath}: {self.ini}") if in_file else Said(self.default, self.flag)
+        if in_file:
+            return Said(in_file, f"{config.inipath}: {self.ini}", "ini file")
+        return Said(self.default, self.flag, "default")
 
     def said(self, config: pytest.Config) -> Said:
-        """Checked.
+        """The value for the session, unchecked."""
+        return self.given(config) or self.otherwise(config)
 
-        :raises pytest.UsageError: it cannot be that.
-        """
-        said = self.given(config) or self.otherwise(config)
-        if complaint := self.complaint(said.value):
+    def check_command_line(self, config: pytest.Config) -> None:
+        """:raises pytest.UsageError: the value on the command line is empty or wrong."""
+        said = self._on_command_line(config)
+        if said is None:
+            return
+        complaint = self.complaint(said.value) if said.value else "is empty"
+        if complaint:
             raise pytest.UsageError(f"{said.by}: {complaint}")
-        return said
 
     def asked(self, request: pytest.FixtureRequest) -> Said:
-        """As ``said``, for a fixture, whose parameter comes first. What is wrong with that fails the test."""
+        """The value for a fixture: its indirect parameter, else that of the session. A wrong value fails the test."""
         parameter = getattr(request, "param", None)
         if parameter is None:
-            return self.said(request.config)
-        said = Said(str(parameter), f"parameter {self.name} of {request.node.nodeid}")
+            said = self.said(request.config)
+        else:
+            said = Said(str(parameter), f"parameter {self.name} of {request.node.nodeid}", "parameter")
         complaint = self.complaint(said.value)
-        if not isinstance(parameter, str | os.PathLike):
+        if parameter is not None and not isinstance(parameter, str | os.PathLike):
             complaint = f"must be a text or a path, not {parameter!r}"
         if complaint:
             pytest.fail(f"{said.by}: {complaint}", pytrace=False)
         return said
 
     def of(self, item: pytest.Item) -> str:
-        """As ``asked``, before or beside the fixture, and unchecked."""
+        """The value for an item, unchecked: its indirect parameter, else that of the session."""
         callspec = getattr(item, "callspec", None)
         parameter = callspec.params.get(self.name) if callspec is not None else None
         if isinstance(parameter, str | os.PathLike):
             return str(parameter)
-        return (self.given(item.config) or self.otherwise(item.config)).value
+        return self.said(item.config).value
+
+    def _on_command_line(self, config: pytest.Config) -> Said | None:
+        value = config.getoption(self.flag)
+        if value is None:
+            return None
+        return Said(trusting.from_command_line(config, self.flag, str(value)), self.flag, "command line")
+
+    def _in_environment(self) -> Said | None:
+        value = os.environ.get(self.variable) if self.variable else None
+        return Said(value, self.variable, "environment") if value else None
 
 
 def _no_folder(value: str) -> str:
@@ -108,7 +125,7 @@ def _not_to_be_a_folder(value: str) -> str:
 
 
 def _no_profile(value: str) -> str:
-    return "" if value in PROFILES else f"must be one of {', '.join(PROFILES)}, not {value!r}"
+    return "" if value in profiles.EXAMPLES else f"must be one of {', '.join(profiles.EXAMPLES)}, not {value!r}"
 
 
 def _seconds(value: str) -> float | None:
@@ -124,27 +141,23 @@ def _no_seconds(value: str) -> str:
     return f"must be seconds from 0.001 to 1e9, not {value!r}" if value and _seconds(value) is None else ""
 
 
-RIG = Option(
-    "hil_rig", "ANALOGRIG_RIG", "emulator", "what plays the scenarios: a shipped name, a .toml file, recording:FILE"
-)
+RIG = Option("hil_rig", "ANALOGRIG_RIG", "emulator", "rig: a shipped name, a .toml file, recording:FILE")
 DUT = Option(
     "hil_dut",
     "ANALOGRIG_DUT",
     "host",
-    "the device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml",
+    "device under test: host, inproc[:LIBRARY], qemu-m4[:ELF], serial:URL, can:..., a .toml file",
 )
-SCENARIO_DIR = Option(
-    "hil_scenario_dir", "ANALOGRIG_SCENARIO_DIR", "", "a folder of scenario files, each of which is a test", _no_folder
-)
+SCENARIO_DIR = Option("hil_scenario_dir", "", "", "folder of scenario files; each of them is a test", _no_folder)
 RUNS_DIR = Option(
-    "hil_runs_dir",
-    "ANALOGRIG_RUNS_DIR",
-    "build/runs",
-    "where the recordings of tests that fail go",
-    _not_to_be_a_folder,
+    "hil_runs_dir", "ANALOGRIG_RUNS_DIR", "build/runs", "folder for recordings of failed tests", _not_to_be_a_folder
 )
 HIL_PROFILE = Option(
-    "hil_profile", "ANALOGRIG_HIL_PROFILE", "ci", f"how much the properties try: {', '.join(PROFILES)}", _no_profile
+    "hil_profile",
+    profiles.VARIABLE,
+    profiles.DEFAULT,
+    f"number of examples per property: {', '.join(f'{name} ({n})' for name, n in profiles.EXAMPLES.items())}",
+    _no_profile,
 )
 
 TIME_LIMIT = Option(
@@ -166,17 +179,18 @@ def time_limit_s(config: pytest.Config) -> float | None:
 def add(parser: pytest.Parser) -> None:
     group = parser.getgroup("analogrig", "hardware in the loop (analogrig)")
     for option in OPTIONS:
-        told = f"{option.help} (also {option.variable}, ini {option.ini}; default: {option.default or 'none'})"
+        also = f"also {option.variable}, ini {option.ini}" if option.variable else f"also ini {option.ini}"
+        told = f"{option.help} ({also}; default: {option.default or 'none'})"
         group.addoption(option.flag, metavar=option.name.rpartition("_")[2].upper(), help=told)
         parser.addini(option.ini, option.help, default="")
     trusting.add(group)
 
 
-def check(config: pytest.Config) -> None:
-    """:raises pytest.UsageError: an option cannot be what it is."""
+def check_command_line(config: pytest.Config) -> None:
+    """:raises pytest.UsageError: a value on the command line is empty or wrong, or the ini file allows something."""
     trusting.check(config)
     for option in OPTIONS:
-        option.said(config)
+        option.check_command_line(config)
 
 
 def trust_of(config: pytest.Config) -> Trust:

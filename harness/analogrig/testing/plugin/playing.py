@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import re
 import subprocess
-import unittest
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,6 +74,11 @@ class Record:
 _RECORD = pytest.StashKey[Record]()
 
 
+def has_played(item: pytest.Item) -> bool:
+    """True if the item has played something through ``hil_play``, or through a scenario file."""
+    return _RECORD in item.stash
+
+
 def record_of(item: pytest.Item) -> Record:
     return item.stash.setdefault(_RECORD, Record())
 
@@ -128,8 +132,11 @@ class Player:
 
 @contextlib.contextmanager
 def examples_kept(item: pytest.Item) -> Iterator[None]:
-    """Each example of hypothesis that fails is written at once, in the place of the one before: whoever ends the
-    session while it is being shrunk finds the simplest until then."""
+    """Write each failing example of hypothesis at once, in the place of the one before: a session that is ended while
+    hypothesis shrinks leaves the simplest until then. Tests without ``hil_play`` are left alone."""
+    if "hil_play" not in getattr(item, "fixturenames", ()):
+        yield
+        return
     handle = getattr(getattr(item, "obj", None), "hypothesis", None)
     if handle is None:
         yield
@@ -143,6 +150,8 @@ def examples_kept(item: pytest.Item) -> Iterator[None]:
 
 
 def _kept_if_it_fails(tried: Callable[..., None], item: pytest.Item) -> Callable[..., None]:
+    import unittest
+
     from hypothesis.errors import UnsatisfiedAssumption
 
     record = record_of(item)

@@ -20,28 +20,46 @@ if TYPE_CHECKING:
 
 RIG_KINDS = ("emulator", "real")
 
+_FOLDER = pytest.StashKey[Path]()
+"""Folder whose scenario files are tests; absent without one."""
+
+_COMPLAINT = pytest.StashKey[str]()
+"""Why the folder of the ini file cannot be collected."""
+
 DEVICES = pytest.StashKey[Devices]()
 """Of the session."""
 
 
 def add_folder(config: pytest.Config) -> None:
-    """The scenarios come on top of all tests; of those that are named if the command line asks for them.
+    """Collect the scenarios on top of all tests; on top of tests that are named only if the command line asks for both.
 
-    :raises pytest.UsageError: pytest does not look into that folder of itself.
+    A folder of the ini file that cannot be collected fails as a test of its own (``add_complaint``).
+
+    :raises pytest.UsageError: the folder of the command line cannot be collected.
     """
     folder = SCENARIO_DIR.said(config)
-    named = config.args_source is pytest.Config.ArgsSource.ARGS
-    if not folder.value or (named and folder.by != SCENARIO_DIR.flag):
+    if not folder.value:
         return
-    path = Path(folder.value).resolve()
-    passed_over = config.getini("norecursedirs")
-    if not named and any(fnmatch.fnmatch(each, pattern) for each in _below(path, config) for pattern in passed_over):
-        raise pytest.UsageError(
-            f"{folder.by}: pytest does not look into {folder.value} of itself: say pytest {folder.value}"
-            f" {SCENARIO_DIR.flag} {folder.value}"
-        )
-    if all(Path(each).resolve() != path for each in config.args):
+    config.stash[_FOLDER] = path = Path(folder.value).resolve()
+    named = config.args_source is pytest.Config.ArgsSource.ARGS
+    if named and folder.source != "command line":
+        return
+    complaint = SCENARIO_DIR.complaint(folder.value) or ("" if named else _passed_over(folder.value, config))
+    if complaint and folder.source == "command line":
+        raise pytest.UsageError(f"{folder.by}: {complaint}")
+    if complaint:
+        config.stash[_COMPLAINT] = f"{folder.by}: {complaint}"
+    elif all(Path(each).resolve() != path for each in config.args):
         config.args.append(folder.value)
+
+
+def _passed_over(folder: str, config: pytest.Config) -> str:
+    """Why pytest does not enter a folder that is not named; empty if it does."""
+    patterns = config.getini("norecursedirs")
+    parts = _below(Path(folder).resolve(), config)
+    if not any(fnmatch.fnmatch(part, pattern) for part in parts for pattern in patterns):
+        return ""
+    return f"pytest does not look into {folder} of itself: use pytest {folder} {SCENARIO_DIR.flag} {folder}"
 
 
 def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
@@ -50,8 +68,8 @@ def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
 
 
 def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    folder = SCENARIO_DIR.said(parent.config).value
-    if not folder or path.suffix != ".toml" or not path.is_relative_to(Path(folder).resolve()):
+    folder = parent.config.stash.get(_FOLDER, None)
+    if folder is None or path.suffix != ".toml" or not path.is_relative_to(folder):
         return None
     return ScenarioFile.from_parent(parent, path=path) if _is_scenario(path) else None
 
@@ -65,6 +83,26 @@ def _is_scenario(path: Path) -> bool:
     with contextlib.suppress(AnalogrigError):
         return config.read_toml(path).get("kind", "scenario") not in {*KINDS, *RIG_KINDS}
     return True
+
+
+def add_complaint(session: pytest.Session, items: list[pytest.Item]) -> None:
+    """Add a failing test if the folder of the ini file cannot be collected: its scenarios must not go unnoticed."""
+    if complaint := session.config.stash.get(_COMPLAINT, ""):
+        items.append(NoFolder.from_parent(session, name=SCENARIO_DIR.name, nodeid=SCENARIO_DIR.name, why=complaint))
+
+
+class NoFolder(pytest.Item):
+    """Stands for the scenarios of a folder that cannot be collected, and fails."""
+
+    def __init__(self, *, why: str, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._why = why
+
+    def runtest(self) -> None:
+        pytest.fail(self._why, pytrace=False)
+
+    def reportinfo(self) -> tuple[Path, None, str]:
+        return self.path, None, self.name
 
 
 class ScenarioFile(pytest.File):
@@ -109,7 +147,7 @@ class ScenarioItem(pytest.Item):
         seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
         return judged(scenario.statement, play, scenario, seed, str(self.path))
 
-    def equipment(self) -> tuple[str, str]:
+    def hil_equipment(self) -> tuple[str, str]:
         """Names of rig and device; empty where the file cannot be read."""
         from analogrig.errors import AnalogrigError
         from analogrig.scenario import Scenario

@@ -36,5 +36,13 @@ def is_playable(rig: Rig, scenario: Scenario) -> bool:
 def with_some_seed(
     play: Play, scenario: str | Scenario, seed: int, judge: Callable[[Played], Finding], tries: int = TRIES
 ) -> Finding:
-    """As ``analogrig.testing.experiment.with_some_seed``, with as many tries as the shipped properties have."""
+    """Finding: a statement holds for a play with ``seed``, or with one of the ``tries - 1`` seeds after it.
+
+    If one play fails a sound device with probability p, this fails it with probability p ** ``tries``. A play that is
+    INCONCLUSIVE ends the search; then the finding does not hold.
+
+    :param play: the fixture ``hil_play``.
+    :param scenario: a shipped name, a .toml file or a Scenario.
+    :param judge: the statement, such as ``Played.stays_quiet``.
+    """
     return experiment.with_some_seed(play, scenario, seed, judge, tries)
