@@ -612,7 +612,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
         play_chunk(plan.as_json(), (0, 0))
     assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--allow", str(library)]) == 2
     complaint = capsys.readouterr().err
-    before, after = plan.devices[0]["build"], planned(tmp_path, spec).devices[0]["build"]
+    before, after = plan.devices[0]["build"], planned(tmp_path, spec, [str(library)]).devices[0]["build"]
     assert f"devices[0].build is '{before}' there and '{after}' here" in complaint
     assert complaint.count("\n") == 1
     assert journal_of(out).read_bytes() == kept

@@ -370,7 +370,7 @@ def test_recording_without_a_sample_is_named(tmp_path: Path) -> None:
 def test_device_at_a_url_is_not_opened_on_the_word_of_a_file(tmp_path: Path) -> None:
     with device() as path:
         out = run_json("run", "--dut", f"serial:{path}", cwd=tmp_path)
-    assert f"--dut serial:{path}" in refusal("replay", out["run"], cwd=tmp_path)
+    assert f"which no file may order: pass --allow {path}" in refusal("replay", out["run"], cwd=tmp_path)
     assert run_json("replay", out["run"], "--dut", "host", cwd=tmp_path)["theta_hash"] == out["theta_hash"]
 
 

@@ -28,6 +28,8 @@ from typing import Any, Protocol
 import pytest
 
 from analogrig import config
+from analogrig.campaigns.conduct import journal_of
+from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.cli import main
@@ -39,6 +41,7 @@ from analogrig.protocol.dut import open_dut, reopen_dut
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from analogrig.testing.counterexample import Counterexample
 from analogrig.trust import FiledName, Thing, Trust, beside
 from tests.harness.served import served
 
@@ -232,9 +235,8 @@ def a_can_adapter(folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path) 
 
 
 def a_can_server(folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path) -> Bait:  # noqa: ARG001
-    """Host and port are options of python-can."""
+    """An adapter at a URL, with an option of python-can: the option is part of what is allowed."""
     witness = Listens()
-    witness.socket.listen()
     toml = 'kind = "can"\ninterface = "serial"\ntimeout_s = 0.1\n'
     toml += f'channel = "socket://127.0.0.1:{witness.port}"\n[options]\nbaudrate = 9600\n'
     name = f"can:serial/socket://127.0.0.1:{witness.port}?baudrate=9600"
@@ -710,7 +712,40 @@ def test_results_and_journal_of_a_campaign_open_nothing(
     results.write_text(re.sub(r'"kind": ?"inproc"', '"kind":"inproc","library":"theirs/evil.so"', results.read_text()))
     main(["compare", str(results), str(results)])
     main(argv)
+    results.unlink()
+    plan = Plan.of(CampaignSpec.load(argv[1]))
+    forged = dataclasses.replace(plan, devices=({**plan.devices[0], "library": "theirs/evil.so"},))
+    with Journal(journal_of(results), forged):
+        pass
+    assert main(argv) == REFUSED
     assert not bait.witness.happened()
+
+
+def test_counterexample_repeats_with_what_it_names_allowed(folder: Path, recorded_thesis: Path) -> None:
+    """From any folder: its files hold absolute paths, and its command allows them."""
+    run, library = Run.load(recorded_thesis), folder / "theirs" / "my.so"
+    device = describe("inproc:theirs/my.so").as_table()
+    rig = dataclasses.asdict(config.build(RealDescription, rig_of_a_command(folder), "rig"))
+    conditions = dataclasses.replace(run.conditions, dut={**device, "identity": {}}, rig={**rig, "name": "bench"})
+    left = Counterexample(dataclasses.replace(run, conditions=conditions), dut="inproc:theirs/my.so")
+    left.write(folder / "left", page=False)
+    assert config.read_toml(folder / "left" / "dut.toml")["library"] == str(library)
+    named = ["--allow", "bench:5000", "--allow", "./theirs/setpot"]
+    assert shlex.split(left.command(Path("left/scenario.toml")))[-6:] == ["--dut", "inproc:theirs/my.so", *named]
+    words = shlex.split(left.suite_command(Path("left")))
+    assert words[-6:] == [
+        "--hil-allow",
+        "./theirs/my.so",
+        "--hil-allow",
+        "bench:5000",
+        "--hil-allow",
+        "./theirs/setpot",
+    ]
+
+
+def rig_of_a_command(folder: Path) -> dict[str, Any]:
+    bait = a_command(folder, lambda: "bench")
+    return tomllib_loads(bait.toml.replace("./setpot", str(folder / "theirs" / "setpot")))
 
 
 def test_recorded_rig_is_never_opened(folder: Path, recorded_thesis: Path) -> None:
