@@ -2,7 +2,7 @@
 
 The shell runs in a copy of this checkout, with the environment and the build products of the checkout. A command whose
 tool is not installed is left out, and its test skips with the package's name. `make test` would run this file again: it
-gets one other test module to run, and leaves out `check`, which the `make test` around this one has made.
+gets one other test module to run. Its `check` is quick, by the caches of the `make test` around this one.
 """
 
 from __future__ import annotations
@@ -71,12 +71,14 @@ def missing(command: str) -> list[str]:
 def copy(folder: Path) -> Path:
     """This checkout with what was built, such that make finds nothing out of date."""
     checkout = shutil.copytree(CHECKOUT, folder, ignore=shutil.ignore_patterns(*NOT_COPIED, "build"))
-    (checkout / ".venv").symlink_to(sys.prefix, target_is_directory=True)
-    if (CHECKOUT / "build" / "generated").is_dir():
-        shutil.copytree(CHECKOUT / "build" / "generated", checkout / "build" / "generated")
-    for path in [*checkout.rglob("*.[chS]"), *checkout.rglob("*.py"), *checkout.glob("*.*"), *checkout.rglob("*.dbc")]:
+    for path in [*checkout.rglob("*.[chS]"), *checkout.rglob("*.py"), *checkout.rglob("*.dbc"), *checkout.glob("*.*")]:
         if path.name != "_catalogue.py":
             os.utime(path, (0, 0))
+    os.utime(checkout / "Makefile", (0, 0))
+    (checkout / ".venv").symlink_to(sys.prefix, target_is_directory=True)
+    for made in ("build/generated", "build/strict", ".mypy_cache"):
+        if (CHECKOUT / made).is_dir():
+            shutil.copytree(CHECKOUT / made, checkout / made)
     return checkout
 
 
@@ -96,13 +98,12 @@ def wait_for_port() -> None:
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, tuple[int, str]]:
     """Status and output of each command that was run."""
     checkout = copy(tmp_path_factory.mktemp("readme") / "checkout")
-    pasted = [f"{command}\necho; echo '{END_OF}' $?\n" for command, _ in COMMANDS if not missing(command)]
+    pasted = [f"{command}\nprintf '\\n%s %s\\n' '{END_OF}' $?\n" for command, _ in COMMANDS if not missing(command)]
     drop = ("ANALOGRIG", "HIL", "PYTEST", "VIRTUAL_ENV", "MAKE", "MFLAGS", "NO_COLOR", "FORCE_COLOR", "CLICOLOR")
     environment = {key: value for key, value in os.environ.items() if not key.startswith(drop)}
     environment |= {
         "PYTHONPATH": f"{checkout / 'harness'}{os.pathsep}{checkout / 'emulator'}",  # of the copy, not of the checkout
         "PYTEST_ARGS": "-p no:cacheprovider tests/harness/test_frame.py",
-        "MAKEFLAGS": "-o check",
     }
     wait_for_port()
     shell = subprocess.run(
