@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ def test_deck_that_is_written_otherwise_is_refused() -> None:
         list(variants(deck))
 
 
-@pytest.mark.skipif(shutil.which("ngspice") is None, reason="needs ngspice: apt-get install ngspice")
+@pytest.mark.tools("ngspice")
 def test_decks_without_time_points_on_the_samples_compute_the_same_signals() -> None:
     exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), SAMPLES, THESIS_TWEAKS)))[:, 1]
     number = next(i for i, each in enumerate(ACCURACIES) if each.max_step_s == 8e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json, working
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
 
 if TYPE_CHECKING:
     from analogrig.hardware.calibration.fit import Calibration, Estimate
@@ -83,8 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
             pots=(arguments.pots,) if arguments.pots else POTS,
             progress=progress_line("fits"),
         )
-        with working("checking the twin"):
-            check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
+        check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if check_lsb <= MOST_LSB:
