@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
+from tests.wheels import distributions, environment, users_environment, wheel
+
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 collect_ignore = ["user_repository"]  # test_packaging.py runs it where it belongs
+
+__all__ = ["distributions", "environment", "users_environment", "wheel"]  # the fixtures of tests/wheels.py
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 

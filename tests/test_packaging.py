@@ -10,56 +10,22 @@ import shutil
 import subprocess
 import sys
 import tarfile
-import venv
 import zipfile
 from pathlib import Path
 
 import pytest
 
-CHECKOUT = Path(__file__).parents[1]
+from tests.wheels import CHECKOUT, run
+
 HELP_PER_START_LIMIT = 5.0
 """`analogrig --help` against `python -c pass`: 0.1 s where the interpreter itself needs 20 ms."""
 
-NOT_SOURCES = (".*", "__pycache__", "*.egg-info", "*.so", "_catalogue.py", "bin", "build", "dist", "uPlot*", "venv*")
-"""What a working checkout may hold beside its sources: what the build makes must come from the build."""
-
 pytestmark = pytest.mark.timeout(300)
-
-
-@pytest.fixture(scope="module")
-def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an sdist of this checkout and the wheel that was built from that sdist."""
-    folder = tmp_path_factory.mktemp("dist")
-    sources = shutil.copytree(CHECKOUT, folder / "sources", ignore=shutil.ignore_patterns(*NOT_SOURCES))
-    _run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, sources, cwd=folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def wheel(distributions: Path) -> Path:
-    return next(distributions.glob("*.whl"))
-
-
-@pytest.fixture(scope="module")
-def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of programs of a new environment that holds the wheel and what it asks for, nothing else."""
-    folder = tmp_path_factory.mktemp("empty")
-    venv.create(folder, with_pip=False, symlinks=True)
-    _run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", wheel, cwd=folder)
-    return folder / "bin"
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for variable in ("PYTHONPATH", "VIRTUAL_ENV", "CFLAGS", "LDFLAGS"):
-        monkeypatch.delenv(variable, raising=False)
-
-
-def _run(*command: str | Path, cwd: Path | None = None) -> str:
-    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    assert done.returncode == 0, f"{command} ended with status {done.returncode}:\n{done.stdout}"
-    return done.stdout
 
 
 def test_wheel_serves_every_python_3_on_one_platform(wheel: Path) -> None:
@@ -92,63 +58,51 @@ def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Pa
 
 
 def test_command_works_from_the_wheel(environment: Path) -> None:
-    assert _run(environment / "analogrig", "--help").startswith("usage: analogrig")
-    assert re.fullmatch(r"analogrig \d+\.\d+\.\d+\n", _run(environment / "analogrig", "--version"))
+    assert run(environment / "analogrig", "--help").startswith("usage: analogrig")
+    assert re.fullmatch(r"analogrig \d+\.\d+\.\d+\n", run(environment / "analogrig", "--version"))
 
 
 def test_installed_device_can_be_executed(environment: Path) -> None:
     device = next(environment.parent.glob("lib/python*/site-packages/analogrig/bin/analogrig-device"))
-    assert "analogrig-device" in _run(device, "--help")
+    assert "analogrig-device" in run(device, "--help")
 
 
 def test_main_job_works_from_the_wheel(environment: Path, tmp_path: Path) -> None:
-    _run(environment / "analogrig", "run", "--out", tmp_path)
+    run(environment / "analogrig", "run", "--out", tmp_path)
     assert (tmp_path / "run.npz").stat().st_size > 0
     assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.fixture(scope="module")
-def users_environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same with what the plugin for pytest asks for."""
-    folder = tmp_path_factory.mktemp("users")
-    venv.create(folder, with_pip=False, symlinks=True)
-    _run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", f"{wheel}[pytest]", cwd=folder)
-    return folder / "bin"
 
 
 @pytest.fixture
 def users_repository(distributions: Path, tmp_path: Path) -> Path:
     """tests/user_repository in a folder of its own, with the sources of the device as the sdist has them."""
     repository = shutil.copytree(CHECKOUT / "tests" / "user_repository", tmp_path / "repository")
-    unpacked = tmp_path / "sdist"
-    unpacked.mkdir()
-    _run("tar", "-xzf", next(distributions.glob("*.tar.gz")), "-C", unpacked)
-    (sources,) = unpacked.iterdir()
+    run(sys.executable, "-m", "tarfile", "-e", next(distributions.glob("*.tar.gz")), tmp_path / "sdist")
+    (sources,) = (tmp_path / "sdist").iterdir()
     shutil.copytree(sources / "estimator_c", repository / "vendor" / "estimator_c")
     generate = sources / "estimator_c" / "catalogue" / "generate.py"
     (repository / "vendor" / "generated").mkdir()
-    _run(sys.executable, generate, repository / "vendor" / "generated", tmp_path / "tables.py", cwd=sources)
+    run(sys.executable, generate, repository / "vendor" / "generated", tmp_path / "tables.py", cwd=sources)
     return repository
 
 
 def test_users_repository_passes_without_its_bug(users_environment: Path, users_repository: Path) -> None:
-    _run("make", "BUG=0", cwd=users_repository)
-    assert "2 passed" in _run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
+    run("make", "BUG=0", cwd=users_repository)
+    assert "2 passed" in run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
 
 
 def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     users_environment: Path, users_repository: Path
 ) -> None:
-    _run("make", cwd=users_repository)
-    found = _ended(1, users_environment / "python", "-m", "pytest", "-q", cwd=users_repository)
+    run("make", cwd=users_repository)
+    found = run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository, status=1)
     assert "1 failed, 1 passed" in found
     assert "B at 1400 was missed" in found
     repeat = re.search(r"^repeat it with: analogrig (.*)$", found, re.MULTILINE)
     assert repeat is not None
-    again = _ended(1, users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository)
+    again = run(users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository, status=1)
     assert "missed" in again
-    suite = _ended(
-        1,
+    suite = run(
         users_environment / "python",
         "-m",
         "pytest",
@@ -157,18 +111,13 @@ def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
         "--hil-scenario-dir",
         "failed",
         cwd=users_repository,
+        status=1,
     )
     assert "1 failed" in suite
 
 
-def _ended(status: int, *command: str | Path, cwd: Path) -> str:
-    done = subprocess.run(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    assert done.returncode == status, f"{command} ended with status {done.returncode}:\n{done.stdout}"
-    return done.stdout
-
-
 def test_help_loads_nothing_heavy(environment: Path) -> None:
-    listing = _run(environment / "python", "-X", "importtime", "-m", "analogrig.cli", "run", "--help")
+    listing = run(environment / "python", "-X", "importtime", "-m", "analogrig.cli", "run", "--help")
     loaded = set(re.findall(r"\| +(\w+)", listing))
     assert "argparse" in loaded
     assert not loaded & {"numpy", "scipy", "serial", "cobs", "anycrc"}
@@ -185,7 +134,7 @@ def test_help_starts_at_once(environment: Path) -> None:
 def _processor_s(*command: str | Path) -> float:
     """What a command takes of the processor: on a busy machine it takes longer, but no more."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    _run(*command)
+    run(*command)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 

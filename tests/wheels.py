@@ -1,0 +1,84 @@
+"""Fixtures of the built distributions: an sdist of this checkout, the wheel built from it, environments that hold it.
+
+tests/conftest.py imports the fixtures, so every test may ask for them. A session builds the wheel once, also where
+pytest-xdist spreads it over several processes.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[1]
+
+NOT_SOURCES = (".*", "__pycache__", "*.egg-info", "*.so", "_catalogue.py", "bin", "build", "dist", "uPlot*", "venv*")
+"""Files of a working checkout that are no sources: the build under test must make its products itself."""
+
+INHERITED = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "CFLAGS", "LDFLAGS", "CC")
+"""Variables that would let a build or an installed program depend on this checkout."""
+
+
+def run(*command: str | Path, cwd: Path | None = None, status: int = 0, **variables: str) -> str:
+    """Run a command that must end with ``status``; return its output and error output."""
+    environment = {name: value for name, value in os.environ.items() if name not in INHERITED} | variables
+    done = subprocess.run(
+        command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    assert done.returncode == status, f"{command} ended with status {done.returncode}:\n{done.stdout}"
+    return done.stdout
+
+
+def environment_with(folder: Path, *requirements: str | Path) -> Path:
+    """Make an environment that holds the requirements and their dependencies alone; return its folder of programs."""
+    venv.create(folder, with_pip=False, symlinks=True)
+    run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", *requirements, cwd=folder)
+    return folder / "bin"
+
+
+def build(folder: Path, *options: str) -> None:
+    """Build an sdist of this checkout, and a wheel from that sdist, into ``folder``."""
+    sources = shutil.copytree(CHECKOUT, folder / "sources", ignore=shutil.ignore_patterns(*NOT_SOURCES))
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, *options, sources, cwd=folder)
+    shutil.rmtree(sources)
+
+
+@pytest.fixture(scope="session")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an sdist of this checkout and the wheel built from that sdist."""
+    session = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent  # the folder that all workers of a session share
+    folder = session / "distributions"
+    with (session / "distributions.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not list(folder.glob("*.whl")):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            build(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def wheel(distributions: Path) -> Path:
+    """The wheel for this machine."""
+    (path,) = distributions.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="session")
+def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of a new environment that holds the wheel and its dependencies alone."""
+    return environment_with(tmp_path_factory.mktemp("empty"), wheel)
+
+
+@pytest.fixture(scope="session")
+def users_environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with the dependencies of the plugin for pytest."""
+    return environment_with(tmp_path_factory.mktemp("users"), f"{wheel}[pytest]")
