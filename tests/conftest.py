@@ -1,14 +1,18 @@
-"""For all tests: one that needs what a machine lacks skips and says so; in CI, where all is installed, none may."""
+"""For all tests: skip those whose tools are missing, name the tools, and end with a table of them.
+
+In CI a skip is a failure: ANALOGRIG_CI=1 allows none, ANALOGRIG_CI=bare only those for a missing tool.
+"""
 
 from __future__ import annotations
 
 import os
-import shutil
+import signal
 from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
+from tests import tools
 from tests.wheels import distributions, environment, users_environment, wheel
 
 if TYPE_CHECKING:
@@ -21,9 +25,44 @@ __all__ = ["distributions", "environment", "users_environment", "wheel"]  # the 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 
+ALLOWED_SKIPS = os.environ.get("ANALOGRIG_CI", "")
+"""Empty: any. "bare": those for a missing tool. Anything else: none."""
+LACKING = pytest.StashKey[tuple[str, ...]]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "tools(*names): programs or files of tests/tools.py that the test needs")
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            # Under nohup or in the background. Children inherit an ignored signal, but not a handler: with one, a test
+            # can interrupt its child, and this process still ignores the signal.
+            signal.signal(number, lambda *_: None)
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what each test needs, by its fixtures too; skip those whose tools are missing."""
+    for item in items:
+        for fixture in getattr(item, "fixturenames", ()):
+            if fixture in tools.FIXTURES:
+                item.add_marker(pytest.mark.tools(*tools.FIXTURES[fixture]))
+        needed = [name for marker in item.iter_markers("tools") for name in marker.args]
+        try:
+            lacking = tools.missing(needed)
+        except KeyError as error:
+            raise pytest.UsageError(f"{item.nodeid} needs {error}: tests/tools.py has no such tool") from error
+        if lacking:
+            item.stash[LACKING] = lacking
+            item.add_marker(pytest.mark.skip(reason=tools.reason(lacking)))
+
+
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    return _without_skips((yield))
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.skipped and LACKING in item.stash:
+        lacking = item.stash[LACKING]
+        report.lacking = list(lacking)  # type: ignore[attr-defined]  # xdist passes it on
+    return _without_skips(report)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -32,24 +71,36 @@ def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest
 
 
 def _without_skips(report: Report) -> Report:
-    expected_to_fail = hasattr(report, "wasxfail")
-    if os.environ.get("ANALOGRIG_CI") and report.outcome == "skipped" and not expected_to_fail:
-        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
-        report.outcome = "failed"
-        report.longrepr = f"{reason} (ANALOGRIG_CI is set: nothing may skip)"
+    if report.outcome != "skipped" or hasattr(report, "wasxfail") or not ALLOWED_SKIPS:
+        return report
+    if ALLOWED_SKIPS == "bare" and hasattr(report, "lacking"):
+        return report
+    text = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+    allowed = "only a missing tool may skip a test" if ALLOWED_SKIPS == "bare" else "nothing may skip"
+    report.outcome = "failed"
+    report.longrepr = f"{text} (ANALOGRIG_CI is set: {allowed})"
     return report
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)  # after the summaries of pytest
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None, None, None]:
+    """End with one table: how many tests wait for which tool."""
+    yield
+    reports = (report for category in terminalreporter.stats.values() for report in category)
+    waiting = [report.lacking for report in reports if hasattr(report, "lacking")]
+    if waiting:
+        terminalreporter.section("missing tools")
+        for line in tools.table(waiting):
+            terminalreporter.line(line)
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """For ``tests.browser.Watched``."""
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("needs a browser: apt-get install chromium")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         # Without a sandbox, since tests may run as root; the pages under test are our own.
-        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(executable_path=tools.found("chromium"), args=["--no-sandbox"])
         yield browser
         browser.close()

@@ -18,8 +18,8 @@ ROOT = HERE.parents[1]
 RESULTS = ROOT / "build" / "can_guest"
 REPORT = "junit.xml"
 
-TIME_LIMIT_S = 600.0
-"""Ten times what it takes on an idle machine."""
+TIME_LIMIT_S = 3000.0
+"""Limit for the whole suite in the guest, which takes a minute on an idle machine."""
 WITHIN = "ANALOGRIG_CAN_GUEST"
 """Set in the guest, where alone the tests are safe: they take interfaces down and disturb the bus."""
 

@@ -13,9 +13,7 @@ given.
 
 from __future__ import annotations
 
-import os
 import shlex
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,12 +21,13 @@ from pathlib import Path
 from typing import IO
 
 from analogrig.links.child import END_TIMEOUT_S, TETHER
+from tests import tools
 
 from .linux import BUSYBOX, MODULES, VMLINUX
 
 QEMU = "qemu-system-x86_64"
-NEEDED = ((QEMU, "qemu-system-x86"), ("ip", "iproute2"))
-"""Programs, and their packages. The second runs in the guest, but from here."""
+NEEDED = (QEMU, "ip", "guest kernel")
+"""Tools of tests/tools.py. The guest runs the host's `ip`."""
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 RESULTS = Path("/run/results")
 """As the guest sees it."""
@@ -46,10 +45,8 @@ class GuestError(Exception):
 
 def lacking() -> str | None:
     """What this computer lacks to run a guest, with the cure."""
-    for program, package in NEEDED:
-        if shutil.which(program, path=f"{os.environ.get('PATH', '')}:{SYSTEM_PATH}") is None:
-            return f"no {program}: apt-get install --no-install-recommends {package}"
-    return None if VMLINUX.exists() else "no kernel for the guest: make build/can_guest/linux"
+    missing = tools.missing(NEEDED)
+    return tools.reason(missing) if missing else None
 
 
 def run(

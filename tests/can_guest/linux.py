@@ -16,7 +16,9 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-FOLDER = Path(__file__).parents[2] / "build" / "can_guest" / "linux"
+from tests import tools
+
+FOLDER = tools.GUEST_LINUX
 VMLINUX = FOLDER / "vmlinux"
 BUSYBOX = FOLDER / "busybox"
 MODULES = FOLDER / "modules"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,13 +18,11 @@ SAMPLE_RATE_HZ = 20e3
 @pytest.fixture
 def ngspice(tmp_path: Path) -> NgSpice:
     """(deck, nodes, samples) -> voltages of the nodes at every sample instant of 20 kHz, (samples, nodes)."""
-    if shutil.which("ngspice") is None:
-        pytest.skip("no ngspice here: apt-get install ngspice")
 
     def run(deck: str, nodes: Sequence[str], samples: int) -> NDArray[np.float64]:
         (tmp_path / "deck.cir").write_text(deck)
         command = ["ngspice", "-b", "-r", "out.raw", "deck.cir"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         log = done.stdout[-2000:] + done.stderr[-2000:]
         assert (tmp_path / "out.raw").exists(), log
         names, table = _read_raw(tmp_path / "out.raw")

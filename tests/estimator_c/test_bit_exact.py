@@ -8,9 +8,7 @@ import pytest
 
 from estimator_c.evidence import bit_exact
 
-pytestmark = pytest.mark.skipif(
-    bool(bit_exact.missing_tools()), reason=f"apt-get install {' '.join(bit_exact.missing_tools())}"
-)
+pytestmark = pytest.mark.tools(*bit_exact.PACKAGES)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from estimator_c.evidence import cost
 
-pytestmark = pytest.mark.skipif(bool(cost.missing_tools()), reason=f"apt-get install {' '.join(cost.missing_tools())}")
+pytestmark = pytest.mark.tools(*cost.PACKAGES)
 
 KNOWN_STEP = """
 #include "subject.h"

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 
 from estimator_c.evidence.coverage import measured
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.tools("gcc", "gcov")
 def test_every_line_and_branch_of_core_and_isolation_is_tested() -> None:
-    if shutil.which("gcov") is None:
-        pytest.skip("no gcov here: apt-get install gcc")
     coverage = measured()
     assert coverage.lines > 700
     assert coverage.branches > 450

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,25 +22,20 @@ BUILDS = [("-DEST_NC_MAX=0U",), ("-DEST_NC_MAX=2U",)]
 BUILD_IDS = ["usual", "extended least squares"]
 
 
-def require(tool: str, package: str) -> None:
-    if shutil.which(tool) is None:
-        pytest.skip(f"no {tool} here: apt-get install {package}")
-
-
+@pytest.mark.tools("gcc")
 @pytest.mark.parametrize("options", BUILDS, ids=BUILD_IDS)
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.name)
 def test_gcc_analyzer_finds_nothing(source: Path, options: Sequence[str], tmp_path: Path) -> None:
-    require("gcc", "gcc")
     command = ["gcc", "-std=c99", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", *options, INCLUDE]
     command += ["-c", str(source)]
     done = subprocess.run([*command, "-o", str(tmp_path / "o")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.tools("clang-tidy")
 @pytest.mark.parametrize("part", ["core", "isolation", "device"])
 def test_clang_tidy_finds_nothing(part: str) -> None:
     """The checks are those of estimator_c/.clang-tidy."""
-    require("clang-tidy", "clang-tidy")
     folders = [ESTIMATOR / name for name in ("core", "isolation", "device")]
     options = ["-std=c99", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in (*folders, GENERATED))]
     sources = map(str, sorted((ESTIMATOR / part).glob("*.c")))
@@ -57,17 +51,17 @@ DEVICE_SOURCES = sorted(
 )
 
 
+@pytest.mark.tools("gcc")
 def test_gcc_analyzer_finds_nothing_in_the_device_and_its_port_to_this_computer(tmp_path: Path) -> None:
-    require("gcc", "gcc")
     command = ["gcc", "-std=c99", "-D_XOPEN_SOURCE=700", "-O2", "-fanalyzer", "-Wall", "-Wextra", "-Werror", "-c"]
     command += [*(f"-I{folder}" for folder in DEVICE_FOLDERS), *map(str, DEVICE_SOURCES)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.tools("cppcheck")
 def test_cppcheck_finds_nothing_in_the_device() -> None:
     """Of its own; the rules of MISRA are for core and isolation."""
-    require("cppcheck", "cppcheck")
     command = [
         "cppcheck",
         "--quiet",
@@ -81,10 +75,9 @@ def test_cppcheck_finds_nothing_in_the_device() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.tools("frama-c")
 def test_eva_finds_that_nothing_undefined_can_happen() -> None:
     """In the default shape, with any configuration and any samples; `make eva` has all shapes."""
-    require("frama-c", "frama-c-base")
     found = eva.analysed(eva.DEFAULT)
     assert found.alarms == ()
     assert found.reached > 0.9, "what is not reached is not analysed"
@@ -107,8 +100,8 @@ def numbers_in_the_code() -> set[tuple[str, int, str]]:
     }
 
 
+@pytest.mark.tools("cppcheck")
 def test_what_cppcheck_with_misra_finds_is_explained_and_numbered_at_its_line(tmp_path: Path) -> None:
-    require("cppcheck", "cppcheck")
     command = ["cppcheck", "--quiet", "--addon=misra", "--enable=warning,style,performance,portability", "--std=c99"]
     command += ["--template={id} {file}:{line} {message}", "-DEST_NC_MAX=2U", INCLUDE]
     command += [f"--cppcheck-build-dir={tmp_path}"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,13 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator_c.evidence import bit_exact, cost
+from estimator_c.evidence import cost
 
 COMPILER = "arm-linux-gnueabi-gcc"
 EMULATOR = "qemu-arm"
-MISSING = [bit_exact.PACKAGES[tool] for tool in (COMPILER, EMULATOR) if shutil.which(tool) is None]
 
-pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"apt-get install {' '.join(MISSING)}")
+pytestmark = pytest.mark.tools(COMPILER, EMULATOR)
 
 Words = NDArray[np.uint32]
 Floats = NDArray[np.float32]

@@ -177,7 +177,7 @@ def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> Non
         connect(describe(f"qemu-m4:{tmp_path}/nothing.elf"))
 
 
-@pytest.mark.skipif(shutil.which(GCC) is None, reason=f"no {GCC}: apt-get install gcc-arm-none-eabi")
+@pytest.mark.tools(GCC)
 def test_hard_fault_is_told_in_the_words_of_the_firmware(tmp_path: Path) -> None:
     """The project's own start-up code, and a program that writes where nothing is."""
     (tmp_path / "main.c").write_text("int main(void) { *(volatile int*)0xE0200000 = 1; return 0; }\n")
