@@ -42,16 +42,19 @@ HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
 DATA = Path("analogrig")
+"""The package of the wheel that receives SHIPPED, at the same paths below it."""
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
-OTHER_SOURCES = (
-    "emulator/analogrig_emulator/*.h",
-    "estimator_c/core/*.h",
-    "estimator_c/device/*.h",
-    "estimator_c/ports/*/*.h",
-    "estimator_c/isolation/*.h",
+ESTIMATOR = (
+    "estimator_c/*.md",
+    *(f"estimator_c/{part}/*.[ch]" for part in ("core", "isolation", "device")),
+    *(f"estimator_c/ports/**/*.{suffix}" for suffix in ("c", "h", "S", "ld")),
     "estimator_c/catalogue/*",
-    *FIXTURES,
 )
+"""Sources that a user compiles into an own device."""
+SHIPPED = (*FIXTURES, *ESTIMATOR)
+GENERATED = tuple(f"analogrig_{part}.{suffix}" for part in ("catalogue", "codec") for suffix in "ch")
+"""C that comes from the catalogue. The wheel has it in estimator_c/generated, a checkout in build/generated."""
+OTHER_SOURCES = ("emulator/analogrig_emulator/*.h", *SHIPPED)
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
 # A computer has room for extended least squares as well.
@@ -108,10 +111,15 @@ class BuildProducts(Command):
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), placed(product))
         if not in_tree:
-            for path in sources(FIXTURES):
-                copied = Path(self.build_lib) / DATA / path
+            for copied, path in self._shipped(generated).items():
                 copied.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, copied)
+
+    def _shipped(self, generated: Path) -> dict[Path, Path]:
+        """Files of the wheel that are copies, and their originals."""
+        package = Path(self.build_lib) / DATA
+        codecs = {package / "estimator_c" / "generated" / name: generated / name for name in GENERATED}
+        return {**{package / path: path for path in sources(SHIPPED)}, **codecs}
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
@@ -120,8 +128,8 @@ class BuildProducts(Command):
 
     def get_outputs(self) -> list[str]:
         """Part of the protocol of setuptools."""
-        copied = [DATA / path for path in sources(FIXTURES)]
-        return [str(Path(self.build_lib) / path) for path in (*map(in_wheel, PRODUCTS), *copied)]
+        products = [Path(self.build_lib) / in_wheel(product) for product in PRODUCTS]
+        return [str(path) for path in (*products, *self._shipped(Path()))]
 
     def get_output_mapping(self) -> dict[str, str]:
         """Part of the protocol of setuptools: where an editable install finds each product."""

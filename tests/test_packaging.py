@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import re
 import resource
@@ -15,12 +16,11 @@ from pathlib import Path
 
 import pytest
 
+from analogrig import device_program
 from tests.wheels import CHECKOUT, run
 
 HELP_PER_START_LIMIT = 5.0
 """`analogrig --help` against `python -c pass`: 0.1 s where the interpreter itself needs 20 ms."""
-
-pytestmark = pytest.mark.timeout(300)
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def test_wheel_serves_every_python_3_on_one_platform(wheel: Path) -> None:
     assert re.search(r"-py3-none-linux_\w+\.whl$", wheel.name)
 
 
-def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
+def test_wheel_holds_every_product(wheel: Path) -> None:
     held = set(zipfile.ZipFile(wheel).namelist())
     assert held >= {
         "analogrig_emulator/_engine.so",
@@ -46,7 +46,61 @@ def test_wheel_holds_every_product_and_no_source_of_c(wheel: Path) -> None:
         "analogrig/reporting/uPlot.iife.min.js",
         "analogrig/reporting/uPlot.min.css",
     }
-    assert not [name for name in held if name.endswith((".c", ".h")) or name.startswith("tests/")]
+    assert not [name for name in held if name.startswith("tests/")]
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_every_source_of_estimator_and_device_is_shipped(kind: str, wheel: Path, distributions: Path) -> None:
+    parts = ("core", "isolation", "device", "ports", "catalogue")
+    tracked = [
+        str(path.relative_to(CHECKOUT))
+        for part in parts
+        for path in (CHECKOUT / "estimator_c" / part).rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    ]
+    assert len([name for name in tracked if name.endswith(".c")]) > 10
+    if kind == "wheel":
+        held = {name.removeprefix("analogrig/") for name in zipfile.ZipFile(wheel).namelist()}
+    else:
+        with tarfile.open(next(distributions.glob("*.tar.gz"))) as sdist:
+            held = {name.partition("/")[2] for name in sdist.getnames()}
+    assert held >= set(tracked)
+
+
+def test_licence_is_in_the_metadata(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as files:
+        (metadata,) = (name for name in files.namelist() if name.endswith(".dist-info/METADATA"))
+        assert "\nLicense-Expression: MIT\n" in files.read(metadata).decode()
+        licence = files.read(metadata.replace("METADATA", "licenses/LICENSE"))
+    assert licence == (CHECKOUT / "LICENSE").read_bytes()
+
+
+FOLDERS = "from analogrig.config import estimator_c, generated_c; print(estimator_c(), generated_c())"
+
+
+@pytest.mark.parametrize("where", ["installed", "checkout"])
+def test_device_compiles_from_the_sources_and_is_the_shipped_one(where: str, environment: Path, tmp_path: Path) -> None:
+    """The program that a user compiles speaks the catalogue that the harness speaks."""
+    python = environment / "python" if where == "installed" else Path(sys.executable)
+    estimator, generated = map(Path, run(python, "-c", FOLDERS).split())
+    assert estimator.is_relative_to(environment.parent if where == "installed" else CHECKOUT)
+    folders = [*(estimator / part for part in ("core", "isolation", "device", "ports/loop")), generated]
+    sources = [path for folder in (*folders, estimator / "ports" / "host") for path in sorted(folder.glob("*.c"))]
+    flags = ("-std=c99", "-D_XOPEN_SOURCE=700", "-DEST_NC_MAX=2U", *(f"-I{folder}" for folder in folders))
+    run("cc", *flags, *sources, "-o", tmp_path / "own")
+    assert run(tmp_path / "own", "--version") == run(environment / "analogrig-device", "--version")
+
+
+def test_codec_that_is_generated_from_the_shipped_catalogue_is_the_shipped_one(
+    users_environment: Path, tmp_path: Path
+) -> None:
+    estimator, generated = map(Path, run(users_environment / "python", "-c", FOLDERS).split())
+    generate = estimator / "catalogue" / "generate.py"
+    (tmp_path / "c").mkdir()
+    run(users_environment / "python", generate, tmp_path / "c", tmp_path / "tables.py")
+    names = {path.name for path in generated.iterdir()}
+    assert names == {path.name for path in (tmp_path / "c").iterdir()}
+    assert filecmp.cmpfiles(generated, tmp_path / "c", names)[0] == sorted(names)
 
 
 def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Path) -> None:
@@ -62,9 +116,30 @@ def test_command_works_from_the_wheel(environment: Path) -> None:
     assert re.fullmatch(r"analogrig \d+\.\d+\.\d+\n", run(environment / "analogrig", "--version"))
 
 
-def test_installed_device_can_be_executed(environment: Path) -> None:
+def test_installed_device_is_a_command(environment: Path) -> None:
     device = next(environment.parent.glob("lib/python*/site-packages/analogrig/bin/analogrig-device"))
-    assert "analogrig-device" in run(device, "--help")
+    assert run(environment / "analogrig-device", "--help") == run(device, "--help")
+    refused = run(environment / "analogrig-device", "--no-such-option", status=2)
+    assert refused == run(device, "--no-such-option", status=2)
+
+
+def test_command_of_a_device_that_is_gone_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(device_program, "PROGRAM", tmp_path / "gone")
+    with pytest.raises(SystemExit) as stopped:
+        device_program.main()
+    assert stopped.value.code == 2
+
+
+def test_device_that_runs_is_the_command_itself(environment: Path) -> None:
+    """It replaces the interpreter, so a signal to the command reaches the device."""
+    with subprocess.Popen([environment / "analogrig-device"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as device:
+        assert device.stdout is not None
+        assert device.stdout.readline().startswith(b"/dev/")
+        program = Path(f"/proc/{device.pid}/exe").readlink()
+        assert device.stdin is not None
+        device.stdin.close()
+        assert device.wait() == 0
+    assert program.name == "analogrig-device"
 
 
 def test_main_job_works_from_the_wheel(environment: Path, tmp_path: Path) -> None:
@@ -74,15 +149,12 @@ def test_main_job_works_from_the_wheel(environment: Path, tmp_path: Path) -> Non
 
 
 @pytest.fixture
-def users_repository(distributions: Path, tmp_path: Path) -> Path:
-    """tests/user_repository in a folder of its own, with the sources of the device as the sdist has them."""
+def users_repository(users_environment: Path, tmp_path: Path) -> Path:
+    """tests/user_repository in a folder of its own, with the sources of the device that the wheel brings."""
     repository = shutil.copytree(CHECKOUT / "tests" / "user_repository", tmp_path / "repository")
-    run(sys.executable, "-m", "tarfile", "-e", next(distributions.glob("*.tar.gz")), tmp_path / "sdist")
-    (sources,) = (tmp_path / "sdist").iterdir()
-    shutil.copytree(sources / "estimator_c", repository / "vendor" / "estimator_c")
-    generate = sources / "estimator_c" / "catalogue" / "generate.py"
-    (repository / "vendor" / "generated").mkdir()
-    run(sys.executable, generate, repository / "vendor" / "generated", tmp_path / "tables.py", cwd=sources)
+    estimator, generated = map(Path, run(users_environment / "python", "-c", FOLDERS).split())
+    shutil.copytree(estimator, repository / "vendor" / "estimator_c")
+    shutil.copytree(generated, repository / "vendor" / "generated")
     return repository
 
 

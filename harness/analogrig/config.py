@@ -39,6 +39,18 @@ def fixtures() -> Path:
     return installed if installed.is_dir() else Path(__file__).parents[2] / "fixtures"
 
 
+def estimator_c() -> Path:
+    """The folder of the estimator's C sources: inside the installed package, or that of the checkout."""
+    installed = Path(__file__).parent / "estimator_c"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "estimator_c"
+
+
+def generated_c() -> Path:
+    """The folder of the C that comes from the message catalogue: codecs of the device's messages."""
+    installed = Path(__file__).parent / "estimator_c" / "generated"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "build" / "generated"
+
+
 def locate(kind: Kind, name: str) -> Path:
     """The TOML file of a shipped ``name``, or of a user's own path.
 

@@ -59,7 +59,6 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return product
 
 
-@pytest.mark.timeout(300)
 def test_no_corrupted_frame_is_taken_for_what_nobody_sent(library: Path) -> None:
     line, decoder = CorruptedLine(library, seed=5), frame.FrameDecoder()
     taken = wrong = 0

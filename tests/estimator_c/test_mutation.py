@@ -48,7 +48,6 @@ def test_a_resumed_run_keeps_what_neither_core_nor_tests_have_made_doubtful(tmp_
     assert set(mutate.recalled(record, mutate.mutants(), {explained.key}).values()) == {outcomes[0], outcomes[2]}
 
 
-@pytest.mark.timeout(900)
 def test_mutants_by_chance_are_noticed_or_explained(tmp_path: Path) -> None:
     """In a process of its own: every test there has the library of a mutant."""
     out = tmp_path / "mutation.json"

@@ -30,7 +30,6 @@ def excited(edges_n: int, samples: int, seed: int) -> tuple[Codes, Codes]:
     return suspension([(0, FRONT)], np.linspace(10.0, 50.0 * edges_n - 40.0, edges_n), samples, 1.0, seed)
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("noise_lsb", [0.0, 1.0], ids=["silent", "1 LSB of noise"])
 def test_ten_million_samples_without_excitation_do_no_harm(estimator: Estimator, noise_lsb: float) -> None:
     """The driver asks est_invariants_hold() after every sample: theta finite, every d positive and finite."""

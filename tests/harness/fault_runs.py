@@ -177,7 +177,8 @@ def play(case: Case, opened: Opened | None = None, timeout_s: float = TIMEOUT_S)
     played = _play(link, description, case)
     link.close()
     played.took_s, played.frames = clock() - started_s, line.frames
-    assert played.took_s < LONGEST_RUN_S, f"{case}: it took {played.took_s:.1f} s"
+    if opened is None:  # over a real line the clock is that of a machine that has other work
+        assert played.took_s < LONGEST_RUN_S, f"{case}: it took {played.took_s:.1f} s"
     assert line.waiting + _kept(link) < MOST_WAITING, f"{case}: too much waits"
     if played.run is not None and played.outcome in {"as without", "lost"}:
         _check_estimates(played.run, case)

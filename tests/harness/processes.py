@@ -6,8 +6,8 @@ import os
 import select
 from pathlib import Path
 
-LONG_S = 20.0
-"""For what comes at once unless something is broken."""
+LONG_S = 600.0
+"""Limit for an event that comes at once unless something is broken, also under a load of ten."""
 
 
 def children(pid: int) -> list[int]:

@@ -16,7 +16,7 @@ RIG = """\
 [rig.bench]
 kind = "real"
 instrument = "redpitaya://{address}"
-timeout_s = 2.0
+timeout_s = 60.0
 generator.gain = 10.0
 inputs.force = {{ input = 1, range = "HV" }}
 inputs.displacement = {{ input = 2, range = "HV" }}

@@ -38,6 +38,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario, Tweak
+from tests.harness.processes import LONG_S
 
 SPEC = """
 trials = 6
@@ -216,7 +217,7 @@ def started(spec: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
 
 def until_lines(process: subprocess.Popen[bytes], path: Path, lines: int) -> None:
     """Until the journal has so many lines; fails if the campaign ends before."""
-    deadline_s = time.monotonic() + 60.0
+    deadline_s = time.monotonic() + LONG_S
     while not path.exists() or path.read_bytes().count(b"\n") < lines:
         assert process.poll() is None and time.monotonic() < deadline_s
         time.sleep(0.01)
@@ -231,7 +232,7 @@ def test_campaign_that_was_ended_in_the_middle_gives_the_same_file(
     process = started(tmp_path / "spec.toml", out)
     until_lines(process, journal_of(out), 4)
     process.send_signal(ended_by)
-    _, complaint = process.communicate(timeout=60)
+    _, complaint = process.communicate(timeout=LONG_S)
     assert process.returncode == status
     assert not out.exists()
     done = journal_of(out).read_bytes().count(b"\n") - 1
@@ -324,7 +325,7 @@ def test_worker_that_is_killed_while_it_has_no_task_is_replaced() -> None:
     for _, pid in Processes(1).play(_own_pid, iter(range(MOST_DEATHS + 1))):
         workers.append(pid)
         os.kill(pid, signal.SIGKILL)
-        deadline_s = time.monotonic() + 30.0
+        deadline_s = time.monotonic() + LONG_S
         while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline_s:
             time.sleep(0.01)  # until the pool has noticed, and buried it
     assert len(set(workers)) == MOST_DEATHS + 1
@@ -338,8 +339,8 @@ def test_workers_end_with_the_campaign_that_was_killed(tmp_path: Path) -> None:
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     assert len(children) >= 2
     process.kill()
-    process.communicate(timeout=60)
-    deadline_s = time.monotonic() + 30.0
+    process.communicate(timeout=LONG_S)
+    deadline_s = time.monotonic() + LONG_S
     while any(Path(f"/proc/{child}/cmdline").exists() for child in children):
         assert time.monotonic() < deadline_s
         time.sleep(0.01)
@@ -349,7 +350,7 @@ def test_campaign_on_dask_with_a_worker_killed_gives_the_file_of_one_process(tmp
     script = Path(__file__).with_name("campaign_on_dask.py")
     planned(tmp_path)
     command: list[str | Path] = [sys.executable, script, tmp_path / "spec.toml", tmp_path / "dask.json"]
-    ran = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert ran.returncode == 0, ran.stderr
     assert "killed a worker" in ran.stdout
     assert (tmp_path / "dask.json").read_bytes() == reference.read_bytes()
@@ -681,10 +682,20 @@ def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Pa
     """A limit on the size of files stands for a disk that is full."""
     planned(tmp_path)
     out = tmp_path / "out.json"
-    command = (
-        f"ulimit -f 4; exec {sys.executable} -m analogrig.cli campaign {tmp_path / 'spec.toml'} --out {out} --workers 1"
-    )
-    ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
+    limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))"
+    limited = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
+    command = [
+        sys.executable,
+        "-m",
+        "analogrig.cli",
+        "campaign",
+        tmp_path / "spec.toml",
+        "--out",
+        out,
+        "--workers",
+        "1",
+    ]
+    ended = subprocess.run([*limited, *command], capture_output=True, text=True, timeout=LONG_S, check=False)
     assert ended.returncode == 2
     assert ended.stderr == f"analogrig: {journal_of(out)}: File too large\n"
     assert journal_of(out).read_bytes().count(b"\n") > 1

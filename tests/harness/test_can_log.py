@@ -30,6 +30,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import LOST, Run
 from analogrig.scenario import Scenario
+from tests.harness.processes import LONG_S
 
 DBC = Path(__file__).parents[2] / "estimator_c" / "catalogue" / "analogrig.dbc"
 
@@ -96,7 +97,7 @@ def without(frames: list[can.Message], *places: int) -> list[can.Message]:
 
 def ran(*words: str, given: bytes = b"") -> str:
     return subprocess.run(
-        [sys.executable, *words], input=given, capture_output=True, check=True, timeout=60
+        [sys.executable, *words], input=given, capture_output=True, check=True, timeout=LONG_S
     ).stdout.decode()
 
 
@@ -476,7 +477,7 @@ def test_measurement_that_is_damaged_is_refused_in_one_line(
     cut = tmp_path / "cut.mf4"
     cut.write_bytes(whole[:3000])
     words = ["-m", "analogrig.cli", "judge", str(cut), "--scenario", "thesis", "--out", str(tmp_path)]
-    done = subprocess.run([sys.executable, *words], capture_output=True, check=False, timeout=60)
+    done = subprocess.run([sys.executable, *words], capture_output=True, check=False, timeout=LONG_S)
     assert done.returncode == 2
     assert done.stderr.decode().startswith(f"analogrig: {cut}: holds no run of a device: {cut} is damaged after 0 ")
     assert done.stderr.count(b"\n") == 1

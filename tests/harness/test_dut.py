@@ -729,7 +729,7 @@ def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
 def host() -> Iterator[tuple[Dut, int]]:
     """A device that is a process, and its number."""
     wire = host_wire()
-    dut = Dut(FramedLink(wire), HostDevice(name="host", timeout_s=0.1))
+    dut = Dut(FramedLink(wire), HostDevice(name="host", timeout_s=2.0))
     dut.handshake()
     dut.configure()
     dut.start()
@@ -749,7 +749,7 @@ def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, int]) -> None:
     dut, pid = host
     feed(dut, 0, 82)
     os.kill(pid, signal.SIGSTOP)
-    with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 0.1 s \(last message: Stepped 81\)"):
+    with pytest.raises(LinkTimeout, match=r"no estimate for sample 82 within 2 s \(last message: Stepped 81\)"):
         feed(dut, 82, N)
 
 

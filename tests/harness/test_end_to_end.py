@@ -23,10 +23,9 @@ from analogrig.devices.devices import HOST_PROGRAM
 from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware
-from tests.harness.processes import descendants
+from tests.harness.processes import LONG_S, descendants
 from tests.harness.runs import made_run
 
-TIMEOUT_S = 60.0
 ENVIRONMENT = {key: value for key, value in os.environ.items() if not key.startswith("ANALOGRIG_")}
 
 
@@ -34,7 +33,7 @@ def analogrig(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[
     command = [sys.executable, "-m", "analogrig.cli", *map(str, arguments)]
     environment = {**ENVIRONMENT, "PYTHONPATH": str(Path(__file__).parents[2])}
     return subprocess.run(
-        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=LONG_S, check=False
     )
 
 
@@ -290,7 +289,7 @@ def long_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        deadline_s = time.monotonic() + TIMEOUT_S
+        deadline_s = time.monotonic() + LONG_S
         while True:
             assert time.monotonic() < deadline_s
             pids = descendants(process.pid)[1:]  # behind the tether
@@ -305,7 +304,7 @@ def long_run(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
 def test_device_that_dies_in_the_run_makes_it_inconclusive(tmp_path: Path) -> None:
     with long_run(tmp_path) as (process, device_pid):
         os.kill(device_pid, signal.SIGKILL)
-        _, errors = process.communicate(timeout=TIMEOUT_S)
+        _, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 3
     (line,) = errors.splitlines()
     assert line.startswith("analogrig: INCONCLUSIVE: ")
@@ -318,7 +317,7 @@ def test_device_that_dies_in_the_run_makes_it_inconclusive(tmp_path: Path) -> No
 def test_interrupted_run_keeps_what_it_has(tmp_path: Path) -> None:
     with long_run(tmp_path) as (process, _):
         process.send_signal(signal.SIGINT)
-        out, errors = process.communicate(timeout=TIMEOUT_S)
+        out, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 130, errors
     assert "INCONCLUSIVE" in out
     assert "Traceback" not in errors
@@ -329,7 +328,7 @@ def test_killed_harness_leaves_no_device_behind(tmp_path: Path) -> None:
     with long_run(tmp_path) as (process, device_pid):
         process.kill()
         process.wait()
-        deadline_s = time.monotonic() + 5.0
+        deadline_s = time.monotonic() + LONG_S
         while Path(f"/proc/{device_pid}").exists() and time.monotonic() < deadline_s:
             time.sleep(0.01)
         assert not Path(f"/proc/{device_pid}").exists()
@@ -341,7 +340,7 @@ def test_closed_pipe_does_not_turn_a_failed_verdict_into_success(tmp_path: Path)
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        command, cwd=tmp_path, env=environment, stdout=writer, stderr=subprocess.PIPE, timeout=TIMEOUT_S, check=False
+        command, cwd=tmp_path, env=environment, stdout=writer, stderr=subprocess.PIPE, timeout=LONG_S, check=False
     )
     os.close(writer)
     assert done.returncode == 1
@@ -354,7 +353,7 @@ def test_run_whose_output_nobody_hears_is_kept_and_judged(tmp_path: Path) -> Non
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        command, cwd=tmp_path, env=environment, stdout=writer, stderr=writer, timeout=TIMEOUT_S, check=False
+        command, cwd=tmp_path, env=environment, stdout=writer, stderr=writer, timeout=LONG_S, check=False
     )
     os.close(writer)
     assert done.returncode == 0

@@ -29,9 +29,7 @@ from analogrig.protocol.catalogue import (
     Stepped,
     pack,
 )
-
-LONG_S = 20.0
-"""For what comes at once unless something is broken."""
+from tests.harness.processes import LONG_S
 
 
 class Terminal:

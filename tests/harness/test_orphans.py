@@ -17,12 +17,9 @@ from pathlib import Path
 import pytest
 
 from tests.harness.firmware import needs_firmware
+from tests.harness.processes import LONG_S
 
 KILLS = 12
-GONE_WITHIN_S = 5.0
-"""The tether waits a second for a device that does not end when it is asked."""
-LONG_S = 60.0
-"""For what takes a second unless something is broken."""
 
 
 def marked(mark: str) -> list[int]:
@@ -38,7 +35,7 @@ def marked(mark: str) -> list[int]:
 
 
 def gone(mark: str) -> bool:
-    deadline_s = time.monotonic() + GONE_WITHIN_S
+    deadline_s = time.monotonic() + LONG_S
     while marked(mark) and time.monotonic() < deadline_s:
         time.sleep(0.01)
     return not marked(mark)

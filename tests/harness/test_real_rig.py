@@ -258,7 +258,7 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
     with served("--defect", defect, *second) as instrument:
         file = instrument.rigs_file(tmp_path)
         if "drop_out" in defect:
-            file.write_text(file.read_text().replace("timeout_s = 2.0", "timeout_s = 0.5"))
+            file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 2.0"))
         with open_rig(str(file)) as rig:
             blocks = rig.perform(SHORT, 1).blocks
             with pytest.raises(FAILURES[defect], match=instrument.address):
@@ -288,7 +288,7 @@ def test_what_is_no_instrument_is_a_named_error(answer: bytes | None, error: typ
         thread.start()
         file = tmp_path / "rigs.toml"
         file.write_text(
-            RIG.format(address=f"127.0.0.1:{listening.getsockname()[1]}", self_test="false").replace("2.0", "0.2")
+            RIG.format(address=f"127.0.0.1:{listening.getsockname()[1]}", self_test="false").replace("60.0", "0.2")
         )
         with open_rig(str(file)) as rig, pytest.raises(error):
             next(rig.perform(SHORT, 1).blocks)
@@ -326,7 +326,6 @@ def test_run_that_is_ended_leaves_the_generator_off(number: signal.Signals, stat
     silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
     with served(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
-        file.write_text(file.read_text().replace("timeout_s = 2.0", "timeout_s = 60.0"))
         command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
         with subprocess.Popen(
             [*command, "--rig", str(file)], cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -357,7 +356,7 @@ WRONG = {
     "redpitaya://": ("picoscope://", "give it as redpitaya://HOST[:PORT] or nidaqmx://CARD"),
     "timeout_s": ("time_out_s", "unknown key 'time_out_s'"),
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
-    "timeout_s = 2.0": ("timeout_s = 2.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
+    "timeout_s = 60.0": ("timeout_s = 60.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
     "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
     '2, range = "HV"': ('2, range = "HV", least_v = 900.0', "inputs.displacement: 0 V at the computer must be within"),
     "127.0.0.1:1": ("127.0.0.1:1/?timeout=1", "give it as redpitaya://HOST[:PORT]"),
@@ -464,7 +463,6 @@ def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) 
 # ---- the shipped tests
 
 
-@pytest.mark.timeout(600)
 def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
     with served() as instrument:
         outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}  # no worker's

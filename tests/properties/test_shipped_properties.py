@@ -24,8 +24,6 @@ from analogrig.scenario import Scenario
 from analogrig.testing.properties.test_detection import SINGLY
 from tests.harness.firmware import needs_firmware
 
-pytestmark = pytest.mark.timeout(300)
-
 LONG = "rarer_than or of_all_kinds or stay_rare or noticed_soon or faults_of_the_line"
 """Those for which a line is too slow; its faults are tried apart, with short time-outs."""
 

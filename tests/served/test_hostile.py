@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from analogrig.hardware.simulator.scpi import MOST_ERRORS
+from tests.harness.processes import LONG_S
 from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
-from tests.served.serving import LONG_S, Served, ended, serving
+from tests.served.serving import Served, ended, serving
 from tests.served.talk import SEQUENCE, asking, interpreter, record, say
 
 ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from analogrig import config
 from analogrig.hardware.simulator.description import InstrumentDescription
-from tests.served.serving import LONG_S, serving
+from tests.harness.processes import LONG_S
+from tests.served.serving import serving
 from tests.served.talk import interpreter
 
 SECTION = (

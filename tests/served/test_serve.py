@@ -20,7 +20,8 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
 from analogrig_emulator.excitation import Excitation
-from tests.served.serving import LONG_S, Served, ended, serving
+from tests.harness.processes import LONG_S
+from tests.served.serving import Served, ended, serving
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
 
 LSB_V = 40.0 / 2**14

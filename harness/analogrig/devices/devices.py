@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from urllib.parse import unquote
 
-from analogrig import config
+from analogrig import config, device_program
 from analogrig.errors import ConfigurationError, LinkError
 from analogrig.links.child import Child, ChildWire
 from analogrig.links.faulty_wire import FaultyWire
@@ -32,7 +32,7 @@ from analogrig.protocol.estimator_config import EstimatorConfig
 if TYPE_CHECKING:  # python-can takes longer to import than all the rest
     from analogrig.links.can_bus import CanBus, PythonCanBus
 
-HOST_PROGRAM = Path(__file__).parents[1] / "bin" / "analogrig-device"
+HOST_PROGRAM = device_program.PROGRAM
 FIRMWARE = Path(__file__).parents[3] / "build" / "firmware"
 
 QEMU = "qemu-system-arm"
