@@ -684,18 +684,9 @@ def test_campaign_goes_on_when_there_is_room_again(tmp_path: Path, reference: Pa
     out = tmp_path / "out.json"
     limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))"
     limited = [sys.executable, "-c", f"{limit}; os.execv(sys.argv[1], sys.argv[1:])"]
-    command = [
-        sys.executable,
-        "-m",
-        "analogrig.cli",
-        "campaign",
-        tmp_path / "spec.toml",
-        "--out",
-        out,
-        "--workers",
-        "1",
-    ]
-    ended = subprocess.run([*limited, *command], capture_output=True, text=True, timeout=LONG_S, check=False)
+    command = [*limited, sys.executable, "-m", "analogrig.cli", "campaign", str(tmp_path / "spec.toml")]
+    command += ["--out", str(out), "--workers", "1"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
     assert ended.returncode == 2
     assert ended.stderr == f"analogrig: {journal_of(out)}: File too large\n"
     assert journal_of(out).read_bytes().count(b"\n") > 1
