@@ -14,11 +14,14 @@ STRICT_CC ?= gcc clang
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
 BIN := $(VENV)/bin
+ZIG := $(BUILD)/zig
+PYTHONS ?= $(foreach version,3.11 3.12 3.13,$(if $(shell python$(version) -c '' 2>/dev/null && echo found),python$(version)))
 
 PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
             harness/analogrig/bin/analogrig-tether harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
 NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
+PYTHON_PACKAGES := $(foreach depth,* */* */*/* */*/*/*,$(wildcard harness/$(depth).py emulator/$(depth).py))
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 
 # The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
@@ -40,7 +43,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test tools check lint strict format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -56,6 +59,9 @@ run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="
 
 test: check $(if $(call found,arm-none-eabi-gcc),firmware,no-firmware) ## check, then every test that this machine can run; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+
+test-bare: ## make test on a PATH that has python3, a C compiler, make, git and coreutils alone
+	@$(PYTHON) -m tests.bare $(if $(PYTEST_ARGS),PYTEST_ARGS='$(PYTEST_ARGS)')
 
 check: lint strict ## linters, types, and the C with every warning an error
 
@@ -127,6 +133,29 @@ mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sa
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
+
+wheels: $(BUILD)/wheels/.made ## build manylinux wheels for x86_64 and aarch64 into build/wheels; downloads zig, 100 MB
+
+test-wheels: wheels ## run the wheels of make wheels, each Python of PYTHONS in an environment of its own
+	@ANALOGRIG_WHEELS=$(BUILD)/wheels ANALOGRIG_PYTHONS="$(PYTHONS)" ANALOGRIG_ZIG=$(ZIG)/bin \
+	    $(BIN)/pytest tests/test_manylinux.py $(PYTEST_ARGS)
+
+# zig is a C compiler for every platform. Newer releases than 0.14.1 define B115200 otherwise than glibc 2.17 has it, so
+# that analogrig-device cannot set up its terminal, which auditwheel does not notice.
+$(ZIG)/.made: Makefile
+	@rm -rf $(ZIG) && $(PYTHON) -m venv $(ZIG)
+	@$(ZIG)/bin/python -m pip install --quiet ziglang==0.14.1 auditwheel==6.8.2
+	@touch $@
+
+$(BUILD)/wheels/.made: $(ZIG)/.made $(PRODUCTS) setup.py pyproject.toml $(PYTHON_PACKAGES) $(wildcard fixtures/*/*.toml)
+	@rm -rf $(@D) && mkdir -p $(@D)
+	@for machine in x86_64 aarch64; do \
+	    CC="$(CURDIR)/$(ZIG)/bin/python -m ziglang cc -target $$machine-linux-gnu.2.17" CFLAGS= LDFLAGS=-s \
+	    $(BIN)/python -m build --no-isolation --wheel --config-setting=--build-option=--plat-name=manylinux_2_17_$$machine \
+	        --outdir $(@D) . >$(@D)/log 2>&1 || { cat $(@D)/log >&2; exit 1; }; \
+	done
+	@for wheel in $(@D)/*.whl; do $(ZIG)/bin/auditwheel show $$wheel; done
+	@touch $@
 
 lock: ## resolve requirements.lock again from pyproject.toml; needs uv
 	@$(PYTHON) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], sep="\n")' | \

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 collect_ignore = ["user_repository"]  # test_packaging.py runs it where it belongs
+if "ANALOGRIG_WHEELS" not in os.environ:
+    collect_ignore.append("test_manylinux.py")
 
 __all__ = ["distributions", "environment", "users_environment", "wheel"]  # the fixtures of tests/wheels.py
 

@@ -11,7 +11,6 @@ import os
 import shutil
 import subprocess
 import sys
-import venv
 from pathlib import Path
 
 import pytest
@@ -35,9 +34,9 @@ def run(*command: str | Path, cwd: Path | None = None, status: int = 0, **variab
     return done.stdout
 
 
-def environment_with(folder: Path, *requirements: str | Path) -> Path:
+def environment_with(folder: Path, *requirements: str | Path, python: str = sys.executable) -> Path:
     """Make an environment that holds the requirements and their dependencies alone; return its folder of programs."""
-    venv.create(folder, with_pip=False, symlinks=True)
+    run(python, "-m", "venv", "--without-pip", folder)
     run(sys.executable, "-m", "pip", "--python", folder, "install", "--quiet", *requirements, cwd=folder)
     return folder / "bin"
 
