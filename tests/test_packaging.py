@@ -100,7 +100,7 @@ def test_codec_that_is_generated_from_the_shipped_catalogue_is_the_shipped_one(
     run(users_environment / "python", generate, tmp_path / "c", tmp_path / "tables.py")
     names = {path.name for path in generated.iterdir()}
     assert names == {path.name for path in (tmp_path / "c").iterdir()}
-    assert filecmp.cmpfiles(generated, tmp_path / "c", names)[0] == sorted(names)
+    assert filecmp.cmpfiles(generated, tmp_path / "c", sorted(names), shallow=False)[0] == sorted(names)
 
 
 def test_every_scenario_rig_and_device_is_shipped(distributions: Path, wheel: Path) -> None:
