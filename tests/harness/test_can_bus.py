@@ -16,6 +16,7 @@ import pytest
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links.can_bus import PythonCanBus, completed
 from analogrig.links.line import CanLine
+from tests.harness.processes import LONG_S
 
 FRAME = can.Message(arbitration_id=0x18, is_extended_id=False, data=bytes(8))
 
@@ -44,12 +45,12 @@ def _no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_frames_pass_in_both_directions(bus: PythonCanBus, channel: str) -> None:
     with can.Bus(interface="virtual", channel=channel) as other:
         bus.send(FRAME)
-        heard = other.recv(1.0)
+        heard = other.recv(LONG_S)
         assert heard is not None and heard.equals(
             FRAME, timestamp_delta=None, check_channel=False, check_direction=False
         )
         other.send(FRAME)
-        assert bus.receive(1.0) is not None
+        assert bus.receive(LONG_S) is not None
         assert bus.receive(0.0) is None
 
 

@@ -19,7 +19,7 @@ import pytest
 from analogrig import config
 from analogrig.errors import ConfigurationError, RigError
 from analogrig.hardware.pots import NoPots, OperatorPots, Pots, PotsDescription
-from tests.harness.processes import ends
+from tests.harness.processes import LONG_S, ends
 
 DIALS = {"K": 0.6380, "B": 0.8152}
 WORDS = "K 18000 N/m, B 3453 N s/m"
@@ -181,7 +181,7 @@ class Box:
         return out
 
     def close(self) -> None:
-        self._thread.join(10.0)
+        self._thread.join(LONG_S)
         os.close(self._far)
         os.close(self._near)
 
@@ -292,7 +292,7 @@ def asked(terminal: Terminal, typed: bytes, *, turn: bool) -> tuple[str, list[Ba
     shown = terminal.shown(b"press Enter: ")
     assert waiting.is_alive(), "did not wait for the operator"
     terminal.type(typed)
-    waiting.join(10.0)
+    waiting.join(LONG_S)
     assert not waiting.is_alive()
     pots.close()
     return shown, failed
