@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from estimator_c.evidence import bit_exact, cost
-from tests import tools
+from tests import bare, tools
 from tests.wheels import CHECKOUT
 
 SKIPS = """
@@ -109,6 +109,7 @@ def test_session_ends_with_a_table_of_the_missing_tools(
         ],
         consecutive=True,
     )
+    assert bare.waited_for(result.stdout.str()) == {"cppcheck", "qemu-arm", "ngspice"}
 
 
 def test_reason_of_a_skip_names_every_missing_tool(waiting: pytest.Pytester) -> None:

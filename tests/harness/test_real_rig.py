@@ -180,7 +180,7 @@ def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
         thread.start()
         file = tmp_path / "rigs.toml"
         address = f"127.0.0.1:{listening.getsockname()[1]}"
-        file.write_text(RIG.format(address=address, self_test="false").replace("2.0", "0.5"))
+        file.write_text(RIG.format(address=address, self_test="false").replace("60.0", "0.5"))
         with open_allowed(str(file)) as rig, pytest.raises(RigTimeout, match=r"no (whole )?answer within 0.5 s"):
             next(rig.perform(SHORT, 1).blocks)
         done.set()
@@ -258,7 +258,7 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
     second = ("--defect", "acquisition.drop_out_record=2")  # the first one is taken while the computer comes to rest
     with served("--defect", defect, *second) as instrument:
         file = instrument.rigs_file(tmp_path)
-        if "drop_out" in defect:
+        if FAILURES[defect] is RigTimeout:
             file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 2.0"))
         with open_allowed(str(file)) as rig:
             blocks = rig.perform(SHORT, 1).blocks
