@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 
 PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
             harness/analogrig/bin/analogrig-tether harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
-NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/engine/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 

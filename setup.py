@@ -36,7 +36,7 @@ UPLOT = {
 PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
-ENGINE_SOURCES = ("emulator/analogrig_emulator/*.c",)
+ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
@@ -44,7 +44,7 @@ TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
 DATA = Path("analogrig")
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
 OTHER_SOURCES = (
-    "emulator/analogrig_emulator/*.h",
+    "emulator/analogrig_emulator/engine/*.h",
     "estimator_c/core/*.h",
     "estimator_c/device/*.h",
     "estimator_c/ports/*/*.h",
