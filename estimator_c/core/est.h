@@ -123,27 +123,27 @@ typedef enum {
 /// Everything that is fixed before a run. P is in units of the noise variance of y: P = 10 means a prior standard
 /// deviation of sqrt(10) times that of the noise.
 typedef struct {
-    uint8_t na;               ///< order of A, 1 .. EST_NA_MAX
-    uint8_t nb;               ///< number of b's, 1 .. EST_NB_MAX
-    uint8_t nk;               ///< delay of the first b, 0 .. EST_NK_MAX; 0 is the direct term y(k) <- u(k), which a
-                              ///< free-running generator needs
-    uint8_t nc;               ///< estimate so many coefficients of C as well (extended least squares, thesis Equ 3.11),
-                              ///< 0 .. EST_NC_MAX; na + nb + nc + offset must not exceed EST_THETA_MAX
-    bool    offset;           ///< estimate the constant d as well
-    bool    noise_estimated;  ///< follow the variance of the noise, beginning with noise_variance
-    uint16_t refresh_n;       ///< take C from the estimate of A after so many equations and each time A has moved; 0: never
-    uint8_t  stuck_n;         ///< y is stuck once it was the same for so many samples after an edge of u; 0: never
-    uint16_t idle_n;          ///< excitation is lost once u had no edge for so many samples; 0: never
+    uint8_t na;       ///< order of A, 1 .. EST_NA_MAX
+    uint8_t nb;       ///< number of b's, 1 .. EST_NB_MAX
+    uint8_t nk;       ///< delay of the first b, 0 .. EST_NK_MAX; 0 is the direct term y(k) <- u(k), which a
+                      ///< free-running generator needs
+    uint8_t nc;       ///< estimate so many coefficients of C as well (extended least squares, thesis Equ 3.11),
+                      ///< 0 .. EST_NC_MAX; na + nb + nc + offset must not exceed EST_THETA_MAX
+    bool     offset;  ///< estimate the constant d as well
+    bool     noise_estimated;  ///< follow the variance of the noise, beginning with noise_variance
+    uint16_t refresh_n;  ///< take C from the estimate of A after so many equations and each time A has moved; 0: never
+    uint8_t  stuck_n;    ///< y is stuck once it was the same for so many samples after an edge of u; 0: never
+    uint16_t idle_n;     ///< excitation is lost once u had no edge for so many samples; 0: never
     est_edge_instants_t edge_instants;
-    float   forgetting;      ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
-    float   random_walk;     ///< variance by which each parameter walks per equation (thesis Equ 3.23); 0 .. 1e9
-    float   p0;              ///< initial variance of each a, b and c; > 0
-    float   p0_offset;       ///< initial variance of d; > 0 [codes^2]
-    float   noise_variance;  ///< of the noise e, not underestimated; > 0 [codes^2]
-    float   c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: none. Zeros inside the unit circle
-    float   edge_codes;      ///< a step of u at least this large is an edge; > 0, at most EST_CODE_LIMIT [codes]
-    float   code_low;        ///< u or y at or below code_low, or at or above code_high, is saturated: beyond the range of
-    float   code_high;       ///< the converter [codes]; at most EST_CODE_LIMIT in magnitude
+    float               forgetting;  ///< lambda of thesis Equ 3.21; 0.5 .. 1, 1 forgets nothing
+    float random_walk;     ///< variance by which each parameter walks per equation (thesis Equ 3.23); 0 .. 1e9
+    float p0;              ///< initial variance of each a, b and c; > 0
+    float p0_offset;       ///< initial variance of d; > 0 [codes^2]
+    float noise_variance;  ///< of the noise e, not underestimated; > 0 [codes^2]
+    float c[EST_NA_MAX];   ///< prefilter C = 1 + c[0] z^-1 + ...; all zero: none. Zeros inside the unit circle
+    float edge_codes;      ///< a step of u at least this large is an edge; > 0, at most EST_CODE_LIMIT [codes]
+    float code_low;        ///< u or y at or below code_low, or at or above code_high, is saturated: beyond the range of
+    float code_high;       ///< the converter [codes]; at most EST_CODE_LIMIT in magnitude
     est_trigger_config_t trigger;
 } est_config_t;
 
@@ -155,10 +155,11 @@ typedef struct {
 } est_sample_t;
 
 typedef enum {
-    EST_UPDATED   = 0,  ///< the sample entered the estimate
-    EST_MISSING   = 1,  ///< the sample was declared missing: theta and its covariance stay as they were
-    EST_REFUSED   = 2,  ///< u or y was not finite, saturated or stuck: counted, otherwise as a missing sample
-    EST_GATHERING = 3,  ///< the sample was taken in, but the samples that its equation reaches back to are not all known
+    EST_UPDATED = 0,  ///< the sample entered the estimate
+    EST_MISSING = 1,  ///< the sample was declared missing: theta and its covariance stay as they were
+    EST_REFUSED = 2,  ///< u or y was not finite, saturated or stuck: counted, otherwise as a missing sample
+    EST_GATHERING =
+        3,  ///< the sample was taken in, but the samples that its equation reaches back to are not all known
 } est_status_t;
 
 /// A sample of larger magnitude than this is refused [codes].
@@ -181,15 +182,15 @@ typedef struct {
 
 /// Counters since est_init(). They saturate, they do not wrap.
 typedef struct {
-    uint32_t updated;    ///< samples taken in, those without an equation included
+    uint32_t updated;  ///< samples taken in, those without an equation included
     uint32_t missing;
     uint16_t refused;    ///< not finite or absurd, saturated, stuck
     uint16_t saturated;  ///< of those
     uint16_t stuck;      ///< of those
     uint16_t alarms;
-    uint16_t restarts;  ///< how often the equations began afresh, the first time included
-    uint16_t slips;     ///< how often the edges of u began to be recorded one sample earlier or later
-    uint16_t refreshes; ///< how often C was taken from the estimate of A
+    uint16_t restarts;   ///< how often the equations began afresh, the first time included
+    uint16_t slips;      ///< how often the edges of u began to be recorded one sample earlier or later
+    uint16_t refreshes;  ///< how often C was taken from the estimate of A
 } est_counters_t;
 
 #define EST_UPPER_N ((EST_THETA_MAX * (EST_THETA_MAX - 1U)) / 2U)
@@ -215,17 +216,17 @@ typedef struct {
 
 /// Makes the noise of consecutive equations white. Private to est_whitener.h.
 typedef struct {
-    float c[EST_NA_MAX];
-    float gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< of the newest equation first
-    float precision[EST_NA_MAX];  ///< of the whitened equations, newest first; 0: there was none
-    est_past_t past[EST_THETA_MAX + 1U];  ///< of the elements of the equation
+    float      c[EST_NA_MAX];
+    float      gain[EST_GAINS_KEPT][EST_NA_MAX];  ///< of the newest equation first
+    float      precision[EST_NA_MAX];             ///< of the whitened equations, newest first; 0: there was none
+    est_past_t past[EST_THETA_MAX + 1U];          ///< of the elements of the equation
 } est_whitener_t;
 
 /// What the edges of u since a moment of doubt would have done, had they come one sample early or late. Private.
 typedef struct {
     est_past_t early;  ///< their share in the whitened equations
     est_past_t late;
-    float   theta[EST_THETA_MAX];  ///< what was believed before the doubt began
+    float      theta[EST_THETA_MAX];  ///< what was believed before the doubt began
 } est_edges_t;
 
 /// The readings of the recent edges besides the recorded one: one sample early, one sample late.
@@ -235,8 +236,8 @@ typedef struct {
 typedef struct {
     float    statistic;
     float    rival[EST_OTHER_READINGS];  ///< the cumulative sum as it would be under the other readings
-    uint16_t quiet_n;                   ///< innovations for which the statistic is still held at zero
-    uint16_t mean_n;                    ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
+    uint16_t quiet_n;                    ///< innovations for which the statistic is still held at zero
+    uint16_t mean_n;                     ///< innovations in the mean between faults, which is rival[0]; 0: begins anew
 } est_trigger_t;
 
 /// The values of est_t.renewal. Private.
@@ -251,17 +252,17 @@ typedef struct {
 /// offset below 128 bytes is a shorter instruction.
 typedef struct {
     const est_config_t* config;
-    uint8_t             same_n;     ///< samples since an edge of u for which y has been the same
-    uint8_t             pending_n;  ///< samples to come before the next equation is complete
-    bool                adaptive;   ///< there is more to adapt than theta and C
-    uint8_t             renewal;    ///< what is to be done to P before the next equation
-    bool                known;      ///< the sample before this one is known; if not, samples are pending
-    bool                settled;    ///< the gains of the whitener are c, and its variance is 1
-    uint16_t            refresh_in;  ///< equations to come before C is considered; 0: never
-    uint16_t            edge_age_n;  ///< samples since the last edge of u
-    uint8_t             doubt_n;  ///< samples since the first edge in doubt, that one included; 0: no doubt
+    uint8_t             same_n;          ///< samples since an edge of u for which y has been the same
+    uint8_t             pending_n;       ///< samples to come before the next equation is complete
+    bool                adaptive;        ///< there is more to adapt than theta and C
+    uint8_t             renewal;         ///< what is to be done to P before the next equation
+    bool                known;           ///< the sample before this one is known; if not, samples are pending
+    bool                settled;         ///< the gains of the whitener are c, and its variance is 1
+    uint16_t            refresh_in;      ///< equations to come before C is considered; 0: never
+    uint16_t            edge_age_n;      ///< samples since the last edge of u
+    uint8_t             doubt_n;         ///< samples since the first edge in doubt, that one included; 0: no doubt
     float               noise_variance;  ///< [codes^2]
-    float               y[EST_NA_MAX];               ///< y(k-1), y(k-2), ...
+    float               y[EST_NA_MAX];   ///< y(k-1), y(k-2), ...
     float               u[EST_INPUT_PAST_MAX + 2U];  ///< u(k), u(k-1), ...
     est_trigger_t       trigger;
     est_counters_t      counters;
@@ -270,7 +271,7 @@ typedef struct {
     est_whitener_t      whitener;
     est_edges_t         edges;
 #if EST_NC_MAX > 0
-    float               residual[EST_NC_MAX];  ///< of the equations before this one, newest first
+    float residual[EST_NC_MAX];  ///< of the equations before this one, newest first
 #endif
 } est_t;
 

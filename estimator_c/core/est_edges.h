@@ -18,10 +18,8 @@ static inline bool est_edges_is_edge(const est_config_t* const config, const flo
 
 /// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed. An edge one sample early would have
 /// entered the equation before; if that was none, the gains are such that this does not count.
-EST_INLINE void est_edges_begin(est_edges_t* const        self,
-                                const est_config_t* const config,
-                                const float* const        theta,
-                                const float               step) {
+EST_INLINE void
+est_edges_begin(est_edges_t* const self, const est_config_t* const config, const float* const theta, const float step) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->early.x[i] = 0.0F;

@@ -80,13 +80,13 @@ EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint_fast8_t count               = est_shape_count(shape);  // cppcheck F3
-    const float* const phi                 = equation->phi;
-    const float        weight              = forgetting * self->weight;
+    const uint_fast8_t count  = est_shape_count(shape);  // cppcheck F3
+    const float* const phi    = equation->phi;
+    const float        weight = forgetting * self->weight;
     float              gain[EST_THETA_MAX] EST_ZEROED;  // P phi, unscaled; MISRA D2
-    float              alpha               = weight * equation->variance;
-    float              inverse             = 0.0F;  // 1 / alpha, once there are u's that want it
-    float*             column              = self->upper;
+    float              alpha   = weight * equation->variance;
+    float              inverse = 0.0F;  // 1 / alpha, once there are u's that want it
+    float*             column  = self->upper;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < count; j++) {
         float f = phi[j];

@@ -26,7 +26,8 @@
 #endif
 
 #ifdef EST_FIXED_NA
-#if (EST_FIXED_NA > EST_NA_MAX) || (EST_FIXED_NB > EST_NB_MAX) || (EST_FIXED_NK > EST_NK_MAX) || (EST_FIXED_NC > EST_NC_MAX)
+#if (EST_FIXED_NA > EST_NA_MAX) || (EST_FIXED_NB > EST_NB_MAX) || (EST_FIXED_NK > EST_NK_MAX) ||                       \
+    (EST_FIXED_NC > EST_NC_MAX)
 #error "the orders that are fixed must not be beyond the largest: EST_NA_MAX and so on"
 #endif
 #endif

@@ -21,7 +21,8 @@ void can_device_init(can_device_t* const self, const device_identity_t* const id
 
 /// Whether a frame can be one of the harness: its identifier, and a kind of frame that carries data.
 static bool is_ours(const can_frame_t* const frame) {
-    return ((frame->flags | CAN_FRAME_FD) == CAN_FRAME_FD) && (frame->id <= UINT8_MAX) && analogrig_is_from_harness((uint8_t)frame->id);
+    return ((frame->flags | CAN_FRAME_FD) == CAN_FRAME_FD) && (frame->id <= UINT8_MAX) &&
+           analogrig_is_from_harness((uint8_t)frame->id);
 }
 
 /// A message of more than eight bytes needs CAN FD; a shorter one may come in either.

@@ -15,7 +15,7 @@
 #define CAN_FRAME_EXTENDED 1U  ///< its identifier has 29 bits
 #define CAN_FRAME_REMOTE 2U    ///< it asks for a frame, and carries nothing
 #define CAN_FRAME_FD 4U
-#define CAN_FRAME_ERROR 8U     ///< the controller tells of an error; it was never on the bus
+#define CAN_FRAME_ERROR 8U  ///< the controller tells of an error; it was never on the bus
 
 typedef struct {
     uint32_t id;

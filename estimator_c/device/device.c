@@ -17,7 +17,7 @@
 #error "the mask of missing samples has 16 bits"
 #endif
 
-#define RUN_MAX 7U      ///< of the run ids, which have three bits
+#define RUN_MAX 7U  ///< of the run ids, which have three bits
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
 #define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE
@@ -83,7 +83,8 @@ static void status(const device_t* const self, device_message_t* const answer, c
     (void)analogrig_status_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void estimate(const device_t* const self, device_message_t* const answer, const uint8_t element, const float value) {
+static void
+estimate(const device_t* const self, device_message_t* const answer, const uint8_t element, const float value) {
     const struct analogrig_estimate_t message = {
         .seq = self->seq, .element = element, .sample_index = self->next_index, .value = value
     };

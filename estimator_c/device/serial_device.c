@@ -33,11 +33,8 @@ static bool take_message(serial_device_t* const self, const uint8_t* const in, c
     return is_whole;
 }
 
-device_progress_t serial_device_run(serial_device_t* const self,
-                                    const uint8_t* const   in,
-                                    const size_t           in_n,
-                                    uint8_t* const         out,
-                                    const size_t           out_n) {
+device_progress_t serial_device_run(
+    serial_device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
     SERIAL_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     const uint32_t    hash     = self->decoder.catalogue_hash;
     device_progress_t progress = { .taken = 0U, .given = 0U };

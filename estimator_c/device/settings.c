@@ -13,8 +13,8 @@ typedef struct {
 
 #define MEMBER(name, member, most)                                                                                     \
     {                                                                                                                  \
-        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((settings_t*)0)->member),           \
-        .offset = (uint16_t)offsetof(settings_t, member), .limit = (most)                                            \
+        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((settings_t*)0)->member),             \
+        .offset = (uint16_t)offsetof(settings_t, member), .limit = (most)                                              \
     }
 
 #define NUMBER(name, member) MEMBER(name, member, 0U)
@@ -114,7 +114,8 @@ static bool acceptable(const field_t field, const float value) {
     for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
         base.estimator.c[i] = 0.0F;
     }
-    return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) && (base.force_zero <= EST_CODE_LIMIT);
+    return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) &&
+           (base.force_zero <= EST_CODE_LIMIT);
 }
 
 settings_t settings_default(void) {

@@ -110,7 +110,8 @@ static bool decode(const uint8_t* const line, const uint8_t n, can_frame_t* cons
     const bool    is_extended = (frame->flags & CAN_FRAME_EXTENDED) != 0U;
     const uint8_t digits      = is_extended ? EXTENDED_DIGITS : STANDARD_DIGITS;
     const uint8_t head        = (uint8_t)(digits + 2U);
-    if ((n < head) || !number(&line[1], digits, &frame->id) || (frame->id > (is_extended ? EXTENDED_MAX : STANDARD_MAX))) {
+    if ((n < head) || !number(&line[1], digits, &frame->id) ||
+        (frame->id > (is_extended ? EXTENDED_MAX : STANDARD_MAX))) {
         return false;
     }
     const uint8_t code  = digit(line[head - 1U]);

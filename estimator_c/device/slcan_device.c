@@ -30,11 +30,8 @@ static size_t enter(slcan_device_t* const self, const uint8_t byte, uint8_t* con
     return event.reply_n;
 }
 
-device_progress_t slcan_device_run(slcan_device_t* const self,
-                                   const uint8_t* const  in,
-                                   const size_t          in_n,
-                                   uint8_t* const        out,
-                                   const size_t          out_n) {
+device_progress_t slcan_device_run(
+    slcan_device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
     SLCAN_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     device_progress_t progress = { .taken = 0U, .given = 0U };
     while ((out_n - progress.given) >= SLCAN_DEVICE_ANSWER) {

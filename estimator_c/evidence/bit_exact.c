@@ -195,7 +195,8 @@ static bool run(record_t* const self, const uint32_t number) {
 
 static void enter_diagnosis(record_t* const self, const est_diagnosis_t diagnosis) {
     enter_bits(self, (uint32_t)diagnosis.change | ((uint32_t)diagnosis.samples_n << 8U));
-    enter_bits(self, diagnosis.onset_n | ((uint32_t)diagnosis.onset_low_n << 8U) | ((uint32_t)diagnosis.onset_high_n << 16U));
+    enter_bits(self,
+               diagnosis.onset_n | ((uint32_t)diagnosis.onset_low_n << 8U) | ((uint32_t)diagnosis.onset_high_n << 16U));
     enter_number(self, diagnosis.extent);
 }
 

@@ -21,7 +21,7 @@ OUTSIDE void reset(void) {
     (void)est_init(&estimator, &config);
     const est_sample_t sample = { .u = sink, .y = sink, .valid = true };
     const est_step_t   step   = est_step(&estimator, sample);
-    sink                  = step.statistic + est_theta(&estimator, 0U);
+    sink                      = step.statistic + est_theta(&estimator, 0U);
 #ifdef FOOTPRINT_ALL
     sink = est_variance(&estimator, 0U) + est_noise_variance(&estimator);
     sink = (float)(est_counters(&estimator).alarms + est_theta_count(&estimator));

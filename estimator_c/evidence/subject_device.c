@@ -35,10 +35,10 @@ static size_t frame_of(const uint8_t id, const uint8_t* const payload, uint8_t* 
 }
 
 SUBJECT void subject_begin(void) {
-    const device_identity_t         identity = { .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH, .input_blocks = 1U };
-    const struct analogrig_control_t start   = { .seq = seq, .command = ANALOGRIG_CONTROL_COMMAND_START_CHOICE };
-    uint8_t                         payload[ANALOGRIG_CONTROL_LENGTH];
-    uint8_t                         frame[FRAME_SIZE(ANALOGRIG_CONTROL_LENGTH)];
+    const device_identity_t identity = { .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH, .input_blocks = 1U };
+    const struct analogrig_control_t start = { .seq = seq, .command = ANALOGRIG_CONTROL_COMMAND_START_CHOICE };
+    uint8_t                          payload[ANALOGRIG_CONTROL_LENGTH];
+    uint8_t                          frame[FRAME_SIZE(ANALOGRIG_CONTROL_LENGTH)];
     serial_device_init(&device, &identity);
     (void)analogrig_control_pack(payload, &start, sizeof(payload));
     const size_t frame_n = frame_of(ANALOGRIG_CONTROL_FRAME_ID, payload, frame);

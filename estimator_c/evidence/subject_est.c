@@ -57,5 +57,6 @@ static bool is_isolated(void) {
 SUBJECT uint32_t subject_judge(void) {
     const est_counters_t counters = est_counters(&estimator);
     return (est_invariants_hold(&estimator) ? 0U : 1U) | ((counters.alarms == 1U) ? 0U : 2U) |
-           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U) | (is_isolated() ? 0U : 16U);
+           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U) |
+           (is_isolated() ? 0U : 16U);
 }

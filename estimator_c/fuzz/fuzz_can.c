@@ -15,8 +15,7 @@ static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
 }
 
 /// Now and then in the wrong kind of frame, or with another identifier of the same last byte.
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     can_frame_t   frame  = { .id = id, .length = analogrig_length(id) };
     const uint8_t choice = take_byte(input);
     frame.flags          = (frame.length > CAN_FRAME_CLASSIC_MAX) ? CAN_FRAME_FD : 0U;

@@ -97,14 +97,16 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     static answers_t        answers;
     static answers_t        answers_at_once;
     const target_t          kind     = target(data, size);
-    const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH, .boot_nonce = 1U, .firmware_id = 1U };
+    const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH,
+                                         .boot_nonce     = 1U,
+                                         .firmware_id    = 1U };
     const size_t            sizes_n  = (size > 0U) ? ((data[0] < size) ? data[0] : (size - 1U)) : 0U;
     input_t                 sizes    = { .bytes = &data[(size > 0U) ? 1U : 0U], .n = sizes_n };
-    input_t                 input    = { .bytes = &sizes.bytes[sizes_n], .n = (size > 0U) ? (size - 1U - sizes_n) : 0U };
-    stream.n                         = 0U;
-    stream.seq                       = 0U;
-    answers.n                        = 0U;
-    answers_at_once.n                = 0U;
+    input_t                 input = { .bytes = &sizes.bytes[sizes_n], .n = (size > 0U) ? (size - 1U - sizes_n) : 0U };
+    stream.n                      = 0U;
+    stream.seq                    = 0U;
+    answers.n                     = 0U;
+    answers_at_once.n             = 0U;
     target_begin(&stream);
     while ((input.n > 0U) && (stream.n < (STREAM_MAX - NOISE_MAX))) {
         add_next(&stream, &input);

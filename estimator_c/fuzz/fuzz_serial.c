@@ -6,8 +6,7 @@
 
 void target_begin(stream_t* const stream) { (void)stream; }
 
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     (void)input;
     stream->n += frame_encode(ANALOGRIG_CATALOGUE_HASH, id, payload, &stream->bytes[stream->n]);
 }

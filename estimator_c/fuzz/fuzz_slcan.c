@@ -25,8 +25,7 @@ static void add_text(stream_t* const stream, const char* const text) {
 void target_begin(stream_t* const stream) { add_text(stream, "O\r"); }
 
 /// Now and then in the wrong kind of frame, or a digit too long.
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     const slcan_t adapter = { .is_open = true };
     const uint8_t choice  = take_byte(input);
     can_frame_t   frame   = { .id = id, .length = analogrig_length(id) };

@@ -144,7 +144,9 @@ static void keep(est_isolation_t* const self, const est_sample_t sample, const f
 }
 
 /// Measured u, counted from where F = 0.
-static float force(const est_isolation_t* const self, const uint32_t ago) { return kept(self, ago)->u - self->force_zero; }
+static float force(const est_isolation_t* const self, const uint32_t ago) {
+    return kept(self, ago)->u - self->force_zero;
+}
 
 /// The force on the plant in the past sample, times what it does to y, since an onset `age_n` samples ago. An edge of u may
 /// come anywhere within the interval, as the b's tell: b_0, if nk is 0, is the share of the new level.
@@ -168,12 +170,12 @@ static float pushed(const est_isolation_t* const self, const uint32_t ago, const
 /// is how d, by which the plant leaves its course, follows from a change of M, of B, or of K: linear in each.
 static void drive(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
     const est_believed_t* const plant = &self->believed;
-    float spring;
-    float damper;
+    float                       spring;
+    float                       damper;
     if (age_n == 1U) {  // the second of the two samples matters half as much: the force acts from the first on
         const float rise = kept(self, ago)->y - kept(self, ago + 1U)->y;
-        spring = plant->hold * (kept(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
-        damper = plant->hold * plant->lag_n * rise;
+        spring           = plant->hold * (kept(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
+        damper           = plant->hold * plant->lag_n * rise;
     } else {
         spring = 0.0F;
         damper = 0.0F;
@@ -202,7 +204,8 @@ static void enter_residual(est_isolation_t* const self, const uint32_t ago) {
     self->residual[0] = out;
 }
 
-static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
+static void
+enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
     float        first[PUSH];
     const float* driving = self->driving;
     float*       matrix  = onset->matrix;
@@ -253,7 +256,8 @@ typedef struct {
 } one_t;
 
 /// Of the pair i > j, whose number is i + j - 1; `ij`: their element of the normal equations.
-static void weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
+static void
+weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
     const uint8_t pair  = (uint8_t)(i + j - 1U);
     const float   share = ij / ones[j].known;
     const float   left  = greater(ones[i].known - (ij * share), PRIOR);  // is not less but for rounding
@@ -262,12 +266,17 @@ static void weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint
     const float   both  = ones[j].gain + (rest * x);
     fit->any_pair[pair] = either(fit->any_pair[pair], both);
     fit->beside[j]      = greater(fit->beside[j], if_worth_telling(both, x, left));
-    fit->beside[i] =
-        greater(fit->beside[i], if_worth_telling(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
+    fit->beside[i]      = greater(
+             fit->beside[i], if_worth_telling(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
 }
 
 /// What an onset explains, with normal equations of M, B and K alone; `gain`: what it explains without them.
-static void weigh(est_fit_t* const fit, const float* const matrix, const float* const vector, const float gain, const uint8_t number, const uint8_t before_n) {
+static void weigh(est_fit_t* const   fit,
+                  const float* const matrix,
+                  const float* const vector,
+                  const float        gain,
+                  const uint8_t      number,
+                  const uint8_t      before_n) {
     one_t        ones[PUSH];
     const float* row = matrix;
     for (uint8_t i = 0U; i < PUSH; i++) {
@@ -338,9 +347,9 @@ static float unlikely(const float extent) { return 0.5F * ((extent + (1.0F / ext
 /// What can be said so far.
 static est_change_t verdict(const est_fit_t* const fit) {
     static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
-    const uint8_t one    = best(fit);
-    const float   likely = fit->any_alone[one] - unlikely(extent_of(alone[one], fit->change[one]));
-    bool          sure   = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
+    const uint8_t             one      = best(fit);
+    const float               likely   = fit->any_alone[one] - unlikely(extent_of(alone[one], fit->change[one]));
+    bool                      sure     = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
                 ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
     for (uint8_t other = 0U; other < 3U; other++) {
         if (other != one) {
@@ -411,13 +420,13 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
         self->onsets[i] = (est_onset_t){ .before_n = before(i, earliest_n) };
     }
-    self->active         = true;
-    self->turn           = 0U;
-    self->worked_n       = 0U;
-    self->waiting_n      = self->onsets[0].before_n;
-    self->nats           = 0.5F / est_noise_variance(estimator);
-    self->residual[0]    = kept(self, self->waiting_n)->innovation;
-    self->residual[1]    = kept(self, self->waiting_n + 1U)->innovation;
+    self->active      = true;
+    self->turn        = 0U;
+    self->worked_n    = 0U;
+    self->waiting_n   = self->onsets[0].before_n;
+    self->nats        = 0.5F / est_noise_variance(estimator);
+    self->residual[0] = kept(self, self->waiting_n)->innovation;
+    self->residual[1] = kept(self, self->waiting_n + 1U)->innovation;
 }
 
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
@@ -450,7 +459,10 @@ static void enter_quiet(est_isolation_t* const self, const est_t* const estimato
     }
 }
 
-void est_isolation_enter(est_isolation_t* const self, const est_t* const estimator, const est_sample_t sample, const est_step_t step) {
+void est_isolation_enter(est_isolation_t* const self,
+                         const est_t* const     estimator,
+                         const est_sample_t     sample,
+                         const est_step_t       step) {
     EST_ASSERT((self != NULL) && (estimator != NULL));
     self->since_n = one_more(self->since_n);
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {

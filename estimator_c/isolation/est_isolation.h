@@ -47,11 +47,11 @@ typedef enum {
 
 typedef struct {
     est_change_t change;
-    float        extent;       ///< of that parameter, new over old; 1 unless it is one parameter that has changed
-    uint16_t     samples_n;    ///< samples after the alarm that this rests on
-    uint16_t     onset_n;      ///< from the likeliest of the onsets that were tried to the alarm [samples]
-    uint16_t     onset_low_n;  ///< and from the last and the first of those that do as well but for a factor of e^2. They
-    uint16_t     onset_high_n; ///< are far apart where the changed parameter had no effect yet
+    float        extent;     ///< of that parameter, new over old; 1 unless it is one parameter that has changed
+    uint16_t     samples_n;  ///< samples after the alarm that this rests on
+    uint16_t     onset_n;    ///< from the likeliest of the onsets that were tried to the alarm [samples]
+    uint16_t onset_low_n;    ///< and from the last and the first of those that do as well but for a factor of e^2. They
+    uint16_t onset_high_n;   ///< are far apart where the changed parameter had no effect yet
 } est_diagnosis_t;
 
 /// A sample. Private.
@@ -63,10 +63,11 @@ typedef struct {
 
 /// How the plant would have left its course since one onset. Private.
 typedef struct {
-    float past[EST_ISOLATION_EFFECTS_N][2];                                      ///< each effect, newest first
-    float matrix[EST_ISOLATION_EFFECTS_N * (EST_ISOLATION_EFFECTS_N + 1U) / 2U]; ///< normal equations: lower triangle by rows
-    float vector[EST_ISOLATION_EFFECTS_N];                                       ///< and right-hand side
-    uint8_t before_n;                                                            ///< from this onset to the alarm
+    float   past[EST_ISOLATION_EFFECTS_N][2];  ///< each effect, newest first
+    float   matrix[EST_ISOLATION_EFFECTS_N * (EST_ISOLATION_EFFECTS_N + 1U) /
+                 2U];                       ///< normal equations: lower triangle by rows
+    float   vector[EST_ISOLATION_EFFECTS_N];  ///< and right-hand side
+    uint8_t before_n;                         ///< from this onset to the alarm
 } est_onset_t;
 
 /// What changes explain, in nats: the best of all onsets, or all of them together (any_). Private.
@@ -89,31 +90,31 @@ typedef struct {
     float lag_n;      ///< B / K
     float spring[3];  ///< K y and B y' for F: what they add to the equation of y from y(k), y(k-1), y(k-2)
     float damper[3];
-    float rest;     ///< y where F = 0 [codes]
-    float gain;     ///< y per u at rest
+    float rest;  ///< y where F = 0 [codes]
+    float gain;  ///< y per u at rest
 } est_believed_t;
 
 /// The fields are private; read est_isolation_diagnosis().
 typedef struct {
     const est_config_t* config;
-    float           force_zero;  ///< u where F = 0 [codes]
-    float           nats;       ///< per squared code of residual
-    uint8_t         newest;     ///< in kept
-    uint8_t         known_n;    ///< in kept, without a gap
-    bool            quiet;      ///< the statistic has been zero: theta of the last such sample is the plant as it was
-    uint8_t         since_n;    ///< samples since the alarm
-    uint8_t         waiting_n;  ///< samples still to be worked on
-    uint8_t         turn;       ///< the slice of the sample to work on
-    uint8_t         slices_n;   ///< that this sample takes
-    uint16_t        worked_n;   ///< samples from the first onset to the one worked on
-    bool            active;     ///< after an alarm
-    est_believed_t  believed;
-    float           driving[3];   ///< what drives the effects of M, B, K since an earlier sample
-    float           residual[2];  ///< y less what the plant as it was would have done, newest first
-    est_fit_t       fit;
-    est_diagnosis_t diagnosis;
-    est_onset_t     onsets[EST_ISOLATION_ONSETS_N];  ///< the first onset first
-    est_kept_t      kept[EST_ISOLATION_KEPT_N];
+    float               force_zero;  ///< u where F = 0 [codes]
+    float               nats;        ///< per squared code of residual
+    uint8_t             newest;      ///< in kept
+    uint8_t             known_n;     ///< in kept, without a gap
+    bool                quiet;    ///< the statistic has been zero: theta of the last such sample is the plant as it was
+    uint8_t             since_n;  ///< samples since the alarm
+    uint8_t             waiting_n;  ///< samples still to be worked on
+    uint8_t             turn;       ///< the slice of the sample to work on
+    uint8_t             slices_n;   ///< that this sample takes
+    uint16_t            worked_n;   ///< samples from the first onset to the one worked on
+    bool                active;     ///< after an alarm
+    est_believed_t      believed;
+    float               driving[3];   ///< what drives the effects of M, B, K since an earlier sample
+    float               residual[2];  ///< y less what the plant as it was would have done, newest first
+    est_fit_t           fit;
+    est_diagnosis_t     diagnosis;
+    est_onset_t         onsets[EST_ISOLATION_ONSETS_N];  ///< the first onset first
+    est_kept_t          kept[EST_ISOLATION_KEPT_N];
 } est_isolation_t;
 
 /// Ready for the first sample of an estimator with this configuration, which is kept as est_init() keeps it. `force_zero` is

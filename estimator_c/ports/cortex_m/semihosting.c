@@ -27,7 +27,7 @@ uint32_t semihosting_argument(void) {
     struct {
         char*    text;
         uint32_t size;
-    } block = { .text = line, .size = sizeof(line) };
+    } block        = { .text = line, .size = sizeof(line) };
     uint32_t value = 0U;
     if (call(SYS_GET_CMDLINE, &block) != 0U) {
         return value;

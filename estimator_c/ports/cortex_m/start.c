@@ -12,12 +12,12 @@
 int main(void);
 
 /// Set by mps2.ld.
-extern uint32_t data_begin;
-extern uint32_t data_end;
+extern uint32_t       data_begin;
+extern uint32_t       data_end;
 extern const uint32_t data_image;
-extern uint32_t bss_begin;
-extern uint32_t bss_end;
-extern uint32_t stack_top;
+extern uint32_t       bss_begin;
+extern uint32_t       bss_end;
+extern uint32_t       stack_top;
 
 /// The port has them.
 void serial_receive_interrupt(void);
@@ -69,7 +69,7 @@ __attribute__((section(".vectors"), used)) static const struct {
     .stack  = &stack_top,
     .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
                 NULL, unexpected, unexpected },
-    .board  = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
+    .board = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
 };
 
 // What the compiler calls on its own. Volatile, or it might take their loops for calls of themselves.
@@ -92,8 +92,8 @@ void* memcpy(void* const restrict to, const void* const restrict from, const siz
 }
 
 void* memmove(void* const to, const void* const from, const size_t n) {
-    volatile uint8_t* const bytes  = to;
-    const uint8_t* const    source = from;
+    volatile uint8_t* const bytes   = to;
+    const uint8_t* const    source  = from;
     const bool              is_down = (uintptr_t)to < (uintptr_t)from;
     for (size_t i = 0U; i < n; i++) {
         const size_t at = is_down ? i : (n - 1U - i);  // what is overwritten has been read

@@ -37,8 +37,8 @@ bool library_start(library_t* self);
 
 /// n samples, one after the other. A sample counts as missing where valid[] is 0; a null pointer: all are valid.
 /// Returns the number of alarms.
-size_t library_run(
-    library_t* self, size_t n, const float* u, const float* y, const uint8_t* valid, const library_out_t* out);
+size_t
+library_run(library_t* self, size_t n, const float* u, const float* y, const uint8_t* valid, const library_out_t* out);
 
 /// Parameters of theta.
 uint8_t library_theta_count(const library_t* self);
