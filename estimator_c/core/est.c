@@ -1,19 +1,11 @@
 #include "est.h"
+#include "est_assert.h"
 #include "est_edges.h"
 #include "est_equation.h"
 #include "est_trigger.h"
 
 #include <float.h>
 #include <stddef.h>
-
-#ifndef EST_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define EST_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define EST_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
 
 /// Orders of the default configuration: those fixed by the build, else ARX(2, 3) with offset. A build with less room
 /// drops the offset first, then b's, then a's.

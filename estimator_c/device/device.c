@@ -1,17 +1,9 @@
 #include "device.h"
+#include "est_assert.h"
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
 #include "settings.h"
-
-#ifndef DEVICE_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define DEVICE_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
 
 #if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
 #error "the mask of missing samples has 16 bits"
@@ -476,14 +468,14 @@ static void on_message(device_t* const self, const uint8_t id, const uint8_t* co
 }
 
 void device_init(device_t* const self, const device_identity_t* const identity) {
-    DEVICE_ASSERT((self != 0) && (identity != 0));
+    EST_ASSERT((self != 0) && (identity != 0));
     *self          = (device_t){ 0 };
     self->identity = *identity;
     reset(self);
 }
 
 void device_enter(device_t* const self, const uint8_t id, const uint8_t* const payload) {
-    DEVICE_ASSERT((self != 0) && (payload != 0) && !device_is_busy(self));
+    EST_ASSERT((self != 0) && (payload != 0) && !device_is_busy(self));
     if (!analogrig_is_from_harness(id)) {
         add_saturating(&self->counters.messages_refused, 1U);
         return;
@@ -495,7 +487,7 @@ void device_enter(device_t* const self, const uint8_t id, const uint8_t* const p
 }
 
 bool device_answer(device_t* const self, device_message_t* const answer) {
-    DEVICE_ASSERT((self != 0) && (answer != 0));
+    EST_ASSERT((self != 0) && (answer != 0));
     bool has_answer = true;
     switch (self->job) {
     case DEVICE_GREETING:
@@ -534,21 +526,21 @@ bool device_answer(device_t* const self, device_message_t* const answer) {
 }
 
 void device_overrun(device_t* const self, const uint32_t lost_n) {
-    DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     add_saturating(&self->counters.receive_overruns, lost_n);
 }
 
 void device_dropped(device_t* const self, const uint32_t frames_n) {
-    DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     add_saturating(&self->counters.frames_dropped, frames_n);
 }
 
 void device_foreign(device_t* const self, const uint32_t frames_n) {
-    DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     add_saturating(&self->counters.frames_foreign, frames_n);
 }
 
 bool device_is_busy(const device_t* const self) {
-    DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     return self->job != DEVICE_IDLE;
 }

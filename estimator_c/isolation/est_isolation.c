@@ -1,15 +1,7 @@
 #include "est_isolation.h"
+#include "est_assert.h"
 
 #include <stddef.h>
-
-#ifndef EST_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define EST_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define EST_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
 
 #define EFFECTS EST_ISOLATION_EFFECTS_N
 #define PUSH 3U  ///< index of the impulse, which stands for an onset between two samples; M, B and K come before it
