@@ -1,5 +1,5 @@
-/// Uses what a program uses of the estimator, so that the linker keeps that and drops the rest; with -DFOOTPRINT_ALL the
-/// whole of its interface, with -DFOOTPRINT_ISOLATES isolation too.
+/// Call the functions that a typical program calls, so that the linker keeps them and drops the rest. -DFOOTPRINT_ALL
+/// adds the rest of the interface, -DFOOTPRINT_ISOLATES isolation.
 
 #include "est.h"
 #include "est_isolation.h"

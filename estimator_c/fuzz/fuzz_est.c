@@ -1,5 +1,6 @@
-/// libFuzzer target over the public API of core and isolation: any configuration, any samples, any time to work; the
-/// invariants must hold after every step, and nothing may be read or written that is not there. `make fuzz` builds and runs it.
+/// libFuzzer target for the public API of core and isolation: any configuration, any samples, any number of slices of
+/// work. The invariants must hold after every step, and the sanitizers must find nothing. `make fuzz` builds and runs
+/// it.
 
 #include "est.h"
 #include "est_isolation.h"
@@ -33,7 +34,7 @@ static uint8_t byte(input_t* const input) {
     return *input->bytes++;
 }
 
-/// Half of them any bit pattern, half of them a code.
+/// Return a number: any bit pattern, or a code, with equal probability.
 static float number(input_t* const input) {
     const uint8_t kind = byte(input);
     if ((kind & 1U) != 0U) {
@@ -51,7 +52,7 @@ static float trigger(void* const context, const float innovation, const float va
     return (anew || !(variance > 0.0F)) ? 0.0F : ((innovation * innovation) / variance);
 }
 
-/// Most values come from the defaults, or almost no configuration would be valid.
+/// Return a configuration. Most values are defaults, otherwise almost no configuration would be valid.
 static est_config_t configuration(input_t* const input) {
     est_config_t config       = est_config_default();
     config.na                 = (uint8_t)(byte(input) % (EST_NA_MAX + 2U));
@@ -93,7 +94,7 @@ static void expect(const bool holds) {
 
 static bool number_is_finite(const float x) { return (x - x) == 0.0F; }
 
-/// Entered, and worked on for so many slices, whether it pays or not.
+/// Enter a step into the isolation, and call est_isolation_work() this many times, whatever it returns.
 static void isolate(est_isolation_t* const isolation,
                     const est_t* const     estimator,
                     const est_sample_t     sample,

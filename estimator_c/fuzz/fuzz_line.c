@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-/// A block's worth of samples, or all the counters: no message has more answers.
+/// Upper bound of the answers to one message: all answers to the samples of a block. There are fewer counters.
 #define ANSWERS_PER_MESSAGE (ANALOGRIG_SAMPLE_BLOCK_FORCE_N * (EST_THETA_MAX + 3U))
 
 void expect(const bool holds) {
@@ -26,8 +26,8 @@ uint8_t take_byte(input_t* const input) {
     return *input->bytes++;
 }
 
-/// A message of the harness, mostly with the sequence number that is due; values that no fuzzer finds in reasonable time,
-/// identifiers and checksums, are made for it.
+/// Add a message of the harness, mostly with the expected sequence number. Identifiers and checksums are computed,
+/// because a fuzzer does not find them in reasonable time.
 static void add_message(stream_t* const stream, input_t* const input) {
     static const uint8_t ids[] = { ANALOGRIG_SAMPLE_FRAME_ID,   ANALOGRIG_SAMPLE_BLOCK_FRAME_ID,
                                    ANALOGRIG_CONTROL_FRAME_ID,  ANALOGRIG_CONFIGURE_FRAME_ID,
@@ -53,7 +53,8 @@ static void add_next(stream_t* const stream, input_t* const input) {
     }
 }
 
-/// The stream in pieces into the device, its answers in pieces out of it; sizes come from the input, the largest without one.
+/// Pass the stream to the device in pieces, and take its answers in pieces. The sizes come from the input, or are the
+/// largest.
 static void play(const target_t* const kind,
                  void* const           state,
                  const stream_t* const stream,
@@ -83,7 +84,7 @@ void expect_answer(const uint8_t id, const uint8_t* const payload, const size_t 
     expect(payload[0] == (uint8_t)number);
 }
 
-/// The state of any shell.
+/// State of any shell.
 typedef union {
     serial_device_t serial;
     can_device_t    can;

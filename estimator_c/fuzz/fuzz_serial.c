@@ -1,4 +1,4 @@
-/// libFuzzer target over the device on a serial line, as fuzz_line.h has it. `make fuzz` builds and runs it.
+/// libFuzzer target for the device on a serial line; see fuzz_line.h. `make fuzz` builds and runs it.
 
 #include "analogrig_catalogue.h"
 #include "fuzz_line.h"
@@ -27,7 +27,7 @@ size_t target_messages(const stream_t* const stream) {
     return frames;
 }
 
-/// Nothing but whole frames.
+/// Expects complete frames only.
 size_t target_checked(const answers_t* const answers) {
     frame_decoder_t decoder;
     frame_decoder_init(&decoder, ANALOGRIG_CATALOGUE_HASH);
