@@ -11,6 +11,7 @@ FUZZ_S ?= 60
 FAULTS_N ?= 100000
 FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
+CLANG_FORMAT ?= clang-format-14
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
 BIN := $(VENV)/bin
@@ -20,6 +21,8 @@ PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.
 NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/engine/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
+C_SOURCES := $(wildcard $(foreach folder,emulator/*/engine harness/*/* estimator_c/* estimator_c/ports/* estimator_c/ports/*/* tests/* tests/*/src,\
+                 $(folder)/*.[ch]))
 
 # The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
 CORES := m0 m3 m4 m7
@@ -40,7 +43,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test check lint strict format bench firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
+.PHONY: help setup run test check lint strict layout format bench firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -55,7 +58,7 @@ run: $(PRODUCTS) ## play the thesis's suspension and judge the estimator; ARGS="
 test: check firmware ## check, then every test; PYTEST_ARGS="-k frame" goes to pytest
 	@$(BIN)/pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
-check: lint strict ## linters, types, and the C with every warning an error
+check: lint strict layout ## linters, types, the layout of the C, and the C with every warning an error
 
 lint: $(PRODUCTS)
 	@$(BIN)/ruff check --quiet --output-format concise $(PYTHON_SOURCES)
@@ -64,9 +67,16 @@ lint: $(PRODUCTS)
 
 strict: $(STRICT_CC:%=$(BUILD)/strict/%.ok)
 
-format: $(PRODUCTS) ## lay out the Python sources
+layout:
+	@if command -v $(CLANG_FORMAT) >/dev/null; then \
+	    $(CLANG_FORMAT) --dry-run --Werror $(C_SOURCES) || { echo "the layout of some C files differs: make format"; exit 1; }; \
+	elif test -n "$$ANALOGRIG_CI"; then echo "$(CLANG_FORMAT) is absent: apt-get install $(CLANG_FORMAT)" >&2; exit 1; \
+	else echo "$(CLANG_FORMAT) is absent, so the layout of the C was not checked (apt-get install $(CLANG_FORMAT))"; fi
+
+format: $(PRODUCTS) ## lay out the Python sources, and the C with clang-format
 	@$(BIN)/ruff check --quiet --select I --fix $(PYTHON_SOURCES)
 	@$(BIN)/ruff format $(PYTHON_SOURCES)
+	@$(CLANG_FORMAT) -i $(C_SOURCES)
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
