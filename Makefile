@@ -11,6 +11,7 @@ FUZZ_S ?= 60
 FAULTS_N ?= 100000
 FAULTS_SEED ?= 0
 STRICT_CC ?= gcc clang
+CLANG_FORMAT ?= clang-format-14
 STRICT_CFLAGS ?= -Wall -Wextra -Wconversion -Wdouble-promotion -Wfloat-equal -pedantic -Werror
 
 BIN := $(VENV)/bin
@@ -19,10 +20,12 @@ PYTHONS ?= $(foreach version,3.11 3.12 3.13,$(if $(shell python$(version) -c '' 
 
 PRODUCTS := harness/analogrig/_catalogue.py emulator/analogrig_emulator/_engine.so harness/analogrig/_device.so harness/analogrig/bin/analogrig-device \
             harness/analogrig/bin/analogrig-tether harness/analogrig/reporting/uPlot.iife.min.js harness/analogrig/reporting/uPlot.min.css
-NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
+NATIVE_SOURCES := $(wildcard emulator/analogrig_emulator/engine/*.[ch] harness/analogrig/devices/*.c estimator_c/*/*.[ch] estimator_c/ports/*/*.[ch] \
                   estimator_c/catalogue/*.dbc estimator_c/catalogue/*.py)
 PYTHON_PACKAGES := $(foreach depth,* */* */*/* */*/*/*,$(wildcard harness/$(depth).py emulator/$(depth).py))
 PYTHON_SOURCES := emulator harness estimator_c tests setup.py
+C_SOURCES := $(wildcard $(foreach folder,emulator/*/engine harness/*/* estimator_c/* estimator_c/ports/* estimator_c/ports/*/* tests/* tests/*/src,\
+                 $(folder)/*.[ch]))
 
 # The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
 CORES := m0 m3 m4 m7
@@ -43,7 +46,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -63,7 +66,7 @@ test: check $(if $(call found,arm-none-eabi-gcc),firmware,no-firmware) ## check,
 test-bare: ## make test on a PATH that has python3, a C compiler, make, git and coreutils alone
 	@$(PYTHON) -m tests.bare $(if $(PYTEST_ARGS),PYTEST_ARGS='$(PYTEST_ARGS)')
 
-check: lint strict ## linters, types, and the C with every warning an error
+check: lint strict layout ## linters, types, the layout of the C, and the C with every warning an error
 
 lint: $(PRODUCTS)
 	@$(BIN)/ruff check --quiet --output-format concise $(PYTHON_SOURCES)
@@ -72,9 +75,16 @@ lint: $(PRODUCTS)
 
 strict: $(STRICT_CC:%=$(BUILD)/strict/%.ok)
 
-format: $(PRODUCTS) ## lay out the Python sources
+layout:
+	@if command -v $(CLANG_FORMAT) >/dev/null; then \
+	    $(CLANG_FORMAT) --dry-run --Werror $(C_SOURCES) || { echo "the layout of some C files differs: make format"; exit 1; }; \
+	elif test "$$ANALOGRIG_CI" = 1; then echo "$(CLANG_FORMAT) is absent: make tools" >&2; exit 1; \
+	else echo "$(CLANG_FORMAT) is absent, so the layout of the C is not checked: make tools"; fi
+
+format: $(PRODUCTS) ## lay out the Python sources, and the C with clang-format
 	@$(BIN)/ruff check --quiet --select I --fix $(PYTHON_SOURCES)
 	@$(BIN)/ruff format $(PYTHON_SOURCES)
+	@$(CLANG_FORMAT) -i $(C_SOURCES)
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)

@@ -36,7 +36,7 @@ UPLOT = {
 PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
-ENGINE_SOURCES = ("emulator/analogrig_emulator/*.c",)
+ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
 DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimator_c/device/*.c")
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
@@ -54,7 +54,7 @@ ESTIMATOR = (
 SHIPPED = (*FIXTURES, *ESTIMATOR)
 GENERATED = tuple(f"analogrig_{part}.{suffix}" for part in ("catalogue", "codec") for suffix in "ch")
 """C that comes from the catalogue. The wheel has it in estimator_c/generated, a checkout in build/generated."""
-OTHER_SOURCES = ("emulator/analogrig_emulator/*.h", *SHIPPED)
+OTHER_SOURCES = ("emulator/analogrig_emulator/engine/*.h", *SHIPPED)
 
 # Without contraction the estimates are the same bits on every machine: these come last, after the user's CFLAGS.
 # A computer has room for extended least squares as well.

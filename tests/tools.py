@@ -31,6 +31,7 @@ PACKAGES = {
     "gcc": "gcc",
     "gcov": "gcc",
     "clang": "clang libclang-rt-dev",
+    "clang-format-14": "clang-format-14",
     "clang-tidy": "clang-tidy",
     "cppcheck": "cppcheck",
     "frama-c": "frama-c-base",

@@ -1,4 +1,4 @@
-"""The engine: a piecewise-linear circuit, stepped exactly from sample to sample (engine.c, which explains how)."""
+"""The engine: a piecewise-linear circuit, stepped exactly from sample to sample (engine/engine.h explains how)."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ class Turns:
 
 
 def _laid_out(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[np.float64], list[int]]:
-    """One block of memory with the arrays of struct engine_system, and where each begins in it, in bytes."""
+    """One block of memory with the arrays of engine_system_t, and where each begins in it, in bytes."""
     rows = system.rows(outputs)
     arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
     parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
@@ -297,5 +297,5 @@ def _laid_out(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[
 
 @functools.lru_cache(maxsize=64)
 def _kink_table(kinks: tuple[Kink, ...]) -> NDArray[np.float64]:
-    """One struct engine_kink a row: (kinks, 8)."""
+    """One engine_kink_t a row: (kinks, 8)."""
     return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)

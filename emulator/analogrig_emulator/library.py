@@ -1,4 +1,4 @@
-"""The compiled half of the emulator (engine.c), found beside this file and loaded on first use."""
+"""The compiled half of the emulator (engine/), found beside this file and loaded on first use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .errors import EngineError
 
 __all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "System", "load"]
 
-# The limits of engine.h.
+# The limits of engine/engine.h.
 MAX_STATES = 32
 MAX_INPUTS = 8
 MAX_KINKS = 64
@@ -23,13 +23,13 @@ _BUILD = "make setup"
 
 
 class Counts(ctypes.Structure):
-    """struct engine_counts."""
+    """The C type engine_counts_t."""
 
     _fields_ = tuple((name, c_int64) for name in ("samples", "events", "steps", "quiet", "modes_built"))
 
 
 class System(ctypes.Structure):
-    """struct engine_system."""
+    """The C type engine_system_t."""
 
     _fields_ = tuple((name, c_void_p) for name in ("abc", "g", "cde", "w_phi", "lmn", "y_phi", "kinks"))
 

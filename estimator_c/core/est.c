@@ -1,4 +1,5 @@
 #include "est.h"
+#include "est_assert.h"
 #include "est_edges.h"
 #include "est_equation.h"
 #include "est_trigger.h"
@@ -6,17 +7,8 @@
 #include <float.h>
 #include <stddef.h>
 
-#ifndef EST_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define EST_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define EST_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
-
-/// The orders of the default configuration: those that the build has fixed, or ARX(2, 3) with offset as far as there is room, the
-/// offset being the first to go, A the last.
+/// Orders of the default configuration: those fixed by the build, else ARX(2, 3) with offset. A build with less room
+/// drops the offset first, then b's, then a's.
 #ifdef EST_FIXED_NA
 #define DEFAULT_NA EST_FIXED_NA
 #define DEFAULT_NB EST_FIXED_NB
@@ -37,53 +29,53 @@
 #define DEFAULT_OFFSET ((DEFAULT_NA + DEFAULT_NB) < EST_THETA_MAX)
 #endif
 
-/// How much less certain a slip leaves every parameter: enough for b's whose covariance is that of their neighbours (10 is
-/// too little, false alarms follow), not so much that a change of the plant that goes on meanwhile passes unnoticed (10,000).
+/// Factor by which a slip increases the variance of every parameter. With 10, the covariance of the shifted b's is too
+/// small and false alarms follow. With 10,000, a simultaneous change of the plant passes unnoticed.
 #define SLIP_DOUBT 1000.0F
 
-/// P must not grow without bound between two looks at it.
+/// Smallest forgetting factor. It bounds the growth of P between two limitations of the d's.
 #define FORGETTING_MIN 0.5F
 
-/// C is the estimate of A with its zeros moved towards the origin by this factor: a C whose zeros lie on the unit circle
-/// would remember for ever.
+/// C is the estimate of A with its zeros moved towards the origin by this factor: a C with zeros on the unit circle
+/// never forgets.
 #define CONTRACTION 0.99F
 
-/// C is left as it is while A is as near to it as this, as the sum of the squares of the coefficients' distances: the
-/// innovations are then white enough, their variance at most 1 % too large with poles up to 0.95. A hundred times that may put a
-/// zero of C on the unit circle.
+/// Squared distance between A and C below which C is kept. The innovations are then white enough: their variance is
+/// at most 1 % too large with poles up to 0.95. A hundred times this distance may put a zero of C on the unit circle.
 #define REFRESH_STEP 8.0e-6F
 
-/// Further away, again as a sum of squares, it makes another filter: what the old one left of the noise of the equations before
-/// is not white to the new one, which therefore begins anew.
+/// Squared distance between A and C beyond which the whitening begins anew. The old filter leaves noise that is not
+/// white to the new one.
 #define REFRESH_STRIDE 0.005F
 
-/// The estimate remembers some 1 / (1 - forgetting) samples. After so many times that without an edge, what it says of A comes from
-/// the noise, which any A = C fits: C would follow it anywhere.
+/// The estimate remembers some 1 / (1 - forgetting) samples. After this many times that without an edge, A is
+/// determined by the noise, which any A = C fits, and C must not follow.
 #define REFRESH_MEMORIES 2.0F
 
-/// The variance of the noise is followed at this rate. A squared innovation beyond NOISE_CLIP times what was expected
-/// counts as no more, so that a change of the plant is not taken for noise; of Gaussian noise that keeps NOISE_KEPT.
+/// Rate at which the noise variance is followed. A squared innovation counts at most NOISE_CLIP times its expected
+/// value, so that a change of the plant is not taken for noise. Clipping leaves NOISE_KEPT of the variance of
+/// Gaussian noise.
 #define NOISE_RATE 0.005F
 #define NOISE_CLIP 9.0F
 #define NOISE_KEPT 0.9851F
 
-EST_OUTLINE void count(uint16_t* const counter) {
+EST_SHARED void increment(uint16_t* const counter) {
     *counter = (uint16_t)(*counter + ((*counter < UINT16_MAX) ? 1U : 0U));
 }
 
-EST_OUTLINE void count_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
+EST_SHARED void increment_long(uint32_t* const counter) { *counter += (*counter < UINT32_MAX) ? 1U : 0U; }
 
 static uint8_t larger(const uint8_t a, const uint8_t b) { return (a > b) ? a : b; }
 
-EST_OUTLINE bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
+EST_SHARED bool within(const float x, const float low, const float high) { return (x >= low) && (x <= high); }
 
 // ---------------------------------------------     CONFIGURATION      ---------------------------------------------
 
-EST_WITHIN bool alike(const est_shape_t a, const est_shape_t b) {
+EST_INLINE bool same_shape(const est_shape_t a, const est_shape_t b) {
     return (a.na == b.na) && (a.nb == b.nb) && (a.nk == b.nk) && (a.nc == b.nc) && (a.offset == b.offset);
 }
 
-EST_WITHIN est_shape_t asked_for(const est_config_t* const config) {
+EST_INLINE est_shape_t requested_shape(const est_config_t* const config) {
     return (est_shape_t){
         .na = config->na, .nb = config->nb, .nk = config->nk, .nc = config->nc, .offset = config->offset ? 1U : 0U
     };
@@ -92,7 +84,7 @@ EST_WITHIN est_shape_t asked_for(const est_config_t* const config) {
 static bool orders_valid(const est_config_t* const config) {
     return (config->na >= 1U) && (config->na <= EST_NA_MAX) && (config->nb >= 1U) && (config->nb <= EST_NB_MAX) &&
            (config->nk <= EST_NK_MAX) && (config->nc <= EST_NC_MAX) &&
-           (est_shape_count(asked_for(config)) <= EST_THETA_MAX);
+           (est_shape_count(requested_shape(config)) <= EST_THETA_MAX);
 }
 
 static bool variances_valid(const est_config_t* const config) {
@@ -109,22 +101,22 @@ static bool codes_valid(const est_config_t* const config) {
            (config->edge_instants >= EST_EDGES_LOCKED) && (config->edge_instants <= EST_EDGES_ANYWHERE);
 }
 
-static bool adaptive(const est_config_t* const config) {
+static bool needs_adaptation(const est_config_t* const config) {
     return (config->nc > 0U) || config->noise_estimated || (config->random_walk > 0.0F);
 }
 
-/// A build may have left something out, or know one shape only.
-static bool in_this_build(const est_config_t* const config) {
-    return alike(asked_for(config), est_shape_of(config)) &&
+/// True iff this build supports the configuration.
+static bool is_supported(const est_config_t* const config) {
+    return same_shape(requested_shape(config), est_shape_of(config)) &&
            (EST_WITH_EDGES || (config->edge_instants == EST_EDGES_LOCKED)) &&
-           (EST_WITH_ADAPTATION || (!adaptive(config) && (config->refresh_n == 0U))) &&
+           (EST_WITH_ADAPTATION || (!needs_adaptation(config) && (config->refresh_n == 0U))) &&
            (EST_WITH_WATCH || ((config->stuck_n == 0U) && (config->idle_n == 0U)));
 }
 
 bool est_config_valid(const est_config_t* const config) {
     EST_ASSERT(config != NULL);
     return orders_valid(config) && est_whitener_accepts(config->c, config->na) && variances_valid(config) &&
-           codes_valid(config) && in_this_build(config) && est_trigger_config_valid(&config->trigger);
+           codes_valid(config) && is_supported(config) && est_trigger_config_valid(&config->trigger);
 }
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
@@ -145,8 +137,8 @@ static void shift_y(est_t* const self, const float newest) {
     self->y[0] = newest;
 }
 
-/// How many samples before its own an equation reaches back to.
-static inline uint8_t past_n(const est_config_t* const config) {
+/// Number of samples before its own that an equation needs.
+static inline uint8_t count_past(const est_config_t* const config) {
     return larger(config->na, (uint8_t)(config->nb + config->nk - 1U));
 }
 
@@ -156,13 +148,13 @@ static void zero(float* const x, const uint_fast8_t n) {
     }
 }
 
-/// What was believed before the doubt holds on, but for the b's, which move by one place: y(k) now depends on u(k-1) as it
-/// did on u(k), or the other way round.
+/// Restore theta from before the doubt, with the b's moved by one place: y(k) now depends on u(k-1) as it did on
+/// u(k), or the reverse. Every parameter becomes less certain.
 static void follow_slip(est_t* const self, const bool late) {
     const uint32_t     nb     = self->config->nb;
     float* const       b      = &self->theta[self->config->na];
     const float* const before = &self->edges.theta[self->config->na];
-    const uint32_t     place  = late ? UINT32_MAX : 1U;  // where each b comes from, modulo 2^32
+    const uint32_t     place  = late ? UINT32_MAX : 1U;  // offset to the source of each b, modulo 2^32
     for (uint_fast8_t i = 0U; i < EST_THETA_MAX; i++) {
         self->theta[i] = self->edges.theta[i];
     }
@@ -172,9 +164,9 @@ static void follow_slip(est_t* const self, const bool late) {
     est_factors_inflate(&self->factors, self->config, SLIP_DOUBT);
 }
 
-/// The C that the estimate asks for. After convergence the noise of the equations is coloured by A itself (thesis section
-/// 3.5: noise on the output).
-EST_SHAPED void contracted(const est_t* const self, const uint_fast8_t na, float* const c) {
+/// Set c to the estimate of A, contracted. With noise on the output, the noise of the equations is coloured by A
+/// (thesis section 3.5).
+EST_SHARED void contract_a(const est_t* const self, const uint_fast8_t na, float* const c) {
     float factor = 1.0F;
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -185,15 +177,15 @@ EST_SHAPED void contracted(const est_t* const self, const uint_fast8_t na, float
 
 static void refresh_prefilter(est_t* const self) {
     float c[EST_NA_MAX];
-    contracted(self, est_shape_of(self->config).na, c);
+    contract_a(self, est_shape_of(self->config).na, c);
     self->refresh_in = self->config->refresh_n;
     if (est_whitener_accepts(c, EST_NA_MAX)) {
         est_whitener_set(&self->whitener, c, EST_NA_MAX);
-        count(&self->counters.refreshes);
+        increment(&self->counters.refreshes);
     }
 }
 
-/// What an alarm, a slip or a C that moves far leaves to do.
+/// Complete the work that the last step left.
 static void renew(est_t* const self) {
     if (self->renewal == EST_RENEWAL_RESET) {
         est_factors_reset(&self->factors, self->config);
@@ -205,12 +197,12 @@ static void renew(est_t* const self) {
     } else if (EST_WITH_ADAPTATION && (self->renewal == EST_RENEWAL_PREFILTER)) {
         refresh_prefilter(self);
     } else {
-        // they are as they should be
+        // the last step left no work
     }
     self->renewal = EST_RENEWAL_NONE;
 }
 
-/// They are of the equations before, and may be beyond all measure.
+/// Clear the residuals: they belong to earlier equations, and may have overflowed.
 EST_INLINE void forget_residuals(est_t* const self) {
 #if EST_NC_MAX > 0
     zero(self->residual, EST_NC_MAX);
@@ -219,9 +211,9 @@ EST_INLINE void forget_residuals(est_t* const self) {
 #endif
 }
 
-/// One sample less to come before the next equation is complete. There is time here for what the step that found a change
-/// left to do: that one is long enough.
-EST_OUTLINE void gather(est_t* const self) {
+/// Count one sample towards the next complete equation. The step has time for the work that an alarm or a slip left,
+/// because it has no equation of its own.
+EST_SHARED void gather(est_t* const self) {
     self->pending_n--;
     self->known = true;
     renew(self);
@@ -229,33 +221,33 @@ EST_OUTLINE void gather(est_t* const self) {
         est_whitener_restart(&self->whitener);
         forget_residuals(self);
         self->settled = false;
-        count(&self->counters.restarts);
+        increment(&self->counters.restarts);
     }
 }
 
-/// The samples before the next are unknown, or belong to another plant.
-EST_OUTLINE void forget_samples(est_t* const self) {
+/// Declare the samples so far unknown: the next equation must not use them.
+EST_SHARED void forget_samples(est_t* const self) {
     if (self->known) {
         self->known     = false;
-        self->pending_n = past_n(self->config);
+        self->pending_n = count_past(self->config);
         if (EST_WITH_EDGES) {
             self->doubt_n = 0U;
         }
     }
 }
 
-/// Of this world. False for NaN too.
-static bool plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
+/// True iff the code is finite and within +-EST_CODE_LIMIT.
+static bool is_plausible(const float code) { return within(code, -EST_CODE_LIMIT, EST_CODE_LIMIT); }
 
-/// Within the range of the converter. False for NaN and the infinities too.
-static bool inside(const est_config_t* const config, const float code) {
+/// True iff the code is within the range of the converter. False for NaN and the infinities.
+static bool in_range(const est_config_t* const config, const float code) {
     return (code > config->code_low) && (code < config->code_high);
 }
 
-/// Whether the two are the same number, to the bit.
-static bool same(const float a, const float b) {
+/// True iff the two numbers have the same bits.
+static bool same_bits(const float a, const float b) {
     typedef union {       // MISRA D5
-        float    number;  // cppcheck F4
+        float    number;  // cppcheck F3
         uint32_t bits;
     } est_bits_t;
     const est_bits_t first  = { .number = a };  // MISRA D5
@@ -263,21 +255,22 @@ static bool same(const float a, const float b) {
     return first.bits == second.bits;
 }
 
-/// The plant answers every edge of u within a few samples: a y that stays the same to the bit comes from no plant, until it
-/// is another. It may rest while u does.
-EST_OUTLINE bool stuck(est_t* const self, const float y, const bool edge) {
-    if (!same(y, self->y[0])) {
+/// True iff y has been constant for too long after an edge of u. The plant answers every edge within a few samples,
+/// so a constant y comes from a defective channel. While u rests, y may rest too.
+EST_SHARED bool is_stuck(est_t* const self, const float y, const bool edge) {
+    if (!same_bits(y, self->y[0])) {
         self->same_n = 0U;
         return false;  // MISRA D4
     }
-    const uint32_t watched = (edge ? 1U : 0U) | self->same_n;  // none: there is no edge that it has not answered
+    const uint32_t watched = (edge ? 1U : 0U) | self->same_n;  // 0: every edge was answered
     if ((watched > 0U) && (self->same_n < UINT8_MAX)) {
         self->same_n++;
     }
     return (self->config->stuck_n > 0U) && (self->same_n >= self->config->stuck_n);
 }
 
-/// An edge joins the doubt about earlier ones if another reading of those is ahead, and otherwise begins a doubt of its own.
+/// Enter an edge into the doubt. It joins the doubt about earlier edges if another reading of these leads; otherwise it
+/// begins a new doubt.
 static void doubt_edge(est_t* const self) {
     if ((self->doubt_n > 0U) && est_trigger_in_doubt(&self->trigger)) {
         return;  // MISRA D4
@@ -298,20 +291,20 @@ static void enter_edge(est_t* const self) {
     } else if (self->config->edge_instants == EST_EDGES_ANYWHERE) {
         self->pending_n = larger(self->pending_n, self->config->na);
     } else {
-        // the b's take it in
+        // the b's absorb the edge
     }
 }
 
-/// Takes in u(k). The equation of this sample can be made unless the samples that it reaches back to are not all known.
+/// Enter u(k). Return EST_GATHERING while the equation of this sample needs unknown samples.
 static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     shift_u(self, sample.u);
     const bool edge = EST_KNOWS_EDGES && est_edges_is_edge(self->config, self->u) && self->known;
-    if (EST_WITH_WATCH && stuck(self, sample.y, edge)) {
-        count(&self->counters.stuck);
+    if (EST_WITH_WATCH && is_stuck(self, sample.y, edge)) {
+        increment(&self->counters.stuck);
         return EST_REFUSED;  // MISRA D4
     }
     if (EST_KNOWS_EDGES) {
-        count(&self->edge_age_n);
+        increment(&self->edge_age_n);
     }
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->doubt_n = (self->doubt_n < EST_DOUBT_N) ? (uint8_t)(self->doubt_n + 1U) : 0U;
@@ -319,7 +312,7 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     if (edge) {
         enter_edge(self);
     }
-    count_long(&self->counters.updated);
+    increment_long(&self->counters.updated);
     if (self->pending_n > 0U) {
         gather(self);
         return EST_GATHERING;  // MISRA D4
@@ -327,31 +320,31 @@ static est_status_t enter_input(est_t* const self, const est_sample_t sample) {
     return EST_UPDATED;
 }
 
-/// Whether the sample is one, and what will become of it.
+/// Classify the sample, and enter its u if it is good.
 static est_status_t examine(est_t* const self, const est_sample_t sample) {
     if (!sample.valid) {
         return EST_MISSING;  // MISRA D4
     }
-    if (inside(self->config, sample.u) && inside(self->config, sample.y)) {
+    if (in_range(self->config, sample.u) && in_range(self->config, sample.y)) {
         return enter_input(self, sample);  // MISRA D4
     }
-    if (EST_WITH_WATCH && plausible(sample.u) && plausible(sample.y)) {
-        count(&self->counters.saturated);
+    if (EST_WITH_WATCH && is_plausible(sample.u) && is_plausible(sample.y)) {
+        increment(&self->counters.saturated);
     }
     return EST_REFUSED;
 }
 
 // ---------------------------------------------       EQUATIONS        ---------------------------------------------
 
-/// What the innovation says in the other readings of the edges in doubt. The estimate has followed what was recorded since, so
-/// that they are taken against what was believed before the doubt.
-EST_INLINE est_finding_t read_otherwise(est_t* const                self,
+/// Enter the innovation under the other readings of the edges in doubt. They are compared with theta before the doubt,
+/// because the estimate has followed the recorded reading since.
+EST_INLINE est_finding_t judge_readings(est_t* const                self,
                                         const est_shape_t           shape,
                                         const est_equation_t* const equation,
                                         const float                 weight) {
     const float e = (self->doubt_n > 1U)
                         ? est_equation_residual(equation->phi, self->edges.theta, est_shape_count(shape))
-                        : equation->innovation;  // theta has not moved since
+                        : equation->innovation;  // theta has not changed yet
     float       early;
     float       late;
     est_edges_shares(&self->edges, shape, &self->whitener, self->u, self->doubt_n, self->edge_age_n, &early, &late);
@@ -368,8 +361,8 @@ static void shift(float* const x, const uint_fast8_t n, const float newest) {
 }
 #endif
 
-/// The residual of an equation, after its update, stands in for its e in the next ones (thesis section 3.5).
-static void keep_residual(est_t* const self, const float* const phi) {
+/// Store the residual of an equation after its update: it replaces e in the next equations (thesis section 3.5).
+static void store_residual(est_t* const self, const float* const phi) {
 #if EST_NC_MAX > 0
     if (self->config->nc > 0U) {
         shift(self->residual, self->config->nc, est_equation_residual(phi, self->theta, est_theta_count(self)));
@@ -380,7 +373,7 @@ static void keep_residual(est_t* const self, const float* const phi) {
 #endif
 }
 
-/// `precision`: the reciprocal of the innovation's variance over that of the noise.
+/// Update the noise variance. `precision`: noise variance over the variance of the innovation.
 static void follow_noise(est_t* const self, const float innovation, const float precision) {
     const float square   = innovation * innovation * precision;
     const float ceiling  = NOISE_CLIP * self->noise_variance;
@@ -389,7 +382,7 @@ static void follow_noise(est_t* const self, const float innovation, const float 
     self->noise_variance = (noise > EST_VARIANCE_MIN) ? noise : EST_VARIANCE_MIN;
 }
 
-/// How far these coefficients are from the C in use, squared.
+/// Squared distance between these coefficients and the present C.
 EST_INLINE float distance(const est_whitener_t* const whitener, const float* const c) {
     const float first = c[0] - whitener->c[0];
     float       sum   = first * first;
@@ -405,11 +398,11 @@ static bool remembers_edge(const est_t* const self) {
     return ((1.0F - self->config->forgetting) * (float)self->edge_age_n) < REFRESH_MEMORIES;
 }
 
-/// Where C moves far, or the gains are on their way to it anyway, the whitening begins anew: C is then taken with the next
-/// sample, which has no equation.
+/// Decide whether C follows A. If C moves far, or the gains have not settled, the whitening begins anew: C is then
+/// taken at the next sample, which has no equation.
 EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     float c[EST_NA_MAX];
-    contracted(self, shape.na, c);
+    contract_a(self, shape.na, c);
     const float moved = distance(&self->whitener, c);
     if (moved < REFRESH_STEP) {
         self->renewal    = EST_RENEWAL_NONE;
@@ -422,8 +415,8 @@ EST_INLINE void compare_prefilter(est_t* const self, const est_shape_t shape) {
     }
 }
 
-/// Whether the estimate is worth taking C from, whether C is still near to it, and to take it are for three equations, so
-/// that no step is a long one. Not while edges are in doubt: theta may have followed what did not happen.
+/// Refresh C in three equations, so that no step is long: judge A, compare C with A, take C. Suspended while edges
+/// are in doubt, because theta may have followed an edge that was misread.
 EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
         self->renewal = EST_RENEWAL_NONE;
@@ -435,14 +428,14 @@ EST_INLINE void consider_refresh(est_t* const self, const est_shape_t shape) {
     } else if (remembers_edge(self)) {
         self->renewal = EST_RENEWAL_COMPARE;
     } else {
-        // A comes from noise
+        // A is determined by noise
     }
 }
 
 // ---------------------------------------------        CHANGES         ---------------------------------------------
 
-/// The plant has changed, and the samples before the next belong to what it was. Data beyond all measure can drive theta to where
-/// its products overflow. So does the statistic then, and nothing of the estimate is worth keeping.
+/// Raise an alarm. The samples so far belong to the plant before the change. Extreme data can make theta overflow; the
+/// statistic then overflows too, and the estimate is discarded.
 static void raise_alarm(est_t* const self, est_step_t* const step) {
     step->alarm          = true;
     const bool overflown = !(step->statistic < FLT_MAX);
@@ -452,27 +445,28 @@ static void raise_alarm(est_t* const self, est_step_t* const step) {
     if (overflown || (self->config->trigger.reset == EST_RESET_ALL)) {
         zero(self->theta, EST_THETA_MAX);
     }
-    if (EST_WITH_ADAPTATION && overflown) {  // the residuals among the regressors may have been, too
+    if (EST_WITH_ADAPTATION && overflown) {  // P may have overflowed with the residuals in its regressors
         est_factors_reset(&self->factors, self->config);
     }
     self->renewal = EST_RENEWAL_RESET;
     est_trigger_restart(&self->trigger, self->config->trigger.hold_off_n);
-    count(&self->counters.alarms);
+    increment(&self->counters.alarms);
     forget_samples(self);
 }
 
-/// The clock of the edges has moved by a sample, and the samples before the next belong to what it was.
-EST_OUTLINE void note_slip(est_t* const self) {
+/// Count a slip: edges of u come one sample earlier or later from now on. The samples so far belong to the old
+/// instants.
+EST_SHARED void note_slip(est_t* const self) {
     self->renewal = est_trigger_settle_late(&self->trigger) ? EST_RENEWAL_LATE : EST_RENEWAL_EARLY;
-    count(&self->counters.slips);
+    increment(&self->counters.slips);
     forget_samples(self);
 }
 
 static void enter_gap(est_t* const self, const est_status_t status) {
     if (status == EST_REFUSED) {
-        count(&self->counters.refused);
+        increment(&self->counters.refused);
     } else {
-        count_long(&self->counters.missing);
+        increment_long(&self->counters.missing);
     }
     if (EST_WITH_EDGES && self->known && (self->doubt_n > 0U)) {
         if (est_trigger_end_doubt(&self->trigger, &self->config->trigger)) {
@@ -482,20 +476,20 @@ static void enter_gap(est_t* const self, const est_status_t status) {
     forget_samples(self);
 }
 
-/// What an equation says besides theta.
+/// Update everything an equation determines besides theta.
 static void adapt(est_t* const self, const float* const phi, const float innovation, const float precision) {
     const est_config_t* const config = self->config;
     if (config->random_walk > 0.0F) {
         est_factors_walk(&self->factors, config);
         est_factors_inflate(&self->factors, config, 1.0F);
     }
-    keep_residual(self, phi);
+    store_residual(self, phi);
     if (config->noise_estimated) {
         follow_noise(self, innovation, precision);
     }
 }
 
-/// P is kept bounded in a step that has nothing else to do besides, if there is one in time.
+/// Limit P. Done in a step without other optional work, unless that comes too late.
 EST_INLINE void limit_factors(est_t* const self, const est_shape_t shape) {
     const bool busy = (EST_WITH_EDGES && (self->doubt_n > 0U)) || (EST_WITH_ADAPTATION && (self->refresh_in == 1U));
     if (!busy || (self->factors.weight < EST_WEIGHT_OVERDUE)) {
@@ -534,7 +528,7 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     step->statistic       = self->trigger.statistic;
     est_finding_t finding = (self->trigger.statistic < config->trigger.ceiling) ? EST_QUIET : EST_ALARM;
     if (EST_WITH_EDGES && (self->doubt_n > 0U)) {
-        finding = read_otherwise(self, shape, &equation, weight);
+        finding = judge_readings(self, shape, &equation, weight);
     }
     if (finding == EST_ALARM) {
         raise_alarm(self, step);
@@ -545,22 +539,23 @@ EST_INLINE void enter_equation(est_t* const self, const est_shape_t shape, const
     } else if (EST_WITH_ADAPTATION && (self->refresh_in == 1U)) {
         consider_refresh(self, shape);
     } else {
-        // C stays
+        // C is constant
     }
 }
 
-/// The usual shapes have code of their own, unless the build has one anyway, or room is scarce.
-static void enter_equation_of_any_shape(est_t* const self, const float y, est_step_t* const step) {
+/// Enter the equation with code specialised for the two usual shapes. Omitted where the shape is fixed or room is
+/// scarce.
+static void dispatch_equation(est_t* const self, const float y, est_step_t* const step) {
     const est_shape_t shape = est_shape_of(self->config);
 #if !defined(EST_FIXED_NA) && !EST_FOR_SIZE && (EST_NA_MAX >= 2U) && (EST_NB_MAX >= 3U) && (EST_NK_MAX >= 1U) &&       \
     (EST_THETA_MAX >= 6U)
     const est_shape_t locked       = { .na = 2U, .nb = 2U, .nk = 1U, .nc = 0U, .offset = 0U };
     const est_shape_t free_running = { .na = 2U, .nb = 3U, .nk = 0U, .nc = 0U, .offset = 1U };
-    if (alike(shape, free_running)) {
+    if (same_shape(shape, free_running)) {
         enter_equation(self, free_running, y, step);
         return;  // MISRA D4
     }
-    if (alike(shape, locked)) {
+    if (same_shape(shape, locked)) {
         enter_equation(self, locked, y, step);
         return;  // MISRA D4
     }
@@ -570,8 +565,8 @@ static void enter_equation_of_any_shape(est_t* const self, const float y, est_st
 
 // ---------------------------------------------          API           ---------------------------------------------
 
-/// A copy as such, or gcc makes instructions of it that store each field.
-EST_OUTLINE est_config_t copied(const est_config_t* const config) { return *config; }
+/// Copy the configuration. Without this function gcc emits one store for each field.
+EST_SHARED est_config_t copy_config(const est_config_t* const config) { return *config; }
 
 est_config_t est_config_default(void) {
     static const est_config_t config = {  // MISRA D2
@@ -604,7 +599,7 @@ est_config_t est_config_default(void) {
                         .warm_up_n  = 150U,
                         .ceiling    = 11.512925F },
     };
-    return copied(&config);
+    return copy_config(&config);
 }
 
 bool est_init(est_t* const self, const est_config_t* const config) {
@@ -613,11 +608,11 @@ bool est_init(est_t* const self, const est_config_t* const config) {
         return false;  // MISRA D4
     }
     *self                = (est_t){ .config = config };
-    self->adaptive       = EST_WITH_ADAPTATION && adaptive(config);
+    self->adaptive       = EST_WITH_ADAPTATION && needs_adaptation(config);
     self->refresh_in     = EST_WITH_ADAPTATION ? config->refresh_n : 0U;
     self->noise_variance = config->noise_variance;
     est_whitener_set(&self->whitener, config->c, config->na);
-    self->pending_n = past_n(config);
+    self->pending_n = count_past(config);
     est_factors_reset(&self->factors, config);
     est_trigger_restart(&self->trigger, config->trigger.warm_up_n);
     return true;
@@ -631,7 +626,7 @@ est_step_t est_step(est_t* const self, const est_sample_t sample) {
         enter_gap(self, step.status);
     } else {
         if (step.status == EST_UPDATED) {
-            enter_equation_of_any_shape(self, sample.y, &step);
+            dispatch_equation(self, sample.y, &step);
         }
         shift_y(self, sample.y);
     }

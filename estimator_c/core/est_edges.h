@@ -1,27 +1,25 @@
-/// Edges of u whose instant is in doubt. A generator on a clock of its own drifts against the sampling clock; when one of
-/// its edges crosses a sampling instant, the level is from then on recorded one sample earlier or later than the plant
-/// feels it. That is a jump of the b's, but no change of the plant: the innovations after the edge are then explained by
-/// moving the edges by one sample, and this module says what that would have done to them.
+/// Edges of u whose instant is in doubt. A generator on its own clock drifts against the sampling clock. When one of
+/// its edges crosses a sampling instant, u is recorded one sample earlier or later from then on, relative to its
+/// effect on the plant. The b's jump, but the plant has not changed. This module computes the effect of moving the
+/// recent edges by one sample, so that the trigger can test whether that explains the innovations.
 
 #ifndef EST_EDGES_H_INCLUDED
 #define EST_EDGES_H_INCLUDED
 
 #include "est_whitener.h"
 
-/// Doubt ends, one way or the other, so many samples after it began: the readings differ most in the first few.
+/// Duration of a doubt in samples. The readings differ most in the first few.
 #define EST_DOUBT_N 12U
 
-/// True iff u[0] comes after an edge, the values of u newest first.
+/// True iff there is an edge between u[1] and u[0].
 static inline bool est_edges_is_edge(const est_config_t* const config, const float* const u) {
     return est_magnitude(u[0] - u[1]) >= config->edge_codes;
 }
 
-/// An edge, a step of u, has just come, and doubt begins. `theta` is what is believed. An edge one sample early would have
-/// entered the equation before; if that was none, the gains are such that this does not count.
-EST_INLINE void est_edges_begin(est_edges_t* const        self,
-                                const est_config_t* const config,
-                                const float* const        theta,
-                                const float               step) {
+/// Begin a doubt at an edge of height `step`, with the present theta. An early edge would also have entered the
+/// equation before; if there was none, the gain of the filter is zero and the term has no effect.
+EST_INLINE void
+est_edges_begin(est_edges_t* const self, const est_config_t* const config, const float* const theta, const float step) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
         self->early.x[i] = 0.0F;
@@ -36,9 +34,9 @@ EST_INLINE void est_edges_begin(est_edges_t* const        self,
     }
 }
 
-/// What the edges, had they come early, and late, would have added to the present equation, whitened. One that is a sample
-/// early had its new level already in the sample before, and one that came late not yet in its own: u since the doubt began
-/// is moved by one place against y, its noise too.
+/// Compute what early edges, and late edges, would have added to the present equation, whitened. With an early edge u
+/// changes in the sample before it was recorded, with a late one in the sample after. u since the beginning of the
+/// doubt is therefore shifted by one sample against y, including its noise.
 EST_INLINE void est_edges_shares(est_edges_t* const          self,
                                  const est_shape_t           shape,
                                  const est_whitener_t* const whitener,

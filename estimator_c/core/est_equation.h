@@ -1,5 +1,5 @@
-/// One equation of the model: filled from the samples, whitened, and entered into the estimate. These functions take the most
-/// of a step's time. They are inline, so that a call with a constant shape becomes straight-line code.
+/// One equation of the model: filled from the samples, whitened, and used to update the estimate. Most of the time of
+/// a step is spent here. The functions are inline, so that a call with a constant shape becomes straight-line code.
 
 #ifndef EST_EQUATION_H_INCLUDED
 #define EST_EQUATION_H_INCLUDED
@@ -9,12 +9,12 @@
 #include "est_whitener.h"
 
 typedef struct {
-    float phi[EST_THETA_MAX + 1U];  ///< the regressor in the order of theta, and y(k) last
-    float innovation;               ///< what was not foreseen of y(k) [codes]
-    float variance;                 ///< of the equation's noise, in noise variances
+    float phi[EST_THETA_MAX + 1U];  ///< regressor in the order of theta, followed by y(k)
+    float innovation;               ///< prediction error of y(k) [codes]
+    float variance;                 ///< variance of the equation's noise [noise variances]
 } est_equation_t;
 
-EST_SHAPED float* append(float* const out, const float* const from, const uint_fast8_t n) {
+EST_SHARED float* append(float* const out, const float* const from, const uint_fast8_t n) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
         out[i] = from[i];
@@ -22,9 +22,9 @@ EST_SHAPED float* append(float* const out, const float* const from, const uint_f
     return &out[n];
 }
 
-/// From the samples.
+/// Fill phi and y(k) from the stored samples.
 EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t shape, const float y, float* const phi) {
-    EST_ROLL
+    EST_UNROLL
     for (uint_fast8_t i = 0U; i < shape.na; i++) {
         phi[i] = -self->y[i];
     }
@@ -32,12 +32,12 @@ EST_INLINE void est_equation_fill(const est_t* const self, const est_shape_t sha
 #if EST_NC_MAX > 0
     out = append(out, self->residual, shape.nc);
 #endif
-    out[0]            = 1.0F;  // of the offset, or y's place
+    out[0]            = 1.0F;  // regressor of the offset; without one, y(k) overwrites it
     out[shape.offset] = y;
 }
 
-/// What theta does not foresee of y(k), the element after the regressor.
-EST_SHAPED float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
+/// Prediction error of y(k), the element that follows the regressor.
+EST_SHARED float est_equation_residual(const float* const phi, const float* const theta, const uint_fast8_t n) {
     float out = phi[n];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < n; i++) {
@@ -46,13 +46,13 @@ EST_SHAPED float est_equation_residual(const float* const phi, const float* cons
     return out;
 }
 
-/// Whitens the equation in place, and finds its innovation.
+/// Whiten the equation in place and compute its innovation.
 EST_INLINE void est_equation_whiten(est_equation_t* const equation,
                                     const est_shape_t     shape,
                                     est_whitener_t* const whitener,
                                     const float* const    theta) {
-    const uint_fast8_t count = est_shape_count(shape);  // cppcheck F3
-    float* const       phi   = equation->phi;           // cppcheck F2
+    const uint_fast8_t count = est_shape_count(shape);
+    float* const       phi   = equation->phi;  // cppcheck F2
     float              gain[EST_NA_MAX];
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -65,28 +65,29 @@ EST_INLINE void est_equation_whiten(est_equation_t* const equation,
     equation->innovation = est_equation_residual(phi, theta, count);
 }
 
-/// gcc does not see that each gain is written before it is read. A build for size, in which it would call memset(), is not asked.
+/// Initialiser against a false warning: gcc does not see that each gain is written before it is read. Omitted in a
+/// build for size, where gcc would call memset().
 #if EST_FOR_SIZE
 #define EST_ZEROED
 #else
 #define EST_ZEROED = { 0.0F }
 #endif
 
-/// One measurement: Bierman, "Factorization Methods for Discrete Sequential Estimation" (1977), section V.3. The forgetting
-/// factor of thesis Equ 3.21 divides the weight of P, and with it every d at once. Moves theta, and returns the reciprocal
-/// of the innovation's variance, in noise variances.
+/// Update theta and the covariance with one measurement: Bierman, "Factorization Methods for Discrete Sequential
+/// Estimation" (1977), section V.3. The forgetting factor of thesis Equ 3.21 divides the weight of P, and with it
+/// every d at once. Return the reciprocal of the innovation's variance [1 / noise variance].
 EST_INLINE float est_equation_measure(est_factors_t* const        self,
                                       const float                 forgetting,
                                       const est_shape_t           shape,
                                       const est_equation_t* const equation,
                                       float* const                theta) {
-    const uint_fast8_t count               = est_shape_count(shape);  // cppcheck F3
-    const float* const phi                 = equation->phi;
-    const float        weight              = forgetting * self->weight;
+    const uint_fast8_t count  = est_shape_count(shape);
+    const float* const phi    = equation->phi;
+    const float        weight = forgetting * self->weight;
     float              gain[EST_THETA_MAX] EST_ZEROED;  // P phi, unscaled; MISRA D2
-    float              alpha               = weight * equation->variance;
-    float              inverse             = 0.0F;  // 1 / alpha, once there are u's that want it
-    float*             column              = self->upper;
+    float              alpha   = weight * equation->variance;
+    float              inverse = 0.0F;  // 1 / alpha of the column before
+    float*             column  = self->upper;
     EST_UNROLL
     for (uint_fast8_t j = 0U; j < count; j++) {
         float f = phi[j];

@@ -1,27 +1,28 @@
-/// The covariance of theta in factors: P = U D U' / weight with U unit upper triangular, in units of the noise variance. A product of
-/// this form cannot lose symmetry, and stays positive as long as D does.
+/// Covariance of theta in factors: P = U D U' / weight with U unit upper triangular, in units of the noise variance. A
+/// product of this form cannot lose symmetry, and stays positive as long as D does.
 
 #ifndef EST_FACTORS_H_INCLUDED
 #define EST_FACTORS_H_INCLUDED
 
 #include "est_shape.h"
 
-/// Without a lower limit, certain beyond the precision of float32 by any measure of the data, a direction excited beyond all
-/// measure would be lost to underflow.
+/// Lower limit of the d's. Without it, extreme data could make a d underflow to zero, and its direction would never be
+/// updated again.
 #define EST_D_MIN 1.0e-30F
 
-/// Below this weight the d's are due for a look at their upper limit; below the second one also if the step is a long one.
+/// Weight below which the d's are limited at the next opportunity, and below which they are limited in any step.
 #define EST_WEIGHT_DUE 0.5F
 #define EST_WEIGHT_OVERDUE 0.25F
 
-/// Every parameter of this shape is less certain by this factor, but no d beyond the prior, and the weight 1 again. Without that limit the
-/// variance of a direction that is not excited grows by 1 / forgetting per equation, without end ("covariance blow-up", thesis
-/// 3.6); no direction needs to be less certain than it was at the start.
+/// Increase the variance of every parameter of this shape by `factor`, but limit each d to its prior, and set the
+/// weight to 1. Without the limit, the variance of a direction that is not excited grows by 1 / forgetting per
+/// equation without bound ("covariance blow-up", thesis 3.6). No direction needs to be less certain than at the
+/// start.
 EST_INLINE void est_factors_scale(est_factors_t* const      self,
                                   const est_config_t* const config,
                                   const est_shape_t         shape,
                                   const float               factor) {
-    const uint_fast8_t count     = est_shape_count(shape);  // cppcheck F3
+    const uint_fast8_t count     = est_shape_count(shape);
     const float        p0        = config->p0;
     const float        p0_offset = config->p0_offset;
     const float        scale     = factor / self->weight;
@@ -34,8 +35,8 @@ EST_INLINE void est_factors_scale(est_factors_t* const      self,
     }
 }
 
-/// The same for the shape of the configuration.
-EST_OUTLINE void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
+/// est_factors_scale() with the shape of the configuration.
+EST_SHARED void est_factors_inflate(est_factors_t* const self, const est_config_t* const config, const float factor) {
     est_factors_scale(self, config, est_shape_of(config), factor);
 }
 
@@ -47,10 +48,10 @@ static inline void est_factors_reset(est_factors_t* const self, const est_config
     for (uint_fast16_t i = 0U; i < EST_UPPER_N; i++) {
         self->upper[i] = 0.0F;
     }
-    est_factors_inflate(self, config, 1.0F);  // no d beyond the prior
+    est_factors_inflate(self, config, 1.0F);  // limits each d to its prior
 }
 
-/// P := P + variance e e', where e is the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
+/// P := P + variance e e' with e the unit vector of this row: Agee and Turner (1972), as in Bierman, section III.3.
 static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, const float variance) {
     float a[EST_THETA_MAX] = { 0.0F };  // MISRA D2
     float c                = variance;
@@ -70,8 +71,8 @@ static inline void walk_row(est_factors_t* const self, const uint_fast8_t row, c
     }
 }
 
-/// Every parameter walks: P := P + random_walk I. The factors of Thornton's time update, "Triangular
-/// covariance factorizations for Kalman filtering" (1976), by rank-one updates, which need no work space.
+/// P := P + random_walk I. The factors are those of Thornton's time update, "Triangular covariance factorizations for
+/// Kalman filtering" (1976). Rank-one updates compute them without work space.
 static inline void est_factors_walk(est_factors_t* const self, const est_config_t* const config) {
     for (uint_fast8_t i = 0U; i < est_shape_count(est_shape_of(config)); i++) {
         walk_row(self, i, config->random_walk * self->weight);

@@ -1,6 +1,6 @@
-/// The change triggers of est.h. They see the innovation, in every reading of the edges in doubt, and its variance, and
-/// nothing else of the estimator. A user's trigger is a function in the configuration (est_trigger_fn); one of the library's
-/// own is a new est_trigger_kind_t, a new function here, and a new value wherever a kind is set: device/, catalogue/, harness/.
+/// Change triggers. They see the innovation and its variance, under every reading of the edges in doubt, and nothing
+/// else of the estimator. A trigger of the user is a function in the configuration (est_trigger_fn). A new trigger of
+/// the library needs a new est_trigger_kind_t, a function here, and a value in device/, catalogue/ and harness/.
 
 #ifndef EST_TRIGGER_H_INCLUDED
 #define EST_TRIGGER_H_INCLUDED
@@ -11,7 +11,7 @@
 #include <float.h>
 #include <stddef.h>
 
-/// True iff every value is in the range stated in est.h, whether this kind of trigger uses it or not.
+/// True iff every value is in the range stated in est.h. Values that this kind of trigger ignores are checked too.
 static inline bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known =
         (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
@@ -24,10 +24,10 @@ static inline bool est_trigger_config_valid(const est_trigger_config_t* const co
 typedef enum {
     EST_QUIET = 0,
     EST_ALARM = 1,
-    EST_SLIP  = 2,  ///< not the plant, but the edges of u have moved by one sample
+    EST_SLIP  = 2,  ///< the edges of u have moved by one sample; the plant has not changed
 } est_finding_t;
 
-/// Ready for the first innovation; the statistic is zero for the next quiet_n samples.
+/// Prepare for the first innovation. The statistic is held at zero for the next quiet_n innovations.
 static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t quiet_n) {
     self->statistic = 0.0F;
     self->quiet_n   = quiet_n;
@@ -36,7 +36,7 @@ static inline void est_trigger_restart(est_trigger_t* const self, const uint16_t
     }
 }
 
-/// Edges are in doubt from this sample on: all readings of them start from what the statistic is now.
+/// Begin a doubt: all readings of the edges start from the present statistic.
 static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_OTHER_READINGS; i++) {
@@ -44,20 +44,20 @@ static inline void est_trigger_begin_doubt(est_trigger_t* const self) {
     }
 }
 
-/// The statistic of the other reading that explains the innovations better.
-EST_OUTLINE float est_trigger_best_rival(const est_trigger_t* const self) {
+/// Smaller statistic of the two other readings: that of the better explanation.
+EST_SHARED float est_trigger_best_rival(const est_trigger_t* const self) {
     return (self->rival[0] < self->rival[1]) ? self->rival[0] : self->rival[1];
 }
 
-/// True iff another reading of the edges in doubt has so far explained the innovations better than what was recorded.
+/// True iff another reading of the edges in doubt explains the innovations better than the recorded one.
 static inline bool est_trigger_in_doubt(const est_trigger_t* const self) {
     return est_trigger_best_rival(self) < self->statistic;
 }
 
-/// The doubt ends before its term, as when a gap takes away what the other readings rest on. If the innovations as recorded
-/// had already passed the ceiling, another reading explained them: a slip, and true. Else the statistic goes on from the best
-/// reading, since none can be followed any further; at its term a doubt has seen all there is of an edge, and the recorded one
-/// goes on.
+/// End a doubt before its term, because a gap removes the samples that the other readings need. Return true iff it
+/// was a slip: the recorded reading has passed the ceiling, and another reading explained the innovations. Otherwise
+/// the statistic continues from the best reading. At its term, by contrast, a doubt has seen the whole effect of an
+/// edge, and the recorded reading continues.
 static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_trigger_config_t* const config) {
     if (self->statistic >= config->ceiling) {
         return true;  // MISRA D4
@@ -68,33 +68,36 @@ static inline bool est_trigger_end_doubt(est_trigger_t* const self, const est_tr
     return false;
 }
 
-/// Makes the best of the other readings the statistic; true iff it is the one in which the edges came late.
+/// Make the better of the other readings the statistic. Return true iff it is the one with late edges.
 static inline bool est_trigger_settle_late(est_trigger_t* const self) {
     const bool late = self->rival[1] < self->rival[0];
     self->statistic = est_trigger_best_rival(self);
     return late;
 }
 
-/// The likelihood ratio of "the innovation's variance has grown fourfold" is exp(0.375 z^2 - ln 2). Its mean is at most 1
-/// for every conditionally 1-sub-Gaussian z, so that by Ville's inequality a sum that restarts at zero passes h at most
-/// once in exp(h) samples on average: the ceiling is ln(ARL0) without any asymptotics.
+/// Gain and drift of the cumulative sum. The likelihood ratio of "the innovation's variance has grown fourfold" is
+/// exp(0.375 z^2 - ln 2). Its mean is at most 1 for every conditionally 1-sub-Gaussian z. By Ville's inequality, a
+/// sum that restarts at zero then passes h at most once in exp(h) samples on average: the ceiling is ln(ARL0) without
+/// asymptotics.
 #define EST_CUSUM_GAIN (0.375F / (EST_INNOVATION_SCALE * EST_INNOVATION_SCALE))
 #define EST_CUSUM_DRIFT 0.69314718F
 
-/// A power of two, so that nothing is rounded. No plant with codes below EST_CODE_LIMIT has an innovation whose square overflows
-/// with it, 1.1e15: theta has, or is about to.
+/// Scale of the innovation before it is squared; a power of two, so that nothing is rounded. The scaled square
+/// overflows from 1.1e15 on, which no plant with codes below EST_CODE_LIMIT reaches: theta then has overflowed, or is
+/// about to.
 #define EST_INNOVATION_SCALE 16384.0F
 
-/// Infinite or not a number if the innovation is beyond all measure, whatever the weight, or is none: the comparisons with the
-/// ceiling are such that this is an alarm.
-EST_SHAPED float est_trigger_sum(const float before, const float innovation, const float weight) {
+/// Add one innovation to a cumulative sum. The sum is infinite or NaN if the innovation is, or is extreme, whatever its
+/// weight. Comparisons with the ceiling are written such that this raises an alarm.
+EST_SHARED float est_trigger_sum(const float before, const float innovation, const float weight) {
     const float scaled = EST_INNOVATION_SCALE * innovation;
     const float sum    = before + ((scaled * scaled * weight) - EST_CUSUM_DRIFT);
     return (sum <= 0.0F) ? 0.0F : sum;
 }
 
-/// Enters the innovation in the other readings of the edges in doubt, that of what was recorded being the statistic already. The
-/// plant has changed only if no reading explains the innovations, or theta has overflowed. `expires` is true iff the doubt has lasted its term.
+/// Enter the innovation under the other readings of the edges in doubt; the statistic already contains the recorded
+/// one. The plant has changed only if no reading explains the innovations, or if theta has overflowed. `expires`: the
+/// doubt has reached its term.
 static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
                                                       const float          ceiling,
                                                       const float          early,
@@ -112,7 +115,7 @@ static inline est_finding_t est_trigger_find_in_doubt(est_trigger_t* const self,
     return EST_ALARM;
 }
 
-/// Thesis 4.4.3. The running mean in the form that needs no sum, so that it cannot grow without bound.
+/// Mean between faults, thesis 4.4.3. The recursive form of the mean cannot grow without bound.
 static inline float mean_between_faults(est_trigger_t* const self, const bool absolute, const float innovation) {
     const float  term = absolute ? est_magnitude(innovation) : innovation;
     float* const mean = &self->rival[0];
@@ -122,16 +125,16 @@ static inline float mean_between_faults(est_trigger_t* const self, const bool ab
     return est_magnitude(*mean);
 }
 
-static inline float custom(est_trigger_t* const              self,
-                           const est_trigger_config_t* const config,
-                           const float                       innovation,
-                           const float                       variance) {
+static inline float call_custom(est_trigger_t* const              self,
+                                const est_trigger_config_t* const config,
+                                const float                       innovation,
+                                const float                       variance) {
     const bool anew = self->mean_n == 0U;
     self->mean_n    = 1U;
     return config->custom(config->context, innovation, variance, anew);
 }
 
-/// Of the kinds that are no cumulative sum. The one that is not named is the caller's.
+/// Statistic of the triggers other than the cumulative sum.
 static inline float est_trigger_other_statistic(est_trigger_t* const              self,
                                                 const est_trigger_config_t* const config,
                                                 const float                       innovation,
@@ -142,10 +145,10 @@ static inline float est_trigger_other_statistic(est_trigger_t* const            
     if (config->kind == EST_TRIGGER_MEAN_BETWEEN_FAULTS) {
         return mean_between_faults(self, config->absolute, innovation);  // MISRA D4
     }
-    return custom(self, config, innovation, EST_CUSUM_GAIN / weight);
+    return call_custom(self, config, innovation, EST_CUSUM_GAIN / weight);
 }
 
-/// Whether the statistic is held at zero.
+/// True iff the statistic is held at zero. Counts down the innovations of the hold.
 EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_kind_t kind) {
     if (self->quiet_n > 0U) {
         self->quiet_n--;
@@ -154,7 +157,7 @@ EST_INLINE bool est_trigger_holds(est_trigger_t* const self, const est_trigger_k
     return kind == EST_TRIGGER_NONE;
 }
 
-/// Enters one innovation [codes], as recorded, whose square has this weight in the cumulative sum: none while that is held.
+/// Enter one innovation [codes] as recorded. `weight` is that of its square in the cumulative sum; 0 while it is held.
 EST_INLINE void est_trigger_enter(est_trigger_t* const              self,
                                   const est_trigger_config_t* const config,
                                   const float                       innovation,

@@ -1,22 +1,23 @@
-/// Consecutive equations of the model have the coloured noise C(z) e. This filter makes it white, and passes every element
-/// of the equation alike, so that the equation still holds. It is not 1/C, which would need the e's before the first
-/// equation, but the innovations filter of a moving average that begins there (Brockwell and Davis, "Time Series: Theory and
-/// Methods" (1991), section 5.3): its gains begin at zero and come to C, and the variance of the noise comes down to 1.
+/// Whitening filter. Consecutive equations of the model have the coloured noise C(z) e. The filter makes it white and
+/// treats every element of the equation alike, so that the equation still holds. It is not 1/C, which would need the
+/// e's before the first equation. It is the innovations filter of a moving average that begins there (Brockwell and
+/// Davis, "Time Series: Theory and Methods" (1991), section 5.3). Its gains begin at zero and converge to C; the
+/// variance of the noise converges to 1.
 
 #ifndef EST_WHITENER_H_INCLUDED
 #define EST_WHITENER_H_INCLUDED
 
 #include "est_shape.h"
 
-/// Reflection coefficients beyond this belong to a C that filters the data into overflow.
+/// Largest reflection coefficient of C. Beyond it the filter would make the data overflow.
 #define REFLECTION_MAX 0.9999F
 
-/// The gains have come to C once the variance of the noise is below this; what is left makes no difference worth the name.
+/// Noise variance below which the gains count as converged to C. The remaining difference has no visible effect.
 #define SETTLED 1.0001F
 
-/// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin.
-/// Schur-Cohn (step-down): all zeros are inside iff every reflection coefficient is below 1.
-EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
+/// True iff all zeros of C = 1 + c[0] z^-1 + ... are inside the unit circle, with a margin. By the Schur-Cohn
+/// recursion: all zeros are inside iff every reflection coefficient is below 1.
+EST_SHARED bool est_whitener_accepts(const float* const c, const uint_fast8_t na) {
     float a[EST_NA_MAX] = { 0.0F };  // MISRA D2
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < na; i++) {
@@ -40,8 +41,8 @@ EST_OUTLINE bool est_whitener_accepts(const float* const c, const uint_fast8_t n
     return true;
 }
 
-/// From now on C is this, and its other coefficients as they are; how the next equations hang together with those before is kept.
-EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
+/// Set the first na coefficients of C. The filter continues from its present state.
+EST_SHARED void est_whitener_set(est_whitener_t* const self, const float* const c, const uint_fast8_t na) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < na; i++) {
         self->c[i]       = c[i];
@@ -49,7 +50,7 @@ EST_OUTLINE void est_whitener_set(est_whitener_t* const self, const float* const
     }
 }
 
-/// The next equation is the first.
+/// Restart: the next equation is the first.
 static inline void est_whitener_restart(est_whitener_t* const self) {
     EST_UNROLL
     for (uint_fast8_t i = 0U; i < EST_NA_MAX; i++) {
@@ -62,8 +63,8 @@ static inline void est_whitener_restart(est_whitener_t* const self) {
     }
 }
 
-/// The autocovariance of C(z) e at this lag.
-EST_WITHIN float autocovariance(const float* const c, const uint_fast8_t lag) {
+/// Autocovariance of C(z) e at this lag.
+EST_INLINE float autocovariance(const float* const c, const uint_fast8_t lag) {
     float sum = (lag == 0U) ? 1.0F : c[lag - 1U];
     EST_UNROLL
     for (uint_fast8_t i = lag; i < EST_NA_MAX; i++) {
@@ -72,7 +73,7 @@ EST_WITHIN float autocovariance(const float* const c, const uint_fast8_t lag) {
     return sum;
 }
 
-/// The gains of a new equation.
+/// Store the gains of a new equation.
 EST_INLINE void remember(est_whitener_t* const self, const float* const gain, const float variance) {
     EST_UNROLL
     for (uint_fast8_t row = EST_NA_MAX - 1U; row > 0U; row--) {
@@ -90,11 +91,11 @@ EST_INLINE void remember(est_whitener_t* const self, const float* const gain, co
     }
 }
 
-/// Goes on to the next equation. Returns the variance of its noise once whitened, in variances of e; at least 1. If that is 1
-/// the gains have settled, which is noted, and stay as they are until the next restart.
+/// Advance to the next equation. Return the variance of its whitened noise in variances of e, at least 1. Once it is
+/// 1, the gains have settled: *settled is set, and they stay constant until the next restart.
 static inline float est_whitener_advance(est_whitener_t* const self, bool* const settled) {
     float gain[EST_NA_MAX];
-    float covariance[EST_NA_MAX];  // of the noise of this equation and that of the whitened one i + 1 before
+    float covariance[EST_NA_MAX];  // between this equation's noise and the whitened noise i + 1 equations before
     float variance = autocovariance(self->c, 0U);
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX; i > 0U; i--) {
@@ -117,8 +118,8 @@ static inline float est_whitener_advance(est_whitener_t* const self, bool* const
     return variance;
 }
 
-/// One sample of one signal. A loop of fixed length is the faster one; the gains beyond the order of C are zero.
-EST_SHAPED float est_filter(const float* const gain, est_past_t* const past, const float x) {
+/// Filter one sample of one signal. Gains beyond the order of C are zero: a loop of fixed length is faster.
+EST_SHARED float est_filter(const float* const gain, est_past_t* const past, const float x) {
     float out = x;
     EST_UNROLL
     for (uint_fast8_t i = EST_NA_MAX - 1U; i > 0U; i--) {

@@ -1,30 +1,23 @@
 #include "can_device.h"
-
-#ifndef CAN_DEVICE_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define CAN_DEVICE_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define CAN_DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
+#include "est_assert.h"
 
 #if ANALOGRIG_LENGTH_MAX > CAN_FRAME_MAX
 #error "a message of the catalogue is longer than a frame"
 #endif
 
 void can_device_init(can_device_t* const self, const device_identity_t* const identity, const bool is_fd) {
-    CAN_DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     *self = (can_device_t){ .is_fd = is_fd };
     device_init(&self->device, identity);
 }
 
-/// Whether a frame can be one of the harness: its identifier, and a kind of frame that carries data.
+/// True iff the frame may be a message of the harness: a data frame with an identifier of one.
 static bool is_ours(const can_frame_t* const frame) {
-    return ((frame->flags | CAN_FRAME_FD) == CAN_FRAME_FD) && (frame->id <= UINT8_MAX) && analogrig_is_from_harness((uint8_t)frame->id);
+    return ((frame->flags | CAN_FRAME_FD) == CAN_FRAME_FD) && (frame->id <= UINT8_MAX) &&
+           analogrig_is_from_harness((uint8_t)frame->id);
 }
 
-/// A message of more than eight bytes needs CAN FD; a shorter one may come in either.
+/// True iff the frame has the length of its message. A message of more than eight bytes needs CAN FD.
 static bool is_whole(const can_device_t* const self, const can_frame_t* const frame) {
     const bool is_fd = (frame->flags & CAN_FRAME_FD) != 0U;
     return (frame->length == analogrig_length((uint8_t)frame->id)) &&
@@ -32,9 +25,9 @@ static bool is_whole(const can_device_t* const self, const can_frame_t* const fr
 }
 
 void can_device_enter(can_device_t* const self, const can_frame_t* const frame) {
-    CAN_DEVICE_ASSERT((self != 0) && (frame != 0));
+    EST_ASSERT((self != 0) && (frame != 0));
     if ((frame->flags & CAN_FRAME_ERROR) != 0U) {
-        return;  // no frame of anybody
+        return;  // an error report, not a frame
     }
     if (!is_ours(frame)) {
         device_foreign(&self->device, 1U);
@@ -49,7 +42,7 @@ void can_device_enter(can_device_t* const self, const can_frame_t* const frame) 
 }
 
 bool can_device_answer(can_device_t* const self, can_frame_t* const answer) {
-    CAN_DEVICE_ASSERT((self != 0) && (answer != 0));
+    EST_ASSERT((self != 0) && (answer != 0));
     device_message_t message;
     if (!device_answer(&self->device, &message)) {
         return false;
@@ -66,7 +59,7 @@ device_progress_t can_device_run(can_device_t* const      self,
                                  const size_t             in_n,
                                  can_frame_t* const       out,
                                  const size_t             out_n) {
-    CAN_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
+    EST_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     device_progress_t progress = { .taken = 0U, .given = 0U };
     while (progress.given < out_n) {
         if (can_device_answer(self, &out[progress.given])) {

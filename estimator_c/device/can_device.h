@@ -1,11 +1,11 @@
-/// can_device: the device on a CAN bus. The identifier of a frame is that of the message in estimator_c/catalogue.
+/// can_device: the device on a CAN bus. The identifier of a frame is that of its message in estimator_c/catalogue.
 ///
-/// Others may speak on the bus too: what is not one of the harness's messages in a data frame with eleven bits of identifier
-/// is passed over and counted. A message that has not its length, or that CAN FD carries to a device without it, is
-/// dropped and counted.
+/// The bus may have other nodes. A frame is foreign unless it is a data frame with an 11-bit identifier of a message
+/// of the harness; foreign frames are skipped and counted. A message with the wrong length, or in CAN FD to a device
+/// without it, is dropped and counted.
 ///
-/// The answers must go out in the order in which they are given. Their identifiers differ, so a controller with several
-/// mailboxes that sends the lowest identifier first must be told to send in order, or be given one frame at a time.
+/// The answers must be transmitted in order. Their identifiers differ, so a controller with several mailboxes that
+/// transmits the lowest identifier first must be configured to transmit in order, or be given one frame at a time.
 ///
 /// No heap, no globals, no recursion. The caller owns the state, which belongs to one context.
 /// Distributed under the terms of the MIT License.
@@ -25,23 +25,23 @@
 extern "C" {
 #endif
 
-/// The state of a device on a bus. The fields are private, but for the device.
+/// State of a device on a CAN bus. The fields are private, except device.
 typedef struct {
-    device_t device;  ///< first
+    device_t device;  ///< first member: a pointer to the state is one to the device
     bool     is_fd;
-    uint8_t  payload[ANALOGRIG_LENGTH_MAX];  ///< of the message that is being answered
+    uint8_t  payload[ANALOGRIG_LENGTH_MAX];  ///< payload of the message that is being answered
 } can_device_t;
 
-/// Makes the device ready: default configuration, stopped. is_fd: its controller can send and receive CAN FD.
+/// Prepare the device: default configuration, stopped. `is_fd`: its controller supports CAN FD.
 void can_device_init(can_device_t* self, const device_identity_t* identity, bool is_fd);
 
-/// Takes a frame, when the last message has all its answers (asserted: the device is not busy). Cost: as device_enter().
+/// Enter a frame. The device must not be busy (asserted). Cost: as device_enter().
 void can_device_enter(can_device_t* self, const can_frame_t* frame);
 
-/// The next answer to the last message; false if there is none. Cost: as device_answer().
+/// Write the next answer to the last message. Return false if there is none. Cost: as device_answer().
 bool can_device_answer(can_device_t* self, can_frame_t* answer);
 
-/// Works as device_progress_t says, on frames; an answer needs one.
+/// Run the device as device_progress_t describes, on frames. An answer takes one frame.
 device_progress_t
 can_device_run(can_device_t* self, const can_frame_t* in, size_t in_n, can_frame_t* out, size_t out_n);
 

@@ -1,4 +1,4 @@
-/// can_frame: a frame of CAN or CAN FD, whatever controller, adapter or socket it comes from.
+/// can_frame: a frame of CAN or CAN FD, independent of controller, adapter or socket.
 ///
 /// Distributed under the terms of the MIT License.
 
@@ -7,15 +7,15 @@
 
 #include <stdint.h>
 
-/// Bytes that a frame can carry.
+/// Maximum bytes of data in a frame.
 #define CAN_FRAME_CLASSIC_MAX 8U
 #define CAN_FRAME_MAX 64U
 
-// Flags of a frame.
-#define CAN_FRAME_EXTENDED 1U  ///< its identifier has 29 bits
-#define CAN_FRAME_REMOTE 2U    ///< it asks for a frame, and carries nothing
-#define CAN_FRAME_FD 4U
-#define CAN_FRAME_ERROR 8U     ///< the controller tells of an error; it was never on the bus
+/// Flags of a frame.
+#define CAN_FRAME_EXTENDED 1U  ///< 29-bit identifier
+#define CAN_FRAME_REMOTE 2U    ///< remote frame: requests a frame, and carries no data
+#define CAN_FRAME_FD 4U        ///< CAN FD
+#define CAN_FRAME_ERROR 8U     ///< error report of the controller; was not on the bus
 
 typedef struct {
     uint32_t id;

@@ -1,42 +1,34 @@
 #include "device.h"
+#include "est_assert.h"
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
 #include "settings.h"
 
-#ifndef DEVICE_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define DEVICE_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
-
 #if ANALOGRIG_SAMPLE_BLOCK_FORCE_N > 16
 #error "the mask of missing samples has 16 bits"
 #endif
 
-#define RUN_MAX 7U      ///< of the run ids, which have three bits
+#define RUN_MAX 7U  ///< largest run identifier: it has three bits
 
 #define COUNTER_FIRST ANALOGRIG_STATUS_COUNTER_UPDATED_CHOICE
 #define COUNTER_LAST ANALOGRIG_STATUS_COUNTER_FRAMES_FOREIGN_CHOICE
 
-/// What is still to be said about a sample, in this order.
-#define SAY_ALARM 1U
-#define SAY_DIAGNOSIS 2U
-#define SAY_ESTIMATES 4U
-#define SAY_STEPPED 8U
+/// Answers due for a sample, in this order.
+#define DUE_ALARM 1U
+#define DUE_DIAGNOSIS 2U
+#define DUE_ESTIMATES 4U
+#define DUE_STEPPED 8U
 
-static void add(uint32_t* const counter, const uint32_t n) {
+static void add_saturating(uint32_t* const counter, const uint32_t n) {
     *counter = (*counter < (UINT32_MAX - n)) ? (*counter + n) : UINT32_MAX;
 }
 
-static uint16_t word(const uint8_t* const bytes) { return (uint16_t)(bytes[0] | ((uint32_t)bytes[1] << 8U)); }
+static uint16_t read_word(const uint8_t* const bytes) { return (uint16_t)(bytes[0] | ((uint32_t)bytes[1] << 8U)); }
 
 // ---------------------------------------------        ANSWERS         ---------------------------------------------
 
-static void hello(const device_t* const self, device_message_t* const answer) {
+static void pack_hello(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_hello_t message = { .seq            = self->seq,
                                                .theta_max      = EST_THETA_MAX,
                                                .answers        = self->job_answers,
@@ -45,7 +37,7 @@ static void hello(const device_t* const self, device_message_t* const answer) {
     (void)analogrig_hello_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void firmware(const device_t* const self, device_message_t* const answer) {
+static void pack_firmware(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_firmware_t message = { .seq          = self->seq,
                                                   .firmware_id  = self->identity.firmware_id,
                                                   .answers      = self->job_answers,
@@ -55,7 +47,7 @@ static void firmware(const device_t* const self, device_message_t* const answer)
     (void)analogrig_firmware_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void configured(const device_t* const self, device_message_t* const answer) {
+static void pack_configured(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_configured_t message = { .seq     = self->seq,
                                                     .key     = self->job_next,
                                                     .answers = self->job_answers,
@@ -65,7 +57,7 @@ static void configured(const device_t* const self, device_message_t* const answe
     (void)analogrig_configured_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void controlled(const device_t* const self, device_message_t* const answer) {
+static void pack_controlled(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_controlled_t message = { .seq      = self->seq,
                                                     .command  = self->job_next,
                                                     .answers  = self->job_answers,
@@ -75,7 +67,7 @@ static void controlled(const device_t* const self, device_message_t* const answe
     (void)analogrig_controlled_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void status(const device_t* const self, device_message_t* const answer, const uint32_t value) {
+static void pack_status(const device_t* const self, device_message_t* const answer, const uint32_t value) {
     const struct analogrig_status_t message = {
         .seq = self->seq, .counter = self->job_next, .answers = self->job_answers, .value = value
     };
@@ -83,7 +75,8 @@ static void status(const device_t* const self, device_message_t* const answer, c
     (void)analogrig_status_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void estimate(const device_t* const self, device_message_t* const answer, const uint8_t element, const float value) {
+static void
+pack_estimate(const device_t* const self, device_message_t* const answer, const uint8_t element, const float value) {
     const struct analogrig_estimate_t message = {
         .seq = self->seq, .element = element, .sample_index = self->next_index, .value = value
     };
@@ -91,7 +84,7 @@ static void estimate(const device_t* const self, device_message_t* const answer,
     (void)analogrig_estimate_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void alarm(const device_t* const self, device_message_t* const answer) {
+static void pack_alarm(const device_t* const self, device_message_t* const answer) {
     const struct analogrig_alarm_t message = { .seq          = self->seq,
                                                .trigger      = (uint8_t)self->settings.estimator.trigger.kind,
                                                .sample_index = self->next_index,
@@ -100,7 +93,7 @@ static void alarm(const device_t* const self, device_message_t* const answer) {
     (void)analogrig_alarm_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void diagnosis(const device_t* const self, device_message_t* const answer) {
+static void pack_diagnosis(const device_t* const self, device_message_t* const answer) {
     const est_diagnosis_t              stated  = est_isolation_diagnosis(&self->isolation);
     const struct analogrig_diagnosis_t message = { .seq         = self->seq,
                                                    .change      = (uint8_t)stated.change,
@@ -110,7 +103,7 @@ static void diagnosis(const device_t* const self, device_message_t* const answer
     (void)analogrig_diagnosis_pack(answer->payload, &message, sizeof(answer->payload));
 }
 
-static void stepped(const device_t* const self, device_message_t* const answer) {
+static void pack_stepped(const device_t* const self, device_message_t* const answer) {
     const est_step_t* const          last    = &self->stepped;
     const struct analogrig_stepped_t message = { .seq          = self->seq,
                                                  .missing      = (last->status == EST_MISSING) ? 1U : 0U,
@@ -135,7 +128,7 @@ static est_step_t step(device_t* const self, const est_sample_t sample) {
     return out;
 }
 
-/// Works on the diagnosis of the last alarm, if there is one to come; whether there is one now.
+/// Work on the diagnosis of the last alarm. Return true iff it has just been completed.
 static bool isolate(device_t* const self) {
     const est_change_t before = est_isolation_diagnosis(&self->isolation).change;
     for (uint8_t i = 0U; (i < DEVICE_ISOLATION_SLICES) && est_isolation_work(&self->isolation); i++) {
@@ -148,7 +141,7 @@ static void enter_gap(device_t* const self, const uint16_t lost_n) {
     for (uint16_t i = 0U; (i < lost_n) && (i < DEVICE_GAP_MAX); i++) {
         (void)step(self, missing);
     }
-    add(&self->counters.samples_lost, lost_n);
+    add_saturating(&self->counters.samples_lost, lost_n);
     self->next_index   = (uint16_t)(self->next_index + lost_n);
     self->unreported_n = (uint16_t)(((uint32_t)self->unreported_n + lost_n) % self->report_interval_n);
 }
@@ -162,11 +155,11 @@ static bool report_is_due(device_t* const self) {
     return true;
 }
 
-/// Lets the estimator step, and notes what there is to say about it.
+/// Step the estimator, and record the answers that are due.
 static void enter_sample(device_t* const self, const uint16_t index, const est_sample_t sample) {
     const uint16_t ahead = (uint16_t)(index - self->next_index);
     if (ahead > (UINT16_MAX / 2U)) {
-        add(&self->counters.samples_ignored, 1U);
+        add_saturating(&self->counters.samples_ignored, 1U);
         return;
     }
     if (ahead > 0U) {
@@ -175,56 +168,56 @@ static void enter_sample(device_t* const self, const uint16_t index, const est_s
     const uint32_t restarts = est_counters(&self->estimator).restarts;
     self->stepped           = step(self, sample);
     self->restarted         = est_counters(&self->estimator).restarts != restarts;
-    self->to_say            = SAY_STEPPED;
+    self->due               = DUE_STEPPED;
     self->element           = 0U;
     if (self->stepped.alarm) {
         self->alarm_index = self->next_index;
-        self->to_say |= SAY_ALARM;
+        self->due |= DUE_ALARM;
     }
     if (self->isolating && isolate(self)) {
-        self->to_say |= SAY_DIAGNOSIS;
+        self->due |= DUE_DIAGNOSIS;
     }
     if (report_is_due(self)) {
-        self->to_say |= SAY_ESTIMATES;
+        self->due |= DUE_ESTIMATES;
     }
 }
 
-/// All elements of theta, then the innovation.
-static void say_estimate(device_t* const self, device_message_t* const answer) {
+/// Report the next element of theta; after the last one, the innovation.
+static void answer_estimate(device_t* const self, device_message_t* const answer) {
     if (self->element < est_theta_count(&self->estimator)) {
-        estimate(self, answer, self->element, est_theta(&self->estimator, self->element));
+        pack_estimate(self, answer, self->element, est_theta(&self->estimator, self->element));
         self->element++;
     } else {
-        estimate(self, answer, ANALOGRIG_ESTIMATE_ELEMENT_INNOVATION_CHOICE, self->stepped.innovation);
-        self->to_say &= (uint8_t)~SAY_ESTIMATES;
+        pack_estimate(self, answer, ANALOGRIG_ESTIMATE_ELEMENT_INNOVATION_CHOICE, self->stepped.innovation);
+        self->due &= (uint8_t)~DUE_ESTIMATES;
     }
 }
 
-/// The next of what there is to say about the sample.
-static void say(device_t* const self, device_message_t* const answer) {
-    if ((self->to_say & SAY_ALARM) != 0U) {
-        alarm(self, answer);
-        self->to_say &= (uint8_t)~SAY_ALARM;
-    } else if ((self->to_say & SAY_DIAGNOSIS) != 0U) {
-        diagnosis(self, answer);
-        self->to_say &= (uint8_t)~SAY_DIAGNOSIS;
-    } else if ((self->to_say & SAY_ESTIMATES) != 0U) {
-        say_estimate(self, answer);
+/// Write the next answer that is due for the sample.
+static void answer_sample(device_t* const self, device_message_t* const answer) {
+    if ((self->due & DUE_ALARM) != 0U) {
+        pack_alarm(self, answer);
+        self->due &= (uint8_t)~DUE_ALARM;
+    } else if ((self->due & DUE_DIAGNOSIS) != 0U) {
+        pack_diagnosis(self, answer);
+        self->due &= (uint8_t)~DUE_DIAGNOSIS;
+    } else if ((self->due & DUE_ESTIMATES) != 0U) {
+        answer_estimate(self, answer);
     } else {
-        stepped(self, answer);
-        self->to_say = 0U;
+        pack_stepped(self, answer);
+        self->due = 0U;
         self->next_index++;
     }
 }
 
-/// Counts samples that cannot be entered.
+/// True iff samples of this run can be entered. Counts those that cannot.
 static bool accepts_samples(device_t* const self, const uint8_t run, const uint8_t samples) {
     if (!self->running || (samples < 1U) || (samples > ANALOGRIG_SAMPLE_BLOCK_FORCE_N)) {
-        add(&self->counters.messages_refused, 1U);
+        add_saturating(&self->counters.messages_refused, 1U);
         return false;
     }
     if (run != self->run) {
-        add(&self->counters.samples_of_other_runs, samples);
+        add_saturating(&self->counters.samples_of_other_runs, samples);
         return false;
     }
     return true;
@@ -259,30 +252,30 @@ static void on_sample_block(device_t* const self, const uint8_t* const payload) 
     self->job_payload = payload;
 }
 
-/// The next sample of the block. The codec has a name for each of its codes, no array.
+/// Enter the next sample of the block. Read from the payload, because the codec has one member per code and no array.
 static void step_block(device_t* const self) {
     const uint8_t        i = self->job_next;
     const uint8_t* const force =
         &self->job_payload[ANALOGRIG_SAMPLE_BLOCK_FORCE_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_FORCE_STRIDE)];
     const uint8_t* const displacement =
         &self->job_payload[ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_BYTE + (i * ANALOGRIG_SAMPLE_BLOCK_DISPLACEMENT_STRIDE)];
-    const est_sample_t sample = { .u     = (float)word(force),
-                                  .y     = (float)word(displacement),
+    const est_sample_t sample = { .u     = (float)read_word(force),
+                                  .y     = (float)read_word(displacement),
                                   .valid = (((uint32_t)self->job_missing >> i) & 1U) == 0U };
     enter_sample(self, (uint16_t)(self->job_index + i), sample);
     self->job_next++;
 }
 
-/// What is next about the samples of the message; false if nothing is left to say.
+/// Write the next answer about the samples of the message. Return false if there is none.
 static bool answer_samples(device_t* const self, device_message_t* const answer) {
-    while ((self->to_say == 0U) && (self->job_next < self->job_count)) {
+    while ((self->due == 0U) && (self->job_next < self->job_count)) {
         step_block(self);
     }
-    const bool has_answer = self->to_say != 0U;
+    const bool has_answer = self->due != 0U;
     if (has_answer) {
-        say(self, answer);
+        answer_sample(self, answer);
     }
-    if ((self->to_say == 0U) && (self->job_next == self->job_count)) {
+    if ((self->due == 0U) && (self->job_next == self->job_count)) {
         self->job = DEVICE_IDLE;
     }
     return has_answer;
@@ -315,7 +308,7 @@ static void on_configure(device_t* const self, const uint8_t* const payload) {
 
 // ---------------------------------------------        CONTROL         ---------------------------------------------
 
-/// As after device_init(), except for the identity and the sequence numbers.
+/// Return to the state after device_init(), but keep the identity and the sequence numbers.
 static void reset(device_t* const self) {
     self->counters          = (device_counters_t){ 0 };
     self->stopped           = (est_counters_t){ 0 };
@@ -434,17 +427,17 @@ static uint32_t counter_value(const device_t* const self, const uint8_t counter)
 
 // ---------------------------------------------        MESSAGES        ---------------------------------------------
 
-/// Every message is numbered. One with the number of any of the last ones is a repetition, which must not be obeyed twice;
-/// false for that. Identify begins a conversation, so its number is any.
-static bool sequence_allows(device_t* const self, const uint8_t id, const uint8_t seq) {
+/// Check the sequence number of a message. Return false for a repetition, which must not be executed twice. Identify
+/// begins a conversation and may have any number.
+static bool check_sequence(device_t* const self, const uint8_t id, const uint8_t seq) {
     const bool    begins = (id == ANALOGRIG_IDENTIFY_FRAME_ID) || !self->seq_known;
     const uint8_t behind = (uint8_t)(self->seq_expected - seq);
     if (!begins && (behind >= 1U) && (behind <= DEVICE_LATE_MAX)) {
-        add(&self->counters.messages_repeated, 1U);
+        add_saturating(&self->counters.messages_repeated, 1U);
         return false;
     }
     if (!begins && (seq != self->seq_expected)) {
-        add(&self->counters.sequence_gaps, 1U);
+        add_saturating(&self->counters.sequence_gaps, 1U);
     }
     self->seq_known    = true;
     self->seq_expected = (uint8_t)(seq + 1U);
@@ -469,52 +462,52 @@ static void on_message(device_t* const self, const uint8_t id, const uint8_t* co
         on_sample_block(self, payload);
         break;
     default:
-        add(&self->counters.messages_refused, 1U);
+        add_saturating(&self->counters.messages_refused, 1U);
         break;
     }
 }
 
 void device_init(device_t* const self, const device_identity_t* const identity) {
-    DEVICE_ASSERT((self != 0) && (identity != 0));
+    EST_ASSERT((self != 0) && (identity != 0));
     *self          = (device_t){ 0 };
     self->identity = *identity;
     reset(self);
 }
 
 void device_enter(device_t* const self, const uint8_t id, const uint8_t* const payload) {
-    DEVICE_ASSERT((self != 0) && (payload != 0) && !device_is_busy(self));
+    EST_ASSERT((self != 0) && (payload != 0) && !device_is_busy(self));
     if (!analogrig_is_from_harness(id)) {
-        add(&self->counters.messages_refused, 1U);
+        add_saturating(&self->counters.messages_refused, 1U);
         return;
     }
-    if (sequence_allows(self, id, payload[0])) {
+    if (check_sequence(self, id, payload[0])) {
         self->job_answers = payload[0];
         on_message(self, id, payload);
     }
 }
 
 bool device_answer(device_t* const self, device_message_t* const answer) {
-    DEVICE_ASSERT((self != 0) && (answer != 0));
+    EST_ASSERT((self != 0) && (answer != 0));
     bool has_answer = true;
     switch (self->job) {
     case DEVICE_GREETING:
-        hello(self, answer);
+        pack_hello(self, answer);
         self->job = DEVICE_INTRODUCING;
         break;
     case DEVICE_INTRODUCING:
-        firmware(self, answer);
+        pack_firmware(self, answer);
         self->job = DEVICE_IDLE;
         break;
     case DEVICE_CONFIGURING:
-        configured(self, answer);
+        pack_configured(self, answer);
         self->job = DEVICE_IDLE;
         break;
     case DEVICE_CONTROLLING:
-        controlled(self, answer);
+        pack_controlled(self, answer);
         self->job = DEVICE_IDLE;
         break;
     case DEVICE_COUNTING:
-        status(self, answer, counter_value(self, self->job_next));
+        pack_status(self, answer, counter_value(self, self->job_next));
         self->job = (self->job_next == COUNTER_LAST) ? DEVICE_IDLE : DEVICE_COUNTING;
         self->job_next++;
         break;
@@ -533,21 +526,21 @@ bool device_answer(device_t* const self, device_message_t* const answer) {
 }
 
 void device_overrun(device_t* const self, const uint32_t lost_n) {
-    DEVICE_ASSERT(self != 0);
-    add(&self->counters.receive_overruns, lost_n);
+    EST_ASSERT(self != 0);
+    add_saturating(&self->counters.receive_overruns, lost_n);
 }
 
 void device_dropped(device_t* const self, const uint32_t frames_n) {
-    DEVICE_ASSERT(self != 0);
-    add(&self->counters.frames_dropped, frames_n);
+    EST_ASSERT(self != 0);
+    add_saturating(&self->counters.frames_dropped, frames_n);
 }
 
 void device_foreign(device_t* const self, const uint32_t frames_n) {
-    DEVICE_ASSERT(self != 0);
-    add(&self->counters.frames_foreign, frames_n);
+    EST_ASSERT(self != 0);
+    add_saturating(&self->counters.frames_foreign, frames_n);
 }
 
 bool device_is_busy(const device_t* const self) {
-    DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     return self->job != DEVICE_IDLE;
 }

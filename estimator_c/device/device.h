@@ -1,17 +1,17 @@
-/// device: the device under test without its hardware. Messages go in, messages come out; the estimator works in between.
+/// device: the device under test without its hardware. It receives messages, runs the estimator, and returns answers.
 ///
-/// It speaks the messages of estimator_c/catalogue, and never without being asked: each message of the harness has its
-/// answers, and a message that cannot be understood has none. It does not wait, and it never holds more than one message:
-/// the next one is taken when the last has all its answers, which are made one at a time, as the line has room for them.
-/// A slow line slows the harness down and nothing is lost. What a line is made of, bytes or CAN frames, is for the shells
-/// to know: serial_device.h, can_device.h, slcan_device.h.
+/// The messages are those of estimator_c/catalogue. The device sends nothing unasked: each message of the harness has
+/// its answers, and a message that cannot be decoded has none. The device never waits and holds at most one message.
+/// The next one is entered after the last answer, and answers are made one at a time, when the line has room for
+/// them. A slow line thus slows the harness down without losses. The shells adapt the device to a kind of line, bytes
+/// or CAN frames: serial_device.h, can_device.h, slcan_device.h.
 ///
 ///     Identify    -> Hello, Firmware          Configure   -> Configured
 ///     Control     -> Controlled               Sample      -> [Alarm] [Diagnosis] [Estimate ...] Stepped
 ///     STATUS      -> Status, one per counter  SampleBlock -> the same for each of its samples
 ///
-/// A sample that is not the next one in the order of its index is never entered: one that comes again or late is ignored,
-/// and those skipped by one that comes early are entered as missing. Both are counted.
+/// Samples are entered in the order of their index. A repeated or late sample is ignored; indices skipped by an early
+/// sample are entered as missing. Both are counted.
 ///
 /// No heap, no globals, no recursion, no operating system. The caller owns the state, which belongs to one context.
 /// Distributed under the terms of the MIT License.
@@ -31,58 +31,57 @@
 extern "C" {
 #endif
 
-/// Bytes in the payload of every answer: all fit classic CAN.
+/// Bytes in the payload of every answer, chosen to fit classic CAN.
 #define DEVICE_ANSWER_LENGTH 8U
 
-/// Of a gap so many samples are entered as missing, at most. The estimate is the same from the first one on; this bounds
-/// the time that one message may take.
+/// Maximum number of samples of a gap that are entered as missing. It bounds the time per message; the estimate
+/// depends on the first one only.
 #define DEVICE_GAP_MAX 1024U
 
-/// A message that comes again, however late, must not be obeyed twice: one with a sequence number so far behind is one.
+/// Number of recent sequence numbers that mark a message as repeated. A repeated message must not be executed twice.
 #define DEVICE_LATE_MAX 32U
 
-/// Slices of work on a diagnosis with each sample. A sample takes EST_ISOLATION_SLICES_N of them, and at the alarm up to 20,
-/// which take less, are waiting: the diagnosis comes 0.6 samples later than with all of them at once.
+/// Slices of work on a diagnosis per sample. A sample needs EST_ISOLATION_SLICES_N, and up to 20 shorter samples wait
+/// at the alarm. The diagnosis is 0.6 samples later than with unlimited work.
 #define DEVICE_ISOLATION_SLICES 18U
 
-/// What a port knows about itself.
+/// Properties of a port.
 typedef struct {
-    uint32_t catalogue_hash;  ///< ANALOGRIG_CATALOGUE_HASH; another one makes the device a stranger, for tests
-    uint32_t boot_nonce;      ///< another number after every boot
-    uint8_t  input_blocks;    ///< so many SampleBlocks may wait in the port's input; at least 1
+    uint32_t catalogue_hash;  ///< ANALOGRIG_CATALOGUE_HASH; tests use others to simulate a foreign device
+    uint32_t boot_nonce;      ///< a different number after every boot
+    uint8_t  input_blocks;    ///< number of SampleBlocks that fit the input of the port; at least 1
     uint8_t  firmware_id;     ///< ANALOGRIG_FIRMWARE_FIRMWARE_ID_..._CHOICE
 } device_identity_t;
 
-/// Counters since device_init() or RESET. They saturate, they do not wrap.
+/// Counters since device_init() or RESET. They saturate instead of wrapping.
 typedef struct {
-    uint32_t frames_dropped;         ///< what came and was no frame, or not whole, as the shell told
-    uint32_t frames_foreign;         ///< frames of others on the same bus, as the shell told
-    uint32_t sequence_gaps;          ///< messages whose sequence number was not the one after the last
+    uint32_t frames_dropped;         ///< malformed or incomplete frames, reported by the shell
+    uint32_t frames_foreign;         ///< frames of other nodes on the bus, reported by the shell
+    uint32_t sequence_gaps;          ///< messages whose sequence number does not follow the last one
     uint32_t messages_repeated;      ///< messages with one of the last DEVICE_LATE_MAX sequence numbers; ignored
-    uint32_t messages_refused;       ///< good frames that made no sense here or now, such as samples before START
+    uint32_t messages_refused;       ///< messages that are invalid in the present state, such as samples before START
     uint32_t samples_lost;           ///< skipped indices
-    uint32_t samples_ignored;        ///< samples that came again or late
-    uint32_t samples_of_other_runs;  ///< which the line has kept; ignored
-    uint32_t receive_overruns;       ///< bytes that the port could not take, as it told
+    uint32_t samples_ignored;        ///< repeated or late samples
+    uint32_t samples_of_other_runs;  ///< samples of an earlier run that the line had stored; ignored
+    uint32_t receive_overruns;       ///< bytes that the port could not store, reported by the port
 } device_counters_t;
 
-/// A message of the device.
+/// An answer of the device.
 typedef struct {
-    uint8_t id;  ///< of the catalogue
+    uint8_t id;  ///< identifier of the catalogue
     uint8_t payload[DEVICE_ANSWER_LENGTH];
 } device_message_t;
 
-/// How far a shell of the device has come with its input and output, both counted in items: bytes, or frames. Its run function
-/// works until all input is taken and answered, or until the output has less room than an answer needs: then call again, with
-/// the rest of the input and a new output. Call again too when all input was taken and the output was nearly full:
-/// device_is_busy() tells. Input is taken only as far as it could be answered.
-/// Cost: per item O(1); per message as device_enter() and device_answer().
+/// Progress of a shell through its input and output, counted in items: bytes or frames. The run function of a shell
+/// works until all input is answered, or until the output has less room than an answer needs. Call it again with the
+/// rest of the input and a new output; also when all input was taken but device_is_busy(). Input is taken only as far
+/// as it can be answered. Cost: O(1) per item, plus device_enter() and device_answer() per message.
 typedef struct {
-    size_t taken;  ///< of the input: done with
-    size_t given;  ///< written to the output
+    size_t taken;  ///< items of the input that are processed
+    size_t given;  ///< items written to the output
 } device_progress_t;
 
-/// What is left to answer of the last message. Private.
+/// The message that is being answered. Private.
 typedef enum {
     DEVICE_IDLE = 0,
     DEVICE_GREETING,
@@ -93,63 +92,62 @@ typedef enum {
     DEVICE_STEPPING,
 } device_job_t;
 
-/// The state of a device. The fields are private.
+/// State of a device. The fields are private.
 typedef struct {
     device_identity_t identity;
     device_counters_t counters;
-    settings_t        settings;  ///< what START will use
+    settings_t        settings;  ///< configuration for the next START
     est_t             estimator;
     est_isolation_t   isolation;
     bool              isolating;
     uint16_t          alarm_index;
-    est_counters_t    stopped;  ///< the estimator's counters when it was stopped; it may have been overwritten since
+    est_counters_t    stopped;  ///< counters of the estimator at the last STOP; a later START overwrites the estimator
     bool              running;
-    uint8_t           run;  ///< of START
+    uint8_t           run;  ///< identifier of the run, from START
     uint16_t          next_index;
     uint16_t          report_interval_n;
     uint16_t          unreported_n;  ///< samples since the last report
     bool              seq_known;
-    uint8_t           seq_expected;  ///< of the next message of the harness
-    uint8_t           seq;           ///< of the next message of the device
+    uint8_t           seq_expected;  ///< sequence number of the next message of the harness
+    uint8_t           seq;           ///< sequence number of the next answer
     device_job_t      job;
     uint8_t           job_answers;   ///< sequence number of the message that is being answered
-    uint8_t           job_next;      ///< sample of the block, counter, key or command
-    uint8_t           job_result;    ///< of a Configure or Control
-    uint32_t          job_argument;  ///< of a Control
+    uint8_t           job_next;      ///< next sample of the block, or next counter; or the key, or the command
+    uint8_t           job_result;    ///< result of a Configure or Control
+    uint32_t          job_argument;  ///< argument of a Control
     uint8_t           job_count;     ///< samples in the block
-    uint16_t          job_index;     ///< of its first sample
-    uint16_t          job_missing;   ///< bit i: its sample i is missing
-    const uint8_t*    job_payload;   ///< of the block
-    uint8_t           to_say;        ///< about the last sample
-    uint8_t           element;       ///< of theta, the next to say
+    uint16_t          job_index;     ///< index of the first sample of the block
+    uint16_t          job_missing;   ///< bit i is set if sample i of the block is missing
+    const uint8_t*    job_payload;   ///< payload of the block
+    uint8_t           due;           ///< answers still due for the last sample
+    uint8_t           element;       ///< next element of theta to report
     bool              restarted;
     est_step_t        stepped;
 } device_t;
 
-/// Makes the device ready: default configuration, stopped.
+/// Prepare the device: default configuration, stopped. Cost: as est_init().
 void device_init(device_t* self, const device_identity_t* identity);
 
-/// Takes a message, when the last one has all its answers (asserted: the device is not busy). Its payload has the length that
-/// the catalogue gives to its id, and stays as it is until the device is not busy any more. What makes no sense here or now
-/// is refused and counted.
-/// Cost: O(1); a Sample one est_step().
+/// Enter a message. The device must not be busy (asserted). The payload has the length that the catalogue assigns to
+/// the id, and must stay unchanged until the device is no longer busy. A message that is invalid in the present state
+/// is counted in messages_refused. Cost: O(1); for a Sample one est_step().
 void device_enter(device_t* self, uint8_t id, const uint8_t* payload);
 
-/// The next answer to the last message; false if there is none.
-/// Cost: O(1), or one est_step() for the first answer about a sample of a block; a gap at most DEVICE_GAP_MAX missing samples
-/// on top, for some 100 samples after an alarm DEVICE_ISOLATION_SLICES of est_isolation_work().
+/// Write the next answer to the last message. Return false if there is none.
+/// Cost: O(1); for the first answer to each sample of a block one est_step(), and up to DEVICE_GAP_MAX more after a
+/// gap. For some 100 samples after an alarm, DEVICE_ISOLATION_SLICES calls of est_isolation_work() on top.
 bool device_answer(device_t* self, device_message_t* answer);
 
-/// So many bytes came that the port could not keep. The harness can ask for their sum.
+/// Report bytes that the port received but could not store. STATUS returns their sum.
 void device_overrun(device_t* self, uint32_t lost_n);
 
-/// So many frames were no good: the shell has dropped them.
+/// Report malformed frames that the shell has dropped.
 void device_dropped(device_t* self, uint32_t frames_n);
 
-/// So many frames were those of others on the same bus: the shell has passed over them.
+/// Report frames of other nodes on the bus that the shell has skipped.
 void device_foreign(device_t* self, uint32_t frames_n);
 
-/// Whether there may still be answers to the last message: ask for them before the next one is entered.
+/// True iff the last message may still have answers. Take them before the next device_enter().
 bool device_is_busy(const device_t* self);
 
 #ifdef __cplusplus

@@ -1,13 +1,5 @@
 #include "frame.h"
-
-#ifndef FRAME_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define FRAME_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define FRAME_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
+#include "est_assert.h"
 
 #if ANALOGRIG_LENGTH_MAX > 248
 #error "a content of more than 253 bytes needs a second byte of COBS, and FRAME_SIZE() knows of one"
@@ -16,7 +8,7 @@
 #define CRC_SIZE 4U
 
 uint32_t frame_crc(const uint32_t seed, const uint8_t* const bytes, const size_t n) {
-    // Four bits at a time: a quarter of the speed of a table of bytes, and a sixteenth of its size.
+    // Four bits at a time: a sixteenth of the size of a table of bytes.
     static const uint32_t nibbles[16] = {
         0x00000000UL, 0x105ec76fUL, 0x20bd8edeUL, 0x30e349b1UL, 0x417b1dbcUL, 0x5125dad3UL, 0x61c69362UL, 0x7198540dUL,
         0x82f63b78UL, 0x92a8fc17UL, 0xa24bb5a6UL, 0xb21572c9UL, 0xc38d26c4UL, 0xd3d3e1abUL, 0xe330a81aUL, 0xf36e6f75UL,
@@ -36,11 +28,11 @@ static uint32_t seed_of(const uint32_t catalogue_hash, const uint8_t id) {
 
 // ---------------------------------------------        ENCODING        ---------------------------------------------
 
-/// Writes COBS byte by byte: zeros become the distance to the next zero, filled in when that is known.
+/// COBS encoder, byte by byte. A zero becomes the distance to the next zero, filled in once that is known.
 typedef struct {
     uint8_t* out;
     size_t   n;
-    size_t   code;  ///< where the distance that is not known yet belongs
+    size_t   code;  ///< position of the distance that is not known yet
 } stuffer_t;
 
 static void stuff(stuffer_t* const self, const uint8_t byte) {
@@ -54,7 +46,7 @@ static void stuff(stuffer_t* const self, const uint8_t byte) {
 
 size_t frame_encode(const uint32_t catalogue_hash, const uint8_t id, const uint8_t* const payload, uint8_t* const out) {
     const uint8_t length = analogrig_length(id);
-    FRAME_ASSERT((length > 0U) && (payload != 0) && (out != 0));
+    EST_ASSERT((length > 0U) && (payload != 0) && (out != 0));
     uint32_t  crc     = frame_crc(frame_crc(seed_of(catalogue_hash, id), &id, 1U), payload, length);
     stuffer_t stuffer = { .out = out, .n = 2U, .code = 1U };
     out[0]            = 0U;
@@ -66,14 +58,14 @@ size_t frame_encode(const uint32_t catalogue_hash, const uint8_t id, const uint8
         stuff(&stuffer, (uint8_t)(crc & 0xFFU));
         crc >>= 8U;
     }
-    stuff(&stuffer, 0U);  // closes the last distance; its own place becomes the zero at the end
+    stuff(&stuffer, 0U);  // fills in the last distance; the zero that ends the frame takes the place of this one
     out[stuffer.code] = 0U;
     return stuffer.n;
 }
 
 // ---------------------------------------------        DECODING        ---------------------------------------------
 
-/// COBS backwards, in place: it never writes ahead of what it has read. Returns the size of the content, 0 if it is none.
+/// Decode COBS in place; writing never overtakes reading. Return the size of the content, 0 if it is not COBS.
 static uint8_t unstuff(uint8_t* const bytes, const uint8_t n) {
     uint8_t in  = 0U;
     uint8_t out = 0U;
@@ -107,7 +99,7 @@ static bool is_good(const frame_decoder_t* const self, const uint8_t size) {
     return frame_crc(seed_of(self->catalogue_hash, id), self->bytes, checked) == little_endian(&self->bytes[checked]);
 }
 
-/// What stood before this zero: nothing (two zeros in a row), a good frame, or something to drop.
+/// Handle the bytes before a zero: none (two zeros in a row), a valid frame, or one to drop.
 static bool finish(frame_decoder_t* const self) {
     const uint8_t fill     = self->fill;
     const bool    overlong = self->overlong;
@@ -124,12 +116,12 @@ static bool finish(frame_decoder_t* const self) {
 }
 
 void frame_decoder_init(frame_decoder_t* const self, const uint32_t catalogue_hash) {
-    FRAME_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     *self = (frame_decoder_t){ .catalogue_hash = catalogue_hash };
 }
 
 bool frame_decoder_enter(frame_decoder_t* const self, const uint8_t byte) {
-    FRAME_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     if (byte == 0U) {
         return finish(self);
     }

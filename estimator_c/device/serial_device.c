@@ -1,23 +1,15 @@
 #include "serial_device.h"
-
-#ifndef SERIAL_DEVICE_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define SERIAL_DEVICE_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define SERIAL_DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
+#include "est_assert.h"
 
 void serial_device_init(serial_device_t* const self, const device_identity_t* const identity) {
-    SERIAL_DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     self->dropped = 0U;
     device_init(&self->device, identity);
     frame_decoder_init(&self->decoder, identity->catalogue_hash);
 }
 
-/// Takes bytes up to the end of a message, and enters it; false if they end before. What was dropped is counted before the
-/// message, which may ask for it.
+/// Enter bytes up to the end of a message. Return false if they end before. Dropped frames are reported first,
+/// because the message may ask for their number.
 static bool take_message(serial_device_t* const self, const uint8_t* const in, const size_t in_n, size_t* const taken) {
     bool is_whole = false;
     while (!is_whole && (*taken < in_n)) {
@@ -33,12 +25,9 @@ static bool take_message(serial_device_t* const self, const uint8_t* const in, c
     return is_whole;
 }
 
-device_progress_t serial_device_run(serial_device_t* const self,
-                                    const uint8_t* const   in,
-                                    const size_t           in_n,
-                                    uint8_t* const         out,
-                                    const size_t           out_n) {
-    SERIAL_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
+device_progress_t serial_device_run(
+    serial_device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
+    EST_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     const uint32_t    hash     = self->decoder.catalogue_hash;
     device_progress_t progress = { .taken = 0U, .given = 0U };
     while ((out_n - progress.given) >= SERIAL_DEVICE_ANSWER) {
@@ -48,7 +37,7 @@ device_progress_t serial_device_run(serial_device_t* const self,
         } else if (!take_message(self, in, in_n, &progress.taken)) {
             break;
         } else {
-            // it may have answers
+            // the message may have answers
         }
     }
     return progress;

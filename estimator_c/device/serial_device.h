@@ -1,4 +1,4 @@
-/// serial_device: the device on a line of bytes. The messages of device.h travel in the frames of frame.h.
+/// serial_device: the device on a serial line. Messages are framed as in frame.h.
 ///
 /// No heap, no globals, no recursion. The caller owns the state, which belongs to one context.
 /// Distributed under the terms of the MIT License.
@@ -17,20 +17,20 @@
 extern "C" {
 #endif
 
-/// Bytes of an answer.
+/// Size of an answer in bytes.
 #define SERIAL_DEVICE_ANSWER FRAME_SIZE(DEVICE_ANSWER_LENGTH)
 
-/// The state of a device on a serial line. The fields are private, but for the device.
+/// State of a device on a serial line. The fields are private, except device.
 typedef struct {
-    device_t        device;  ///< first
+    device_t        device;  ///< first member: a pointer to the state is one to the device
     frame_decoder_t decoder;
-    uint32_t        dropped;  ///< frames of which the device has been told
+    uint32_t        dropped;  ///< dropped frames already reported to the device
 } serial_device_t;
 
-/// Makes the device ready: default configuration, stopped, at the beginning of a frame.
+/// Prepare the device: default configuration, stopped, at the beginning of a frame.
 void serial_device_init(serial_device_t* self, const device_identity_t* identity);
 
-/// Works as device_progress_t says, on bytes; an answer needs SERIAL_DEVICE_ANSWER of them.
+/// Run the device as device_progress_t describes, on bytes. An answer takes SERIAL_DEVICE_ANSWER bytes.
 device_progress_t serial_device_run(serial_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
 /// sizeof(serial_device_t), for callers in other languages.

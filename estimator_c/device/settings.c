@@ -6,15 +6,15 @@
 
 typedef struct {
     uint8_t  key;
-    uint8_t  size;    ///< of the member [bytes]
-    uint16_t offset;  ///< of the member in settings_t
-    uint16_t limit;   ///< the largest whole number; 0: a floating-point number
+    uint8_t  size;    ///< size of the member [bytes]
+    uint16_t offset;  ///< offset of the member in settings_t
+    uint16_t limit;   ///< largest value of an integer; 0: a floating-point number
 } field_t;
 
 #define MEMBER(name, member, most)                                                                                     \
     {                                                                                                                  \
-        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((settings_t*)0)->member),           \
-        .offset = (uint16_t)offsetof(settings_t, member), .limit = (most)                                            \
+        .key = ANALOGRIG_CONFIGURE_KEY_##name##_CHOICE, .size = (uint8_t)sizeof(((settings_t*)0)->member),             \
+        .offset = (uint16_t)offsetof(settings_t, member), .limit = (most)                                              \
     }
 
 #define NUMBER(name, member) MEMBER(name, member, 0U)
@@ -50,8 +50,8 @@ static const field_t FIELDS[] = {
 
 #define FIELDS_N (sizeof(FIELDS) / sizeof(FIELDS[0]))
 
-/// What the key stands for; a field of size 0 for an unknown key.
-static field_t field_of(const uint8_t key) {
+/// Field of a key; its size is 0 if the key is unknown.
+static field_t find_field(const uint8_t key) {
     const uint8_t first = ANALOGRIG_CONFIGURE_KEY_C1_CHOICE;
     if ((key >= first) && (key < (first + EST_NA_MAX))) {
         const size_t offset = offsetof(settings_t, estimator.c) + ((key - first) * sizeof(float));
@@ -65,7 +65,7 @@ static field_t field_of(const uint8_t key) {
     return (field_t){ .key = key, .size = 0U };
 }
 
-/// Of a whole number: the members have one byte, two, or that of an enumeration.
+/// Write an integer. Members have one byte, two, or the size of an enum.
 static void put_whole(uint8_t* const member, const uint8_t size, const uint16_t value) {
     if (size == sizeof(uint8_t)) {
         *member = (uint8_t)value;
@@ -84,8 +84,8 @@ static uint16_t get_whole(const uint8_t* const member, const uint8_t size) {
                                       : (uint16_t) * (const uint32_t*)(const void*)member;
 }
 
-/// A value that the field can hold. False for NaN too.
-static bool holds(const field_t field, const float value) {
+/// True iff the field can hold the value. False for NaN.
+static bool can_hold(const field_t field, const float value) {
     if (field.limit == 0U) {
         return analogrig_configure_value_is_in_range(value);
     }
@@ -101,8 +101,8 @@ static void put(settings_t* const self, const field_t field, const float value) 
     }
 }
 
-/// A value that the estimator can take, whatever the other fields will come to: they are set one by one.
-static bool acceptable(const field_t field, const float value) {
+/// True iff the estimator accepts the value with suitable other fields. They are set one by one, in any order.
+static bool is_acceptable(const field_t field, const float value) {
     settings_t base = settings_default();
 #ifndef EST_FIXED_NA
     base.estimator.na     = 1U;
@@ -114,7 +114,8 @@ static bool acceptable(const field_t field, const float value) {
     for (uint8_t i = 0U; i < EST_NA_MAX; i++) {
         base.estimator.c[i] = 0.0F;
     }
-    return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) && (base.force_zero <= EST_CODE_LIMIT);
+    return est_config_valid(&base.estimator) && (base.force_zero >= -EST_CODE_LIMIT) &&
+           (base.force_zero <= EST_CODE_LIMIT);
 }
 
 settings_t settings_default(void) {
@@ -122,11 +123,11 @@ settings_t settings_default(void) {
 }
 
 settings_result_t settings_set(settings_t* const self, const uint8_t key, const float value) {
-    const field_t field = field_of(key);
+    const field_t field = find_field(key);
     if (field.size == 0U) {
         return SETTINGS_UNKNOWN;
     }
-    if (!holds(field, value) || !acceptable(field, value)) {
+    if (!can_hold(field, value) || !is_acceptable(field, value)) {
         return SETTINGS_OUT_OF_RANGE;
     }
     put(self, field, value);
@@ -134,7 +135,7 @@ settings_result_t settings_set(settings_t* const self, const uint8_t key, const 
 }
 
 float settings_get(const settings_t* const self, const uint8_t key) {
-    const field_t field = field_of(key);
+    const field_t field = find_field(key);
     if (field.size == 0U) {
         return 0.0F;
     }

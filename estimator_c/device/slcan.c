@@ -1,13 +1,5 @@
 #include "slcan.h"
-
-#ifndef SLCAN_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define SLCAN_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define SLCAN_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
+#include "est_assert.h"
 
 #define CR 0x0DU
 #define BEL 0x07U
@@ -19,7 +11,7 @@
 #define NO_DIGIT 16U
 #define CODES_MAX 16U
 
-/// Bytes of data for each code of length; up to 8 they are the same (ISO 11898-1, table 5).
+/// Bytes of data for each length code (ISO 11898-1, table 5).
 static const uint8_t length_of_code[CODES_MAX] = { 0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64 };
 
 // ---------------------------------------------         DIGITS         ---------------------------------------------
@@ -33,7 +25,7 @@ static uint8_t digit(const uint8_t character) {
     } else if ((character >= (uint8_t)'a') && (character <= (uint8_t)'f')) {
         out = (uint8_t)(character - (uint8_t)'a' + 10U);
     } else {
-        // no digit
+        // not a digit
     }
     return out;
 }
@@ -43,7 +35,7 @@ static uint8_t character(const uint32_t value) {
     return (uint8_t)(low + ((low < 10U) ? (uint8_t)'0' : ((uint8_t)'A' - 10U)));
 }
 
-/// A number of n digits; false if one of them is none.
+/// Parse a number of n hexadecimal digits. Return false if there is another character.
 static bool number(const uint8_t* const text, const uint8_t n, uint32_t* const out) {
     uint32_t value = 0U;
     for (uint8_t i = 0U; i < n; i++) {
@@ -59,7 +51,7 @@ static bool number(const uint8_t* const text, const uint8_t n, uint32_t* const o
 
 // ---------------------------------------------         FRAMES         ---------------------------------------------
 
-/// The flags of a kind of line; false if it is none of a frame.
+/// Flags of the kind of frame in a line. Return false if the line is not a frame.
 static bool kind_flags(const uint8_t kind, uint8_t* const flags) {
     bool is_frame = true;
     switch (kind) {
@@ -101,7 +93,7 @@ static bool decode_data(const uint8_t* const text, can_frame_t* const frame) {
     return true;
 }
 
-/// The frame in a line of n characters, CR not counted; false if there is none in it.
+/// Parse the frame in a line of n characters, without CR. Return false if it is malformed.
 static bool decode(const uint8_t* const line, const uint8_t n, can_frame_t* const frame) {
     *frame = (can_frame_t){ 0 };
     if (!kind_flags(line[0], &frame->flags)) {
@@ -110,7 +102,8 @@ static bool decode(const uint8_t* const line, const uint8_t n, can_frame_t* cons
     const bool    is_extended = (frame->flags & CAN_FRAME_EXTENDED) != 0U;
     const uint8_t digits      = is_extended ? EXTENDED_DIGITS : STANDARD_DIGITS;
     const uint8_t head        = (uint8_t)(digits + 2U);
-    if ((n < head) || !number(&line[1], digits, &frame->id) || (frame->id > (is_extended ? EXTENDED_MAX : STANDARD_MAX))) {
+    if ((n < head) || !number(&line[1], digits, &frame->id) ||
+        (frame->id > (is_extended ? EXTENDED_MAX : STANDARD_MAX))) {
         return false;
     }
     const uint8_t code  = digit(line[head - 1U]);
@@ -150,7 +143,7 @@ static bool close_channel(slcan_t* const self) {
     return was_open;
 }
 
-/// A line that is no frame; false if it is refused.
+/// Execute a line that is not a frame. Return false if it is refused.
 static bool command(slcan_t* const self, slcan_event_t* const event) {
     const bool is_single = self->fill == 1U;
     switch (self->line[0]) {
@@ -173,7 +166,7 @@ static bool command(slcan_t* const self, slcan_event_t* const event) {
     case (uint8_t)'F':
         reply_text(event, "F00");
         return is_single && self->is_open;
-    case (uint8_t)'Z':  // time stamps: there are none
+    case (uint8_t)'Z':  // time stamps are not supported
         return (self->fill == 2U) && (self->line[1] == (uint8_t)'0');
     default:
         return false;
@@ -190,7 +183,7 @@ static bool transmit(const slcan_t* const self, slcan_event_t* const event) {
     return true;
 }
 
-/// The line is complete. An empty one is a user's way to find out whether somebody is there.
+/// Execute a complete line. An empty line is accepted: users probe the adapter with it.
 static bool execute(slcan_t* const self, slcan_event_t* const event) {
     if (self->overlong) {
         return false;
@@ -202,12 +195,12 @@ static bool execute(slcan_t* const self, slcan_event_t* const event) {
 }
 
 void slcan_init(slcan_t* const self, const bool is_fd) {
-    SLCAN_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     *self = (slcan_t){ .is_fd = is_fd };
 }
 
 bool slcan_enter(slcan_t* const self, const uint8_t byte, slcan_event_t* const event) {
-    SLCAN_ASSERT((self != 0) && (event != 0));
+    EST_ASSERT((self != 0) && (event != 0));
     if (byte != CR) {
         if (self->fill < SLCAN_LINE_MAX) {
             self->line[self->fill++] = byte;
@@ -238,12 +231,12 @@ static uint8_t kind_of(const uint8_t flags) {
     } else if ((flags & CAN_FRAME_REMOTE) != 0U) {
         kind = is_extended ? (uint8_t)'R' : (uint8_t)'r';
     } else {
-        // a data frame
+        // classic data frame
     }
     return kind;
 }
 
-/// The least code whose length holds so many bytes.
+/// Smallest length code that holds n bytes.
 static uint8_t code_of(const uint8_t length) {
     uint8_t code = 0U;
     while (length_of_code[code] < length) {
@@ -253,7 +246,7 @@ static uint8_t code_of(const uint8_t length) {
 }
 
 size_t slcan_encode(const slcan_t* const self, const can_frame_t* const frame, uint8_t* const out) {
-    SLCAN_ASSERT((self != 0) && (frame != 0) && (frame->length <= CAN_FRAME_MAX) && (out != 0));
+    EST_ASSERT((self != 0) && (frame != 0) && (frame->length <= CAN_FRAME_MAX) && (out != 0));
     if (!self->is_open) {
         return 0U;
     }

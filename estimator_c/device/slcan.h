@@ -1,14 +1,15 @@
-/// slcan: CAN frames as lines of text, the protocol of LAWICEL's adapters (CAN232 version 3, CANUSB version 1.0D), which
-/// python-can, Linux's slcand and many tools speak. CAN FD as in the CANable's extension of it (d, D, b, B).
+/// slcan: CAN frames as lines of text, in the protocol of LAWICEL's adapters (CAN232 version 3, CANUSB version 1.0D).
+/// python-can, Linux's slcand and many tools support it. CAN FD uses the extension of the CANable (d, D, b, B).
 ///
 ///     tIIIN..  TIIIIIIIIN..    a frame with 11 or 29 bits of identifier     rIIIN RIIIIIIIIN    a remote frame
 ///     dIIIN..  DIIIIIIIIN..    a frame of CAN FD; b, B: its data at the higher rate
 ///     O L C                    open the channel, open it to listen only, close it
-///     S s Y                    bit rates, noted by whoever has a bus     V N F    version, serial number, status
+///     S s Y                    bit rates; accepted and ignored              V N F    version, serial number, status
 ///
-/// Every line ends with CR, and is answered by CR (after a frame that goes out: z CR or Z CR), or by BEL if it is refused.
+/// A line ends with CR. The reply is CR (after a transmitted frame z CR or Z CR), or BEL if the line is refused.
 ///
-/// No heap, no globals that change, no recursion. The caller owns the state. Distributed under the terms of the MIT License.
+/// No heap, no mutable globals, no recursion. The caller owns the state.
+/// Distributed under the terms of the MIT License.
 
 #ifndef SLCAN_H_INCLUDED
 #define SLCAN_H_INCLUDED
@@ -23,17 +24,17 @@
 extern "C" {
 #endif
 
-/// Characters of the longest line: kind, 29 bits of identifier, length, data, CR.
+/// Length of the longest line: kind, 29 bits of identifier, length, data, CR.
 #define SLCAN_LINE(data_n) (1U + 8U + 1U + (2U * (data_n)) + 1U)
 #define SLCAN_LINE_MAX SLCAN_LINE(CAN_FRAME_MAX)
 
-/// The same with 11 bits of identifier.
+/// The same with an 11-bit identifier.
 #define SLCAN_STANDARD_LINE(data_n) (SLCAN_LINE(data_n) - 5U)
 
-/// Bytes of the longest reply.
+/// Length of the longest reply in bytes.
 #define SLCAN_REPLY_MAX 6U
 
-/// An adapter as its user sees it. The fields are private.
+/// State of the adapter. The fields are private.
 typedef struct {
     bool    is_fd;
     bool    is_open;
@@ -43,22 +44,23 @@ typedef struct {
     uint8_t line[SLCAN_LINE_MAX];
 } slcan_t;
 
-/// What a byte has led to.
+/// Result of a complete line.
 typedef struct {
-    bool        has_frame;  ///< a frame is to go out on the bus
+    bool        has_frame;  ///< transmit the frame on the bus
     can_frame_t frame;
-    uint8_t     reply_n;  ///< bytes to go back
+    uint8_t     reply_n;  ///< length of the reply
     uint8_t     reply[SLCAN_REPLY_MAX];
 } slcan_event_t;
 
-/// Makes the adapter ready, its channel closed. is_fd: frames of CAN FD are taken.
+/// Prepare the adapter with its channel closed. `is_fd`: accept frames of CAN FD.
 void slcan_init(slcan_t* self, bool is_fd);
 
-/// Takes one byte; true iff it completed a line, of which *event tells. Cost: constant, but for a CR after n bytes: O(n).
+/// Enter one byte. Return true iff it completes a line, whose result is *event. Cost: constant; for a CR after n
+/// bytes O(n).
 bool slcan_enter(slcan_t* self, uint8_t byte, slcan_event_t* event);
 
-/// Writes a frame that came from the bus as a line; returns its length, at most SLCAN_LINE_MAX. 0 while the channel is closed:
-/// there is nobody to tell.
+/// Write a frame received from the bus as a line. Return its length, at most SLCAN_LINE_MAX; 0 while the channel is
+/// closed.
 size_t slcan_encode(const slcan_t* self, const can_frame_t* frame, uint8_t* out);
 
 #ifdef __cplusplus

@@ -1,21 +1,13 @@
 #include "slcan_device.h"
-
-#ifndef SLCAN_DEVICE_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define SLCAN_DEVICE_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define SLCAN_DEVICE_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
+#include "est_assert.h"
 
 void slcan_device_init(slcan_device_t* const self, const device_identity_t* const identity) {
-    SLCAN_DEVICE_ASSERT(self != 0);
+    EST_ASSERT(self != 0);
     can_device_init(&self->can, identity, true);
     slcan_init(&self->adapter, true);
 }
 
-/// Takes a byte, and the frame that it completes; returns how many bytes of reply were written.
+/// Enter a byte, and the frame that it completes. Return the number of bytes of the reply.
 static size_t enter(slcan_device_t* const self, const uint8_t byte, uint8_t* const out) {
     slcan_event_t event;
     if (!slcan_enter(&self->adapter, byte, &event)) {
@@ -30,12 +22,9 @@ static size_t enter(slcan_device_t* const self, const uint8_t byte, uint8_t* con
     return event.reply_n;
 }
 
-device_progress_t slcan_device_run(slcan_device_t* const self,
-                                   const uint8_t* const  in,
-                                   const size_t          in_n,
-                                   uint8_t* const        out,
-                                   const size_t          out_n) {
-    SLCAN_DEVICE_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
+device_progress_t slcan_device_run(
+    slcan_device_t* const self, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
+    EST_ASSERT((self != 0) && ((in != 0) || (in_n == 0U)) && ((out != 0) || (out_n == 0U)));
     device_progress_t progress = { .taken = 0U, .given = 0U };
     while ((out_n - progress.given) >= SLCAN_DEVICE_ANSWER) {
         can_frame_t answer;

@@ -1,5 +1,5 @@
-/// slcan_device: the device on a CAN bus of its own, behind an adapter that speaks slcan.h: bytes in, bytes out. To whoever
-/// opens it, it is an adapter of LAWICEL's kind with a bus on which the device is the only other node.
+/// slcan_device: the device on a CAN bus of its own, behind an slcan adapter. To its user it is an adapter with a bus
+/// on which the device is the only other node.
 ///
 /// No heap, no globals, no recursion. The caller owns the state, which belongs to one context.
 /// Distributed under the terms of the MIT License.
@@ -17,19 +17,20 @@
 extern "C" {
 #endif
 
-/// Bytes that one step of work may write: an answer, or a reply.
+/// Maximum size in bytes of an answer or a reply.
 #define SLCAN_DEVICE_ANSWER SLCAN_STANDARD_LINE(DEVICE_ANSWER_LENGTH)
 
-/// The state. The fields are private, but for the device.
+/// State of the device and its adapter. The fields are private, except can.device.
 typedef struct {
-    can_device_t can;  ///< first
+    can_device_t can;  ///< first member: a pointer to the state is one to the device
     slcan_t      adapter;
 } slcan_device_t;
 
-/// Makes the device ready: default configuration, stopped, the adapter's channel closed. It takes CAN FD.
+/// Prepare the device: default configuration, stopped, CAN FD supported, the channel of the adapter closed.
 void slcan_device_init(slcan_device_t* self, const device_identity_t* identity);
 
-/// Works as device_progress_t says, on bytes; an answer, or a reply of the adapter, needs SLCAN_DEVICE_ANSWER of them.
+/// Run the device as device_progress_t describes, on bytes. An answer or a reply takes at most SLCAN_DEVICE_ANSWER
+/// bytes.
 device_progress_t slcan_device_run(slcan_device_t* self, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
 
 /// sizeof(slcan_device_t), for callers in other languages.

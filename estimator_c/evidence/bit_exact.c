@@ -1,5 +1,5 @@
-/// Runs the estimator in every configuration on data that are the same everywhere, and prints how many steps there were,
-/// what happened in them, and a hash of all results. bit_exact.py compares the outputs of compilers and targets.
+/// Run the estimator in every configuration on data that are identical everywhere. Print the numbers of steps and
+/// events, and a hash of all results. bit_exact.py compares the output between compilers and targets.
 
 #include "est.h"
 #include "est_isolation.h"
@@ -9,7 +9,7 @@
 
 #define STEPS_N 120U  ///< in each configuration
 
-/// With isolation, the plant changing once it is known.
+/// Steps of each run with isolation; the plant changes in it.
 #define ISOLATION_STEPS_N 500U
 #define ISOLATION_CHANGE 300U
 #define ISOLATION_RUNS_N 36U
@@ -24,10 +24,10 @@ typedef struct {
     uint32_t missing;
     uint32_t refreshes;
     uint32_t diagnoses;
-    uint32_t violations;  ///< steps after which the invariants did not hold
+    uint32_t violations;  ///< steps after which est_invariants_hold() failed
 } record_t;
 
-/// FNV-1a of the four bytes, the lowest first.
+/// Hash the four bytes by FNV-1a, lowest first.
 static void enter_bits(record_t* const self, const uint32_t bits) {
     for (uint32_t shift = 0U; shift < 32U; shift += 8U) {
         self->hash = (self->hash ^ ((bits >> shift) & 0xFFU)) * 1099511628211U;
@@ -39,7 +39,7 @@ typedef union {
     uint32_t bits;
 } word_t;
 
-/// The bits of a NaN depend on the target: it is counted instead, and there should be none.
+/// Hash the bits of a number. The bits of a NaN depend on the target, so it is counted instead; none is expected.
 static void enter_number(record_t* const self, const float number) {
     const word_t word = { .number = number };
     if ((word.bits & 0x7FFFFFFFU) > 0x7F800000U) {
@@ -54,7 +54,7 @@ static float of_bits(const uint32_t bits) {
     return word.number;
 }
 
-/// A trigger of the caller's own: the squared innovation in units of its variance, averaged over some ten equations.
+/// A custom trigger: the normalised squared innovation, averaged over some ten equations.
 static float own_trigger(void* const context, const float innovation, const float variance, const bool anew) {
     float* const mean = context;
     *mean             = anew ? 0.0F : *mean;
@@ -62,7 +62,7 @@ static float own_trigger(void* const context, const float innovation, const floa
     return *mean;
 }
 
-/// Takes the digits of a number off its end, base by base: so one number stands for a whole configuration.
+/// Remove the last digit of a number in this base and return it. One number thus encodes a whole configuration.
 static uint32_t digit(uint32_t* const number, const uint32_t base) {
     const uint32_t out = *number % base;
     *number /= base;
@@ -81,7 +81,8 @@ static est_trigger_config_t trigger_of(const est_trigger_kind_t kind, uint32_t* 
                                    .context    = context };
 }
 
-/// The orders, triggers and edges in every combination, a C that filters or none; the rest by chance.
+/// Configuration of this number: every combination of orders, triggers, edge instants and prefilter; other fields at
+/// random.
 static est_config_t configuration_of(uint32_t number, uint32_t random, float* const context) {
     static const float forgettings[] = { 1.0F, 0.99F, 0.9F, 0.5F };
     static const float walks[]       = { 0.0F, 1.0e-6F, 0.01F };
@@ -101,7 +102,7 @@ static est_config_t configuration_of(uint32_t number, uint32_t random, float* co
     config.idle_n                    = (uint16_t)(20U * digit(&random, 2U));
     config.code_low                  = -1000.0F;
     config.code_high                 = 5000.0F;
-    const float zero                 = 0.2F * (float)digit(&random, 5U);  // of C, twice
+    const float zero                 = 0.2F * (float)digit(&random, 5U);  // double zero of C
     config.c[0]                      = -zero;
     config.c[1]                      = 0.0F;
     if (config.na == 2U) {
@@ -111,10 +112,10 @@ static est_config_t configuration_of(uint32_t number, uint32_t random, float* co
     return config;
 }
 
-/// What a card delivers: now and then nothing, nonsense, or the same again and again.
+/// Sample of a card that occasionally delivers nothing, extreme values, or a constant.
 static est_sample_t sample_of(plant_t* const plant, const uint32_t k) {
     static const uint32_t nonsense[] = { 0x7FC00000U, 0x7F800000U, 0xFF800000U, 0x45BB8000U,
-                                         0x7F7FFFFFU };  // NaN first
+                                         0x7F7FFFFFU };  // the first is NaN
     const plant_codes_t   codes      = plant_next(plant);
     const uint32_t        chance     = plant_random(plant);
     est_sample_t          sample     = { .u = (float)codes.u, .y = (float)codes.y, .valid = (chance % 64U) != 0U };
@@ -161,7 +162,7 @@ static void enter_end(record_t* const self, const est_t* const estimator) {
     self->refreshes += c.refreshes;
 }
 
-/// The edges come at the instants of samples, across which they drift, or anywhere.
+/// Plant whose edges come at sampling instants, drift across them, or come anywhere.
 static plant_t plant_of(const est_edge_instants_t edge_instants, const uint32_t seed) {
     plant_t plant           = plant_at_rest(PLANT_FRONT, seed, 5U * PLANT_TICKS_PER_SAMPLE);
     plant.half_period_ticks = 10U * PLANT_TICKS_PER_SAMPLE;
@@ -195,11 +196,13 @@ static bool run(record_t* const self, const uint32_t number) {
 
 static void enter_diagnosis(record_t* const self, const est_diagnosis_t diagnosis) {
     enter_bits(self, (uint32_t)diagnosis.change | ((uint32_t)diagnosis.samples_n << 8U));
-    enter_bits(self, diagnosis.onset_n | ((uint32_t)diagnosis.onset_low_n << 8U) | ((uint32_t)diagnosis.onset_high_n << 16U));
+    enter_bits(self,
+               diagnosis.onset_n | ((uint32_t)diagnosis.onset_low_n << 8U) | ((uint32_t)diagnosis.onset_high_n << 16U));
     enter_number(self, diagnosis.extent);
 }
 
-/// Locked edges with four parameters or edges that may slip with six; M, B, K or two of them change.
+/// Run isolation: four parameters with locked edges or six with edges that may slip; a change of M, B, K or two of
+/// them.
 static bool run_isolation(record_t* const self, uint32_t number) {
     const plant_mechanics_t front     = PLANT_FRONT;
     const plant_mechanics_t changed[] = { PLANT_FRONT_SOFT,

@@ -1,5 +1,6 @@
-/// What Frama-C's Eva analyses: whether any configuration at all is valid; then, with one that is and has these orders (-DNA=2U
-/// and so on), any samples, for ever. Numbers may be anything that a float can hold, NaN and the infinities included. eva.py runs it.
+/// Entry point for Frama-C's Eva: est_config_valid() with any configuration; then any number of any samples with a
+/// valid configuration of these orders (-DNA=2U and so on). A float may have any value, including NaN and the
+/// infinities. eva.py runs the analysis.
 
 #include "est.h"
 

@@ -1,5 +1,5 @@
-/// Uses what a program uses of the estimator, so that the linker keeps that and drops the rest; with -DFOOTPRINT_ALL the
-/// whole of its interface, with -DFOOTPRINT_ISOLATES isolation too.
+/// Call the functions that a typical program calls, so that the linker keeps them and drops the rest. -DFOOTPRINT_ALL
+/// adds the rest of the interface, -DFOOTPRINT_ISOLATES isolation.
 
 #include "est.h"
 #include "est_isolation.h"
@@ -21,7 +21,7 @@ OUTSIDE void reset(void) {
     (void)est_init(&estimator, &config);
     const est_sample_t sample = { .u = sink, .y = sink, .valid = true };
     const est_step_t   step   = est_step(&estimator, sample);
-    sink                  = step.statistic + est_theta(&estimator, 0U);
+    sink                      = step.statistic + est_theta(&estimator, 0U);
 #ifdef FOOTPRINT_ALL
     sink = est_variance(&estimator, 0U) + est_noise_variance(&estimator);
     sink = (float)(est_counters(&estimator).alarms + est_theta_count(&estimator));

@@ -1,5 +1,5 @@
-/// Bare metal for a Cortex-M: makes the samples of a realistic run, enters them one after another into a subject, and ends
-/// the simulation. What lies in the section .outside is not counted (see cost.py).
+/// Bare-metal program for a Cortex-M: generate the samples of a realistic run, enter them into a subject, and end the
+/// simulation. Instructions in the section .outside are not counted (see cost.py).
 
 #include "plant.h"
 #include "subject.h"
@@ -10,8 +10,8 @@
 
 #define SAMPLES_N 600U
 #define MISSING_SAMPLE 330U
-#define LATE_SAMPLE 381U  ///< the edges of a drifting generator cross the sampling instant here
-#define SOFT_SAMPLE 480U  ///< the plant is another one from here on
+#define LATE_SAMPLE 381U  ///< first sample after a drifting edge crosses a sampling instant
+#define SOFT_SAMPLE 480U  ///< first sample of the changed plant
 
 static float u_codes[SAMPLES_N];
 static float y_codes[SAMPLES_N];
@@ -29,9 +29,9 @@ OUTSIDE static void enable_fpu(void) {
 }
 #endif
 
-/// All of them before the first step, since soft float lies inside of what is counted.
+/// Generate all samples before the first step: the routines of soft float are counted wherever they are called.
 OUTSIDE static void make_samples(void) {
-    // the edges come at the very instants of samples
+    // edges coincide with sampling instants
     plant_t plant = plant_at_rest(PLANT_FRONT, 1U, 10U * PLANT_TICKS_PER_SAMPLE);
     for (uint32_t k = 0U; k < SAMPLES_N; k++) {
         plant.reads_first = subject_drifts && (k >= LATE_SAMPLE);
@@ -44,7 +44,7 @@ OUTSIDE static void make_samples(void) {
     }
 }
 
-/// SYS_EXIT_EXTENDED of Arm's semihosting.
+/// End the simulation with SYS_EXIT_EXTENDED of Arm semihosting.
 OUTSIDE static void end_simulation(const uint32_t status) {
     const uint32_t           block[2]              = { 0x20026U, status };
     register uint32_t        operation __asm("r0") = 0x20U;
@@ -54,7 +54,7 @@ OUTSIDE static void end_simulation(const uint32_t status) {
     }
 }
 
-/// Lies inside: the count of the last step ends here.
+/// End of the last step. Inside the counted sections.
 __attribute__((noinline, used)) void after_last_step(void) { __asm volatile(""); }
 
 OUTSIDE void reset(void) {
@@ -70,7 +70,7 @@ OUTSIDE void reset(void) {
     end_simulation(subject_judge());
 }
 
-// The compiler calls these; they stand in for those of the C library.
+// Functions of the C library that the compiler calls implicitly.
 
 __attribute__((section(".library"), used)) void* memset(void* const to, const int value, const size_t n) {
     for (size_t i = 0U; i < n; i++) {

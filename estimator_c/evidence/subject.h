@@ -1,4 +1,4 @@
-/// What image.c measures. The code of these functions lies outside of what is counted; what they call lies inside.
+/// subject: interface of the code that image.c measures. These functions are not counted; those that they call are.
 
 #ifndef SUBJECT_H_INCLUDED
 #define SUBJECT_H_INCLUDED
@@ -8,13 +8,13 @@
 
 #define SUBJECT __attribute__((section(".outside"), noinline, used))
 
-/// Whether the generator's edges may drift across a sampling instant: they then do, once.
+/// True if the edges of the generator drift across a sampling instant once.
 extern const bool subject_drifts;
 
 void subject_begin(void);
 void subject_enter(float u, float y, bool valid);
 
-/// 0 if all has happened that the run is made for; the exit status of the simulator.
+/// Return 0 if everything happened that the run is designed to provoke, else another exit status.
 uint32_t subject_judge(void);
 
 #endif  // SUBJECT_H_INCLUDED

@@ -1,4 +1,4 @@
-/// The device as a subject: a frame with a sample comes in, the frames that answer it go out.
+/// The device as a subject: enter the frame of a sample, and write the frames of its answers.
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
@@ -19,14 +19,14 @@ static size_t          longest_answer;
 void device_step(const uint8_t* in, size_t in_n);
 void between_steps(void);
 
-/// Lies inside: what is counted begins with it.
+/// Begin of the counted part. Inside the counted sections.
 __attribute__((noinline, used)) void device_step(const uint8_t* const in, const size_t in_n) {
     const size_t given = serial_device_run(&device, in, in_n, output, sizeof(output)).given;
     least_answer       = (given < least_answer) ? given : least_answer;
     longest_answer     = (given > longest_answer) ? given : longest_answer;
 }
 
-/// Lies inside: what is counted ends with it, for the harness's part, which follows, lies inside too.
+/// End of the counted part. The work of the harness follows, which is inside the counted sections too.
 __attribute__((noinline, used)) void between_steps(void) { __asm volatile(""); }
 
 static size_t frame_of(const uint8_t id, const uint8_t* const payload, uint8_t* const frame) {
@@ -35,10 +35,10 @@ static size_t frame_of(const uint8_t id, const uint8_t* const payload, uint8_t* 
 }
 
 SUBJECT void subject_begin(void) {
-    const device_identity_t         identity = { .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH, .input_blocks = 1U };
-    const struct analogrig_control_t start   = { .seq = seq, .command = ANALOGRIG_CONTROL_COMMAND_START_CHOICE };
-    uint8_t                         payload[ANALOGRIG_CONTROL_LENGTH];
-    uint8_t                         frame[FRAME_SIZE(ANALOGRIG_CONTROL_LENGTH)];
+    const device_identity_t identity = { .catalogue_hash = (uint32_t)ANALOGRIG_CATALOGUE_HASH, .input_blocks = 1U };
+    const struct analogrig_control_t start = { .seq = seq, .command = ANALOGRIG_CONTROL_COMMAND_START_CHOICE };
+    uint8_t                          payload[ANALOGRIG_CONTROL_LENGTH];
+    uint8_t                          frame[FRAME_SIZE(ANALOGRIG_CONTROL_LENGTH)];
     serial_device_init(&device, &identity);
     (void)analogrig_control_pack(payload, &start, sizeof(payload));
     const size_t frame_n = frame_of(ANALOGRIG_CONTROL_FRAME_ID, payload, frame);
@@ -61,7 +61,7 @@ SUBJECT void subject_enter(const float u, const float y, const bool valid) {
     between_steps();
 }
 
-/// Every sample was answered in full, once with an alarm.
+/// Check that every sample was answered completely, and one with an alarm.
 SUBJECT uint32_t subject_judge(void) {
     return ((least_answer == ((ANSWERS_N - 1U) * FRAME_SIZE(8U))) ? 0U : 1U) |
            ((longest_answer >= (ANSWERS_N * FRAME_SIZE(8U))) ? 0U : 2U);

@@ -1,5 +1,5 @@
-/// The estimator as a subject. With -DSUBJECT_LOCKED the generator is on the card's clock; -DSUBJECT_NA=2U, _NB, _NK and
-/// _OFFSET are the orders; with -DSUBJECT_ISOLATES the change is isolated.
+/// The estimator as a subject. -DSUBJECT_NA=2U, _NB, _NK and _OFFSET set the orders, -DSUBJECT_LOCKED the generator
+/// on the clock of the card, -DSUBJECT_ISOLATES the isolation of the change.
 
 #include "est.h"
 #include "est_isolation.h"
@@ -27,7 +27,7 @@ SUBJECT void subject_begin(void) {
 #ifdef SUBJECT_LOCKED
     config.edge_instants = EST_EDGES_LOCKED;
 #endif
-    (void)est_init(&estimator, &config);  // a refusal leaves nothing to count, and subject_judge() says so
+    (void)est_init(&estimator, &config);  // subject_judge() detects a refusal: nothing is counted
 #ifdef SUBJECT_ISOLATES
     (void)est_isolation_init(&isolation, &config, 0.0F);
 #endif
@@ -44,7 +44,7 @@ SUBJECT void subject_enter(const float u, const float y, const bool valid) {
 #endif
 }
 
-/// Of the change, it was the stiffness.
+/// True iff the change was identified as one of the stiffness.
 static bool is_isolated(void) {
 #ifdef SUBJECT_ISOLATES
     return est_isolation_diagnosis(&isolation).change == EST_CHANGE_STIFFNESS;
@@ -53,9 +53,10 @@ static bool is_isolated(void) {
 #endif
 }
 
-/// The change of the plant was seen, a drift was not taken for one, and the gap was a gap.
+/// Check that the change raised an alarm, the drift did not, and the gap was counted.
 SUBJECT uint32_t subject_judge(void) {
     const est_counters_t counters = est_counters(&estimator);
     return (est_invariants_hold(&estimator) ? 0U : 1U) | ((counters.alarms == 1U) ? 0U : 2U) |
-           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U) | (is_isolated() ? 0U : 16U);
+           ((counters.missing == 1U) ? 0U : 4U) | ((counters.slips == (subject_drifts ? 1U : 0U)) ? 0U : 8U) |
+           (is_isolated() ? 0U : 16U);
 }

@@ -1,6 +1,6 @@
-/// Least squares as textbooks have them, for an ARX model with delay 1: the regressor, the prediction and the update, and nothing
-/// else. No check, no prefilter, no trigger. They show what the estimator costs beside them (see cost.py). -DTEXTBOOK_N is
-/// the number of parameters, half of them a's; the order is an argument, as in a library.
+/// Textbook recursive least squares for an ARX model with delay 1: regressor, prediction and update, without checks,
+/// prefilter or trigger. The reference for the cost of the estimator (see cost.py). -DTEXTBOOK_N is the number of
+/// parameters, half of them a's. The order is an argument, as in a library.
 
 #include "subject.h"
 
@@ -8,13 +8,13 @@
 #define TEXTBOOK_N 4U
 #endif
 
-#define P0 1.0e-4F  ///< with a larger one the covariance form does not survive float32
+#define P0 1.0e-4F  ///< a larger value makes the covariance form diverge in float32
 #define FORGETTING 0.99F
 
 typedef struct {
     float theta[TEXTBOOK_N];
     float phi[TEXTBOOK_N];
-    float p[TEXTBOOK_N][TEXTBOOK_N];  ///< the covariance; or U above the diagonal and D on it
+    float p[TEXTBOOK_N][TEXTBOOK_N];  ///< covariance; or U above the diagonal and D on it
 } textbook_t;
 
 const bool subject_drifts = false;
@@ -22,7 +22,7 @@ const bool subject_drifts = false;
 static textbook_t       state;
 static volatile uint8_t order_n = TEXTBOOK_N / 2U;
 
-/// The newest pair of samples takes the place of the oldest.
+/// Replace the oldest pair of samples by the newest.
 static void shift(textbook_t* const self, const uint8_t order, const float u, const float y) {
     for (uint8_t i = (uint8_t)(order - 1U); i > 0U; i--) {
         self->phi[i]         = self->phi[i - 1U];
@@ -87,7 +87,7 @@ static void update_factors(textbook_t* const self, const uint8_t n, const float 
     }
 }
 
-/// What is counted.
+/// The counted step.
 __attribute__((noinline)) void
 textbook_step(textbook_t* const self, const uint8_t order, const float u, const float y) {
     const uint8_t n = (uint8_t)(2U * order);
@@ -109,11 +109,11 @@ SUBJECT void subject_begin(void) {
 }
 
 SUBJECT void subject_enter(const float u, const float y, const bool valid) {
-    (void)valid;  // it has no notion of a gap
+    (void)valid;  // missing samples are not supported
     textbook_step(&state, order_n, u, y);
 }
 
-/// The static gain of the model is near that of the plant, 0.6 or 0.82 after the change.
+/// Check that the static gain of the model is close to that of the plant: 0.6, or 0.82 after the change.
 SUBJECT uint32_t subject_judge(void) {
     float a = 1.0F;
     float b = 0.0F;

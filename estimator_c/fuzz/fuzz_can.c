@@ -1,5 +1,5 @@
-/// libFuzzer target over the device on a CAN bus, with CAN FD and without, as fuzz_line.h has it: frames of any identifier, kind
-/// and length among the harness's. `make fuzz` builds and runs it.
+/// libFuzzer target for the device on a CAN bus, with and without CAN FD; see fuzz_line.h. Messages of the harness
+/// are mixed with frames of any identifier, kind and length. `make fuzz` builds and runs it.
 
 #include "analogrig_catalogue.h"
 #include "can_device.h"
@@ -14,9 +14,8 @@ static void add_frame(stream_t* const stream, const can_frame_t* const frame) {
     stream->n += sizeof(*frame);
 }
 
-/// Now and then in the wrong kind of frame, or with another identifier of the same last byte.
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+/// Occasionally uses the wrong kind of frame, or another identifier with the same last byte.
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     can_frame_t   frame  = { .id = id, .length = analogrig_length(id) };
     const uint8_t choice = take_byte(input);
     frame.flags          = (frame.length > CAN_FRAME_CLASSIC_MAX) ? CAN_FRAME_FD : 0U;
@@ -37,7 +36,7 @@ void target_add_noise(stream_t* const stream, input_t* const input) {
     add_frame(stream, &frame);
 }
 
-/// Of the harness, each in a data frame of its length.
+/// Counts data frames with the identifier and length of a message of the harness.
 size_t target_messages(const stream_t* const stream) {
     size_t n = 0U;
     for (size_t i = 0U; i < stream->n; i += sizeof(can_frame_t)) {
@@ -50,7 +49,7 @@ size_t target_messages(const stream_t* const stream) {
     return n;
 }
 
-/// Nothing but classic frames of the device.
+/// Expects classic frames of the device only.
 size_t target_checked(const answers_t* const answers) {
     const size_t frames = answers->n / sizeof(can_frame_t);
     expect((answers->n % sizeof(can_frame_t)) == 0U);

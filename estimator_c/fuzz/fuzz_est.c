@@ -1,5 +1,6 @@
-/// libFuzzer target over the public API of core and isolation: any configuration, any samples, any time to work; the
-/// invariants must hold after every step, and nothing may be read or written that is not there. `make fuzz` builds and runs it.
+/// libFuzzer target for the public API of core and isolation: any configuration, any samples, any number of slices of
+/// work. The invariants must hold after every step, and the sanitizers must find nothing. `make fuzz` builds and runs
+/// it.
 
 #include "est.h"
 #include "est_isolation.h"
@@ -33,7 +34,7 @@ static uint8_t byte(input_t* const input) {
     return *input->bytes++;
 }
 
-/// Half of them any bit pattern, half of them a code.
+/// Return a number: any bit pattern, or a code, with equal probability.
 static float number(input_t* const input) {
     const uint8_t kind = byte(input);
     if ((kind & 1U) != 0U) {
@@ -42,7 +43,8 @@ static float number(input_t* const input) {
         memcpy(&value, &bits, sizeof(value));
         return value;
     }
-    return (float)((int32_t)(word(input) >> 20U) - ((kind & 2U) != 0U ? 2048 : 0)) / ((kind & 4U) != 0U ? 1024.0F : 1.0F);
+    return (float)((int32_t)(word(input) >> 20U) - ((kind & 2U) != 0U ? 2048 : 0)) /
+           ((kind & 4U) != 0U ? 1024.0F : 1.0F);
 }
 
 static float trigger(void* const context, const float innovation, const float variance, const bool anew) {
@@ -50,29 +52,31 @@ static float trigger(void* const context, const float innovation, const float va
     return (anew || !(variance > 0.0F)) ? 0.0F : ((innovation * innovation) / variance);
 }
 
-/// Most values come from the defaults, or almost no configuration would be valid.
+/// Return a configuration. Most values are defaults, otherwise almost no configuration would be valid.
 static est_config_t configuration(input_t* const input) {
-    est_config_t config = est_config_default();
-    config.na           = (uint8_t)(byte(input) % (EST_NA_MAX + 2U));
-    config.nb           = (uint8_t)(byte(input) % (EST_NB_MAX + 2U));
-    config.nk           = (uint8_t)(byte(input) % (EST_NK_MAX + 2U));
-    config.nc           = (uint8_t)(byte(input) % (EST_NC_MAX + 2U));
-    const uint8_t flags      = byte(input);
-    config.offset            = (flags & 1U) != 0U;
-    config.noise_estimated   = (flags & 2U) != 0U;
-    config.trigger.absolute  = (flags & 4U) != 0U;
-    config.trigger.reset     = ((flags & 8U) != 0U) ? EST_RESET_ALL : EST_RESET_COVARIANCE;
-    config.trigger.custom    = ((flags & 16U) != 0U) ? trigger : 0;
-    config.refresh_n         = byte(input);
-    config.stuck_n           = byte(input);
-    config.idle_n            = byte(input);
+    est_config_t config       = est_config_default();
+    config.na                 = (uint8_t)(byte(input) % (EST_NA_MAX + 2U));
+    config.nb                 = (uint8_t)(byte(input) % (EST_NB_MAX + 2U));
+    config.nk                 = (uint8_t)(byte(input) % (EST_NK_MAX + 2U));
+    config.nc                 = (uint8_t)(byte(input) % (EST_NC_MAX + 2U));
+    const uint8_t flags       = byte(input);
+    config.offset             = (flags & 1U) != 0U;
+    config.noise_estimated    = (flags & 2U) != 0U;
+    config.trigger.absolute   = (flags & 4U) != 0U;
+    config.trigger.reset      = ((flags & 8U) != 0U) ? EST_RESET_ALL : EST_RESET_COVARIANCE;
+    config.trigger.custom     = ((flags & 16U) != 0U) ? trigger : 0;
+    config.refresh_n          = byte(input);
+    config.stuck_n            = byte(input);
+    config.idle_n             = byte(input);
     config.trigger.hold_off_n = byte(input);
-    config.trigger.warm_up_n = byte(input);
-    config.trigger.kind      = (est_trigger_kind_t)(byte(input) % 6U);
-    config.edge_instants     = (est_edge_instants_t)(byte(input) % 4U);
-    float* const values[] = { &config.forgetting, &config.random_walk,  &config.p0,         &config.p0_offset,
-                              &config.c[0],       &config.noise_variance, &config.edge_codes, &config.code_low,
-                              &config.code_high,  &config.trigger.ceiling, &config.c[EST_NA_MAX - 1U] };
+    config.trigger.warm_up_n  = byte(input);
+    config.trigger.kind       = (est_trigger_kind_t)(byte(input) % 6U);
+    config.edge_instants      = (est_edge_instants_t)(byte(input) % 4U);
+    float* const values[]     = {
+            &config.forgetting,        &config.random_walk, &config.p0,       &config.p0_offset, &config.c[0],
+            &config.noise_variance,    &config.edge_codes,  &config.code_low, &config.code_high, &config.trigger.ceiling,
+            &config.c[EST_NA_MAX - 1U]
+    };
     const uint32_t changed = word(input);
     for (size_t i = 0U; i < (sizeof(values) / sizeof(values[0])); i++) {
         if (((changed >> i) & 1U) != 0U) {
@@ -90,8 +94,12 @@ static void expect(const bool holds) {
 
 static bool number_is_finite(const float x) { return (x - x) == 0.0F; }
 
-/// Entered, and worked on for so many slices, whether it pays or not.
-static void isolate(est_isolation_t* const isolation, const est_t* const estimator, const est_sample_t sample, const est_step_t step, const uint8_t slices) {
+/// Enter a step into the isolation, and call est_isolation_work() this many times, whatever it returns.
+static void isolate(est_isolation_t* const isolation,
+                    const est_t* const     estimator,
+                    const est_sample_t     sample,
+                    const est_step_t       step,
+                    const uint8_t          slices) {
     est_isolation_enter(isolation, estimator, sample, step);
     for (uint8_t i = 0U; i < slices; i++) {
         (void)est_isolation_work(isolation);

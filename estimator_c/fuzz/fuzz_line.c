@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-/// A block's worth of samples, or all the counters: no message has more answers.
+/// Upper bound of the answers to one message: all answers to the samples of a block. There are fewer counters.
 #define ANSWERS_PER_MESSAGE (ANALOGRIG_SAMPLE_BLOCK_FORCE_N * (EST_THETA_MAX + 3U))
 
 void expect(const bool holds) {
@@ -26,8 +26,8 @@ uint8_t take_byte(input_t* const input) {
     return *input->bytes++;
 }
 
-/// A message of the harness, mostly with the sequence number that is due; values that no fuzzer finds in reasonable time,
-/// identifiers and checksums, are made for it.
+/// Add a message of the harness, mostly with the expected sequence number. Identifiers and checksums are computed,
+/// because a fuzzer does not find them in reasonable time.
 static void add_message(stream_t* const stream, input_t* const input) {
     static const uint8_t ids[] = { ANALOGRIG_SAMPLE_FRAME_ID,   ANALOGRIG_SAMPLE_BLOCK_FRAME_ID,
                                    ANALOGRIG_CONTROL_FRAME_ID,  ANALOGRIG_CONFIGURE_FRAME_ID,
@@ -53,7 +53,8 @@ static void add_next(stream_t* const stream, input_t* const input) {
     }
 }
 
-/// The stream in pieces into the device, its answers in pieces out of it; sizes come from the input, the largest without one.
+/// Pass the stream to the device in pieces, and take its answers in pieces. The sizes come from the input, or are the
+/// largest.
 static void play(const target_t* const kind,
                  void* const           state,
                  const stream_t* const stream,
@@ -83,7 +84,7 @@ void expect_answer(const uint8_t id, const uint8_t* const payload, const size_t 
     expect(payload[0] == (uint8_t)number);
 }
 
-/// The state of any shell.
+/// State of any shell.
 typedef union {
     serial_device_t serial;
     can_device_t    can;
@@ -97,14 +98,16 @@ int LLVMFuzzerTestOneInput(const uint8_t* const data, const size_t size) {
     static answers_t        answers;
     static answers_t        answers_at_once;
     const target_t          kind     = target(data, size);
-    const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH, .boot_nonce = 1U, .firmware_id = 1U };
+    const device_identity_t identity = { .catalogue_hash = ANALOGRIG_CATALOGUE_HASH,
+                                         .boot_nonce     = 1U,
+                                         .firmware_id    = 1U };
     const size_t            sizes_n  = (size > 0U) ? ((data[0] < size) ? data[0] : (size - 1U)) : 0U;
     input_t                 sizes    = { .bytes = &data[(size > 0U) ? 1U : 0U], .n = sizes_n };
-    input_t                 input    = { .bytes = &sizes.bytes[sizes_n], .n = (size > 0U) ? (size - 1U - sizes_n) : 0U };
-    stream.n                         = 0U;
-    stream.seq                       = 0U;
-    answers.n                        = 0U;
-    answers_at_once.n                = 0U;
+    input_t                 input = { .bytes = &sizes.bytes[sizes_n], .n = (size > 0U) ? (size - 1U - sizes_n) : 0U };
+    stream.n                      = 0U;
+    stream.seq                    = 0U;
+    answers.n                     = 0U;
+    answers_at_once.n             = 0U;
     target_begin(&stream);
     while ((input.n > 0U) && (stream.n < (STREAM_MAX - NOISE_MAX))) {
         add_next(&stream, &input);

@@ -1,7 +1,7 @@
-/// fuzz_line: what the fuzz targets over the device have in common, one for each kind of line: any bytes and any messages, in
-/// pieces of any size, answered into outputs of any size. Whatever comes, all that goes out is whole and comes from the device,
-/// numbered one after the other; the answers to a message are bounded, the size of the pieces changes nothing, and the
-/// estimator's invariants hold.
+/// fuzz_line: common part of the fuzz targets for the device, one for each kind of line. Any bytes and messages are
+/// entered in pieces of any size, and answered into outputs of any size. The output must consist of complete messages
+/// of the device with consecutive numbers. The answers to a message are bounded, the size of the pieces has no
+/// effect, and the invariants of the estimator hold.
 
 #ifndef FUZZ_LINE_H_INCLUDED
 #define FUZZ_LINE_H_INCLUDED
@@ -15,13 +15,13 @@
 #define STREAM_MAX 4096U
 #define ANSWERS_MAX (1U << 20U)
 
-/// What is left of the fuzzer's input.
+/// Rest of the fuzzer's input.
 typedef struct {
     const uint8_t* bytes;
     size_t         n;
 } input_t;
 
-/// What comes over the line, and the sequence number that is due next.
+/// Bytes that arrive over the line, and the next sequence number.
 typedef struct {
     uint8_t seq;
     size_t  n;
@@ -33,45 +33,45 @@ typedef struct {
     uint8_t bytes[ANSWERS_MAX];
 } answers_t;
 
-/// Most bytes that one step may add to a stream.
+/// Maximum number of bytes that one step adds to a stream.
 #define NOISE_MAX 256U
 
-// ---- what each target defines
+// ---- functions that each target defines
 
-/// Its kind of line.
+/// Kind of line.
 typedef struct {
     const device_line_t* line;
-    size_t               item_size;    ///< bytes that come together
-    size_t               answer_size;  ///< bytes of room for which something is answered
+    size_t               item_size;    ///< bytes that arrive together
+    size_t               answer_size;  ///< room in bytes that an answer needs
 } target_t;
 
-/// For this input of the fuzzer.
+/// Return the kind of line for this input.
 target_t target(const uint8_t* data, size_t size);
 
-/// What must be said first.
+/// Add the messages that must come first.
 void target_begin(stream_t* stream);
 
-/// Adds a message of the harness.
+/// Add a message of the harness.
 void target_add_message(stream_t* stream, uint8_t id, const uint8_t* payload, input_t* input);
 
-/// Adds at most NOISE_MAX bytes of anything else.
+/// Add at most NOISE_MAX bytes of anything else.
 void target_add_noise(stream_t* stream, input_t* input);
 
-/// No fewer than the harness's messages in it.
+/// Upper bound of the number of messages of the harness in the stream.
 size_t target_messages(const stream_t* stream);
 
-/// How many answers there are; expect_answer() for each.
+/// Check each answer with expect_answer(), and return their number.
 size_t target_checked(const answers_t* answers);
 
-// ---- what they have to do it with
+// ---- functions for the targets
 
-/// Aborts unless it holds.
+/// Abort unless the condition holds.
 void expect(bool holds);
 
-/// The next byte; 0 when there is none.
+/// Take the next byte; 0 at the end.
 uint8_t take_byte(input_t* input);
 
-/// Expects the message to be one of the device with that number.
+/// Abort unless the message is one of the device with this sequence number.
 void expect_answer(uint8_t id, const uint8_t* payload, size_t length, size_t number);
 
 #endif  // FUZZ_LINE_H_INCLUDED

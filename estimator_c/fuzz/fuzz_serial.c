@@ -1,4 +1,4 @@
-/// libFuzzer target over the device on a serial line, as fuzz_line.h has it. `make fuzz` builds and runs it.
+/// libFuzzer target for the device on a serial line; see fuzz_line.h. `make fuzz` builds and runs it.
 
 #include "analogrig_catalogue.h"
 #include "fuzz_line.h"
@@ -6,8 +6,7 @@
 
 void target_begin(stream_t* const stream) { (void)stream; }
 
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     (void)input;
     stream->n += frame_encode(ANALOGRIG_CATALOGUE_HASH, id, payload, &stream->bytes[stream->n]);
 }
@@ -28,7 +27,7 @@ size_t target_messages(const stream_t* const stream) {
     return frames;
 }
 
-/// Nothing but whole frames.
+/// Expects complete frames only.
 size_t target_checked(const answers_t* const answers) {
     frame_decoder_t decoder;
     frame_decoder_init(&decoder, ANALOGRIG_CATALOGUE_HASH);

@@ -1,5 +1,5 @@
-/// libFuzzer target over the device behind slcan, as fuzz_line.h has it: lines, commands and any bytes. `make fuzz` builds and
-/// runs it.
+/// libFuzzer target for the device behind slcan: lines, commands and any bytes; see fuzz_line.h. `make fuzz` builds
+/// and runs it.
 
 #include "analogrig_catalogue.h"
 #include "fuzz_line.h"
@@ -10,10 +10,10 @@
 #define CR 0x0DU
 #define BEL 0x07U
 
-/// An answer's line: t, three digits of identifier, the length, sixteen digits of data.
+/// Length of an answer: t, three digits of identifier, the length, sixteen digits of data.
 #define ANSWER_LINE 21U
 
-/// That of a SampleBlock.
+/// Length of the line of a SampleBlock.
 #define BLOCK_LINE 133U
 
 static void add_text(stream_t* const stream, const char* const text) {
@@ -24,9 +24,8 @@ static void add_text(stream_t* const stream, const char* const text) {
 
 void target_begin(stream_t* const stream) { add_text(stream, "O\r"); }
 
-/// Now and then in the wrong kind of frame, or a digit too long.
-void
-target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
+/// Occasionally uses the wrong kind of frame, or a line that is one digit too long.
+void target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* const payload, input_t* const input) {
     const slcan_t adapter = { .is_open = true };
     const uint8_t choice  = take_byte(input);
     can_frame_t   frame   = { .id = id, .length = analogrig_length(id) };
@@ -39,7 +38,7 @@ target_add_message(stream_t* const stream, const uint8_t id, const uint8_t* cons
     }
 }
 
-/// Any bytes, or such as a line is made of.
+/// Adds any bytes, or only characters of lines.
 void target_add_noise(stream_t* const stream, input_t* const input) {
     static const char letters[] = "\r\r\r\rtTrRdDbBOOOLCSsYVNFZ0123456789ABCDEFabcdef0000";
     const uint8_t     choice    = take_byte(input);
@@ -49,7 +48,7 @@ void target_add_noise(stream_t* const stream, input_t* const input) {
     }
 }
 
-/// A line for a data frame of 8 or 64 bytes, as long as such a line is.
+/// True iff the line has the length of a data frame with 8 or 64 bytes.
 static bool may_be_message(const uint8_t* const line, const size_t n) {
     return ((n == ANSWER_LINE) && (line[4] == (uint8_t)'8')) ||
            ((n == BLOCK_LINE) && ((line[4] == (uint8_t)'F') || (line[4] == (uint8_t)'f')));
@@ -95,7 +94,7 @@ static bool is_reply(const uint8_t* const line, const size_t n) {
     return false;
 }
 
-/// Nothing but whole lines: replies, and frames of the device.
+/// Expects complete lines only: replies, and frames of the device.
 size_t target_checked(const answers_t* const answers) {
     size_t frames = 0U;
     size_t start  = 0U;
@@ -112,7 +111,7 @@ size_t target_checked(const answers_t* const answers) {
             expect(i == start);
             start = i + 1U;
         } else {
-            // within a line
+            // inside a line
         }
     }
     expect(start == answers->n);

@@ -1,54 +1,46 @@
 #include "est_isolation.h"
+#include "est_assert.h"
 
 #include <stddef.h>
 
-#ifndef EST_ASSERT
-#ifdef NDEBUG  // a freestanding compiler has no assert.h
-#define EST_ASSERT(x) ((void)0)
-#else
-#include <assert.h>
-#define EST_ASSERT(x) assert(x)  // NOLINT(cppcoreguidelines-macro-usage)
-#endif
-#endif
-
 #define EFFECTS EST_ISOLATION_EFFECTS_N
-#define PUSH 3U  ///< the effect that stands for an onset between those that are tried; M, B and K are those before it
+#define PUSH 3U  ///< index of the impulse, which stands for an onset between two samples; M, B and K come before it
 
-/// Samples after an alarm before theta is taken for the plant again, and after which the extent is refined no more.
+/// Samples after an alarm at which theta counts as the plant again, and the refinement of the extent ends.
 #define SETTLED_N 100U
 
-/// In nats, by how much a change alone must be likelier than any other one alone, 20 times; than the two others together, 1.5
-/// times: as long as no force acts they explain just the same, and then soon far less; and than it and a second one by
-/// WORTH_TELLING or more, 7 times.
+/// Evidence for a single changed parameter [nats]. SURE: over any other single parameter, a factor of 20.
+/// MORE_LIKELY: over the two others together, 1.5; without a force they explain the same, and soon after far less.
+/// ALONE: over itself and a second parameter that changed by WORTH_TELLING or more, 7.
 #define SURE 3.0F
 #define MORE_LIKELY 0.4F
 #define ALONE 2.0F
 #define WORTH_TELLING 0.15F
 
-/// In nats: what none but a second change explains; and what an onset between two samples must explain more than one at a
-/// sample, since it has a number of its own to do so.
+/// Evidence for a second changed parameter [nats], and for an onset between two samples, which has one more free
+/// parameter than an onset at a sample.
 #define NOT_BY_CHANCE 11.0F
 #define BETWEEN 2.0F
 
-/// The extent is not told before it is known to a standard deviation of 1.1 %. Here and in the normal equations a reciprocal
-/// variance is halved: what a deviation costs in nats is its square times that.
+/// Accuracy of the extent at which it is stated: a standard deviation of 1.1 %. Reciprocal variances are halved here
+/// and in the normal equations: a deviation then costs its square times that [nats].
 #define EXTENT_KNOWN 4000.0F
 
-/// What is known of a change before any sample: a standard deviation of 1; and of a push: nothing.
+/// Prior of a change: a standard deviation of 1. Prior of an impulse: almost none.
 #define PRIOR 0.5F
 #define UNKNOWN 1.0e-3F
 
-/// Enough for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
+/// Halvings that suffice for the largest arcosh of a plant, 7.6 with a2 = 1e-6.
 #define HALVINGS_N 8U
 
-/// Of the smallest a2, 1e-6.
+/// Doublings that suffice for the logarithm of the smallest a2, 1e-6.
 #define DOUBLINGS_N 20U
 
 #define LN_2 0.69314718F
 
 // ---------------------------------------------         PLANT          ---------------------------------------------
 
-/// Natural logarithm of 1e-6 < a < 1: 2 artanh((x - 1) / (x + 1)) near 1.
+/// Natural logarithm of 1e-6 < a < 1. Near 1 it is 2 artanh((x - 1) / (x + 1)).
 static float logarithm(const float a) {
     float x   = a;
     float out = 0.0F;
@@ -72,7 +64,8 @@ static float root(const float x) {
     return out;
 }
 
-/// arcosh(a)^2, which is -arccos(a)^2 below 1. a > -1; is halved by cosh(w / 2)^2 = (1 + cosh(w)) / 2 until the series serves.
+/// arcosh(a)^2, which is -arccos(a)^2 below 1, for a > -1. Halves the argument by cosh(w / 2)^2 = (1 + cosh(w)) / 2
+/// until the series converges.
 static float squared_arcosh(const float a) {
     float x     = a;
     float scale = 2.0F;
@@ -86,17 +79,18 @@ static float squared_arcosh(const float a) {
     return scale * z * (1.0F - (z * (0.16666667F - (z * (0.044444444F - (z * 0.014285714F))))));
 }
 
-/// Coefficients of z^0, z^-1, z^-2 from their sum and their first and second moment.
+/// Compute the coefficients of z^0, z^-1, z^-2 from their sum, their first and their second moment.
 static void from_moments(float* const out, const float sum, const float first, const float second) {
     out[2] = 0.5F * (second - first);
     out[1] = first - (2.0F * out[2]);
     out[0] = sum - out[1] - out[2];
 }
 
-/// What theta says of the plant. The poles of A are exp(-p/2 +- w) with p = B T / M and p^2/4 - w^2 = q = K T^2 / M. The
-/// plant answers 1, t and t^2, as deflections by a force, with 1, t - D, and t^2 - 2 D t + 2 (D^2 - 1/q), where D = B / K
-/// is its lag: the coefficients follow that make the sampled answers the same. False iff it is no plant.
-static bool believe(est_believed_t* const self, const est_config_t* const config, const float force_zero) {
+/// Derive the plant from theta. The poles of A are exp(-p/2 +- w) with p = B T / M and p^2/4 - w^2 = q = K T^2 / M. A
+/// force that deflects the plant by 1, t or t^2 when static is answered by 1, t - D and t^2 - 2 D t + 2 (D^2 - 1/q),
+/// with the lag D = B / K. The coefficients are those that give the same answers at the samples. Return false if
+/// theta is not a plant.
+static bool derive_plant(est_plant_t* const self, const est_config_t* const config, const float force_zero) {
     const float a1  = self->theta[0];
     const float a2  = self->theta[1];
     const float sum = 1.0F + a1 + a2;
@@ -131,11 +125,11 @@ static bool believe(est_believed_t* const self, const est_config_t* const config
 
 // ---------------------------------------------        SAMPLES         ---------------------------------------------
 
-static const est_kept_t* kept(const est_isolation_t* const self, const uint32_t ago) {
+static const est_kept_t* sample_before(const est_isolation_t* const self, const uint32_t ago) {
     return &self->kept[((self->newest + EST_ISOLATION_KEPT_N) - ago) % EST_ISOLATION_KEPT_N];
 }
 
-static uint8_t one_more(const uint8_t n) { return (n < UINT8_MAX) ? (uint8_t)(n + 1U) : n; }
+static uint8_t count_up(const uint8_t n) { return (n < UINT8_MAX) ? (uint8_t)(n + 1U) : n; }
 
 static void keep(est_isolation_t* const self, const est_sample_t sample, const float innovation) {
     self->newest             = (uint8_t)((self->newest + 1U) % EST_ISOLATION_KEPT_N);
@@ -143,66 +137,72 @@ static void keep(est_isolation_t* const self, const est_sample_t sample, const f
     self->known_n            = (uint8_t)((self->known_n < EST_ISOLATION_KEPT_N) ? (self->known_n + 1U) : self->known_n);
 }
 
-/// Measured u, counted from where F = 0.
-static float force(const est_isolation_t* const self, const uint32_t ago) { return kept(self, ago)->u - self->force_zero; }
+/// Measured force: u counted from F = 0.
+static float force(const est_isolation_t* const self, const uint32_t ago) {
+    return sample_before(self, ago)->u - self->force_zero;
+}
 
-/// The force on the plant in the past sample, times what it does to y, since an onset `age_n` samples ago. An edge of u may
-/// come anywhere within the interval, as the b's tell: b_0, if nk is 0, is the share of the new level.
-static float pushed(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n) {
+/// Effect on y of the force during the past sample, for an onset `age_n` samples ago. An edge of u may come anywhere
+/// within the interval; b_0 is then the share of the new level, if nk is 0.
+static float force_effect(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n) {
     const est_config_t* const config = self->config;
-    const float* const        b      = &self->believed.theta[2];
+    const float* const        b      = &self->plant.theta[2];
     if (age_n == 1U) {
         const float direct = (config->nk == 0U) ? b[0] : 0.0F;
-        const float whole  = self->believed.gain * self->believed.hold;
+        const float whole  = self->plant.gain * self->plant.hold;
         return (direct * force(self, ago)) + ((whole - direct) * force(self, ago + 1U));  // MISRA D4
     }
     float out = 0.0F;
     for (uint8_t i = 0U; i < config->nb; i++) {
-        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: est_isolation_init()
+        out += b[i] * force(self, ago + i + config->nk);  // at most two samples back: checked by est_isolation_init()
     }
     return out;
 }
 
-/// What drives the effects since an onset so long ago. With x the displacement, everything else as it was,
+/// Compute the inputs of the effects for an onset `age_n` samples ago. With x the measured displacement and all else
+/// unchanged,
 ///     M0 d'' + B0 d' + K0 d = -nu (F - B0 x' - K0 x) - dB x' - dK x,    nu = 1 - M0/M,
-/// is how d, by which the plant leaves its course, follows from a change of M, of B, or of K: linear in each.
+/// gives the deviation d of the plant from its course. It is linear in a change of M, of B, and of K.
 static void drive(const est_isolation_t* const self, const uint32_t ago, const uint16_t age_n, float* const out) {
-    const est_believed_t* const plant = &self->believed;
-    float spring;
-    float damper;
-    if (age_n == 1U) {  // the second of the two samples matters half as much: the force acts from the first on
-        const float rise = kept(self, ago)->y - kept(self, ago + 1U)->y;
-        spring = plant->hold * (kept(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
-        damper = plant->hold * plant->lag_n * rise;
+    const est_plant_t* const plant = &self->plant;
+    float                    spring;
+    float                    damper;
+    if (age_n == 1U) {  // the force acts from the first sample on: the second has half the weight
+        const float rise = sample_before(self, ago)->y - sample_before(self, ago + 1U)->y;
+        spring           = plant->hold * (sample_before(self, ago + 1U)->y + (0.33333333F * rise) - plant->rest);
+        damper           = plant->hold * plant->lag_n * rise;
     } else {
         spring = 0.0F;
         damper = 0.0F;
         for (uint32_t i = 0U; i < 3U; i++) {
-            const float x = kept(self, ago + i)->y - plant->rest;
+            const float x = sample_before(self, ago + i)->y - plant->rest;
             spring += plant->spring[i] * x;
             damper += plant->damper[i] * x;
         }
     }
-    out[0] = spring + damper - pushed(self, ago, age_n);
+    out[0] = spring + damper - force_effect(self, ago, age_n);
     out[1] = -damper;
     out[2] = -spring;
 }
 
-/// y less what the plant as it was would have done, from its equation, whitened by C as in est_whitener.h.
+/// Enter a sample into the residual: y less the response of the plant before the change, whitened by C as in
+/// est_whitener.h.
 static void enter_residual(est_isolation_t* const self, const uint32_t ago) {
     const est_config_t* const config = self->config;
-    const float* const        theta  = self->believed.theta;
-    float out = kept(self, ago)->y + (theta[0] * kept(self, ago + 1U)->y) + (theta[1] * kept(self, ago + 2U)->y);
+    const float* const        theta  = self->plant.theta;
+    float                     out    = sample_before(self, ago)->y + (theta[0] * sample_before(self, ago + 1U)->y) +
+                (theta[1] * sample_before(self, ago + 2U)->y);
     for (uint8_t i = 0U; i < config->nb; i++) {
-        out -= theta[2U + i] * kept(self, ago + i + config->nk)->u;
+        out -= theta[2U + i] * sample_before(self, ago + i + config->nk)->u;
     }
     out -= config->offset ? theta[2U + config->nb + config->nc] : 0.0F;
-    out -= (self->believed.c[0] * self->residual[0]) + (self->believed.c[1] * self->residual[1]);
+    out -= (self->plant.c[0] * self->residual[0]) + (self->plant.c[1] * self->residual[1]);
     self->residual[1] = self->residual[0];
     self->residual[0] = out;
 }
 
-static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
+static void
+enter_onset(est_isolation_t* const self, est_onset_t* const onset, const uint32_t ago, const uint16_t age_n) {
     float        first[PUSH];
     const float* driving = self->driving;
     float*       matrix  = onset->matrix;
@@ -214,7 +214,7 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, c
         float* const past   = onset->past[i];
         const float  pushes = (age_n == 1U) ? 1.0F : 0.0F;
         const float  drives = (i == PUSH) ? pushes : driving[i];
-        const float  now    = drives - (self->believed.c[0] * past[0]) - (self->believed.c[1] * past[1]);
+        const float  now    = drives - (self->plant.c[0] * past[0]) - (self->plant.c[1] * past[1]);
         const float  weight = now * self->nats;
         past[1]             = past[0];
         past[0]             = now;
@@ -230,44 +230,51 @@ static void enter_onset(est_isolation_t* const self, est_onset_t* const onset, c
 static float greater(const float a, const float b) { return (a > b) ? a : b; }
 
 /// ln(exp(a) + exp(b)), to 0.03.
-static float either(const float a, const float b) {
+static float log_add(const float a, const float b) {
     const float most  = greater(a, b);
     const float least = (a > b) ? b : a;
     const float near  = greater(2.83F - (most - least), 0.0F);
     return most + ((0.0866F * near) * near);
 }
 
-/// What is left of a gain if a change x, known so well, must be worth telling.
-static float if_worth_telling(const float gain, const float x, const float known) {
+/// Discount a gain by what it costs to make the change x, known this well, a relevant one.
+static float discount(const float gain, const float x, const float known) {
     const float size = (x < 0.0F) ? -x : x;
     const float lack = greater(WORTH_TELLING - size, 0.0F);
     return gain - ((known * lack) * lack);
 }
 
-/// One change, as the normal equations have it. Private.
+/// A hypothesis of one changed parameter. Private.
 typedef struct {
     float vector;
-    float known;   ///< half its reciprocal variance
-    float change;  ///< likeliest
+    float known;   ///< half the reciprocal variance of change
+    float change;  ///< most likely value
     float gain;
 } one_t;
 
-/// Of the pair i > j, whose number is i + j - 1; `ij`: their element of the normal equations.
-static void weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
+/// Weigh the pair of parameters i > j, whose index is i + j - 1. `ij`: their element of the normal equations.
+static void
+weigh_pair(est_fit_t* const fit, const one_t* const ones, const uint8_t i, const uint8_t j, const float ij) {
     const uint8_t pair  = (uint8_t)(i + j - 1U);
     const float   share = ij / ones[j].known;
-    const float   left  = greater(ones[i].known - (ij * share), PRIOR);  // is not less but for rounding
+    const float   left  = greater(ones[i].known - (ij * share), PRIOR);  // smaller only by rounding
     const float   rest  = ones[i].vector - (share * ones[j].vector);
     const float   x     = rest / left;
     const float   both  = ones[j].gain + (rest * x);
-    fit->any_pair[pair] = either(fit->any_pair[pair], both);
-    fit->beside[j]      = greater(fit->beside[j], if_worth_telling(both, x, left));
+    fit->any_pair[pair] = log_add(fit->any_pair[pair], both);
+    fit->beside[j]      = greater(fit->beside[j], discount(both, x, left));
     fit->beside[i] =
-        greater(fit->beside[i], if_worth_telling(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
+        greater(fit->beside[i], discount(both, ones[j].change - (share * x), (left * ones[j].known) / ones[i].known));
 }
 
-/// What an onset explains, with normal equations of M, B and K alone; `gain`: what it explains without them.
-static void weigh(est_fit_t* const fit, const float* const matrix, const float* const vector, const float gain, const uint8_t number, const uint8_t before_n) {
+/// Weigh all hypotheses for one onset. The normal equations contain M, B and K only. `gain`: the gain without any of
+/// them.
+static void weigh(est_fit_t* const   fit,
+                  const float* const matrix,
+                  const float* const vector,
+                  const float        gain,
+                  const uint8_t      number,
+                  const uint8_t      before_n) {
     one_t        ones[PUSH];
     const float* row = matrix;
     for (uint8_t i = 0U; i < PUSH; i++) {
@@ -275,7 +282,7 @@ static void weigh(est_fit_t* const fit, const float* const matrix, const float* 
         const float change = vector[i] / known;
         const float alone  = gain + (vector[i] * change);
         ones[i]            = (one_t){ .vector = vector[i], .known = known, .change = change, .gain = alone };
-        fit->any_alone[i]  = either(fit->any_alone[i], alone);
+        fit->any_alone[i]  = log_add(fit->any_alone[i], alone);
         fit->onset[number] = greater(fit->onset[number], alone);
         if (alone > fit->alone[i]) {
             fit->alone[i]    = alone;
@@ -290,13 +297,13 @@ static void weigh(est_fit_t* const fit, const float* const matrix, const float* 
     }
 }
 
-/// What this onset explains if it is at its sample.
+/// Weigh an onset at its sample.
 static void judge(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
     fit->onset[number] = 0.0F;
     weigh(fit, onset->matrix, onset->vector, 0.0F, number, onset->before_n);
 }
 
-/// The same if it is between its sample and another: with a push, which is eliminated.
+/// Weigh an onset between its sample and the next. The impulse that this needs is eliminated.
 static void judge_pushed(est_fit_t* const fit, const est_onset_t* const onset, const uint8_t number) {
     const float* const push   = &onset->matrix[6];
     const float        known  = push[PUSH] + UNKNOWN;
@@ -315,15 +322,15 @@ static void judge_pushed(est_fit_t* const fit, const est_onset_t* const onset, c
     weigh(fit, matrix, vector, (change * onset->vector[PUSH]) - BETWEEN, number, onset->before_n);
 }
 
-static void begin_round(est_fit_t* const fit) { *fit = (est_fit_t){ .alone = { 0.0F } }; }
+static void clear_fit(est_fit_t* const fit) { *fit = (est_fit_t){ .alone = { 0.0F } }; }
 
-/// The likeliest parameter.
-static uint8_t best(const est_fit_t* const fit) {
+/// Most likely parameter.
+static uint8_t find_likeliest(const est_fit_t* const fit) {
     const uint8_t first = (fit->any_alone[1] > fit->any_alone[0]) ? 1U : 0U;
     return (fit->any_alone[2] > fit->any_alone[first]) ? 2U : first;
 }
 
-/// From 1 - old/new of M, new/old - 1 of B and K; 0.01 at least, and of M 100 at most.
+/// Extent of a change: from 1 - old/new for M, new/old - 1 for B and K. At least 0.01, for M at most 100.
 static float extent_of(const est_change_t change, const float x) {
     const bool  of_mass = change == EST_CHANGE_MASS;
     const float parts   = greater(1.0F + (of_mass ? -x : x), 0.01F);
@@ -331,16 +338,17 @@ static float extent_of(const est_change_t change, const float x) {
     return of_mass ? inverse : parts;
 }
 
-/// What a change by that factor has against it, in nats: near 1 it is ln(extent)^2 / 2, as if factors of e were usual. Where the
-/// mass hardly matters, one a hundred times as heavy would explain anything, y itself being among what drives its effect.
-static float unlikely(const float extent) { return 0.5F * ((extent + (1.0F / extent)) - 2.0F); }
+/// Log-likelihood of an extent a priori, negated [nats]: near 1 it is ln(extent)^2 / 2, as if factors of e were
+/// usual. Without it a hundredfold mass would explain anything where the mass hardly matters, because y drives its
+/// effect.
+static float penalty_of(const float extent) { return 0.5F * ((extent + (1.0F / extent)) - 2.0F); }
 
-/// What can be said so far.
-static est_change_t verdict(const est_fit_t* const fit) {
+/// Decide from the evidence so far.
+static est_change_t decide(const est_fit_t* const fit) {
     static const est_change_t alone[3] = { EST_CHANGE_MASS, EST_CHANGE_DAMPING, EST_CHANGE_STIFFNESS };
-    const uint8_t one    = best(fit);
-    const float   likely = fit->any_alone[one] - unlikely(extent_of(alone[one], fit->change[one]));
-    bool          sure   = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
+    const uint8_t             one      = find_likeliest(fit);
+    const float               likely   = fit->any_alone[one] - penalty_of(extent_of(alone[one], fit->change[one]));
+    bool                      sure     = (fit->known[one] > EXTENT_KNOWN) && ((likely - fit->beside[one]) >= ALONE) &&
                 ((likely - fit->any_pair[2U - one]) >= MORE_LIKELY);
     for (uint8_t other = 0U; other < 3U; other++) {
         if (other != one) {
@@ -353,7 +361,7 @@ static est_change_t verdict(const est_fit_t* const fit) {
     return sure ? alone[one] : EST_CHANGE_UNDECIDED;
 }
 
-/// The sample that is worked on comes after the alarm.
+/// True iff the present sample comes after the alarm.
 static bool is_after_alarm(const est_isolation_t* const self) { return self->worked_n > self->onsets[0].before_n; }
 
 static void diagnose(est_isolation_t* const self) {
@@ -363,7 +371,7 @@ static void diagnose(est_isolation_t* const self) {
     }
     out->samples_n = (uint16_t)(self->worked_n - self->onsets[0].before_n);
     if (out->change == EST_CHANGE_UNDECIDED) {
-        out->change = verdict(&self->fit);
+        out->change = decide(&self->fit);
     }
     if ((out->change == EST_CHANGE_UNDECIDED) || (out->change == EST_CHANGE_SEVERAL)) {
         return;  // MISRA D4
@@ -391,9 +399,9 @@ static void stop(est_isolation_t* const self) {
     self->quiet     = false;
 }
 
-/// How long before the alarm onset number i is tried, the first onset first. The longer it took to the alarm, the less did the
-/// change matter in between, and a push makes up for it.
-static uint8_t before(const uint8_t i, const uint8_t earliest_n) {
+/// Samples from onset number i to the alarm, earliest onset first. The longer the delay, the smaller the effect of
+/// the change before the alarm, and the impulse compensates for coarser steps.
+static uint8_t onset_before(const uint8_t i, const uint8_t earliest_n) {
     static const uint8_t wanted_n[EST_ISOLATION_ONSETS_N] = { 20U, 12U, 7U, 4U, 2U, 1U };
     return (wanted_n[i] < earliest_n) ? wanted_n[i] : earliest_n;
 }
@@ -405,19 +413,19 @@ static void start(est_isolation_t* const self, const est_t* const estimator) {
     stop(self);
     self->since_n   = 0U;
     self->diagnosis = (est_diagnosis_t){ .change = EST_CHANGE_UNDECIDED, .extent = 1.0F };
-    if (!was_quiet || (earliest_n < 1U) || !believe(&self->believed, self->config, self->force_zero)) {
+    if (!was_quiet || (earliest_n < 1U) || !derive_plant(&self->plant, self->config, self->force_zero)) {
         return;  // MISRA D4
     }
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
-        self->onsets[i] = (est_onset_t){ .before_n = before(i, earliest_n) };
+        self->onsets[i] = (est_onset_t){ .before_n = onset_before(i, earliest_n) };
     }
-    self->active         = true;
-    self->turn           = 0U;
-    self->worked_n       = 0U;
-    self->waiting_n      = self->onsets[0].before_n;
-    self->nats           = 0.5F / est_noise_variance(estimator);
-    self->residual[0]    = kept(self, self->waiting_n)->innovation;
-    self->residual[1]    = kept(self, self->waiting_n + 1U)->innovation;
+    self->active      = true;
+    self->turn        = 0U;
+    self->worked_n    = 0U;
+    self->waiting_n   = self->onsets[0].before_n;
+    self->nats        = 0.5F / est_noise_variance(estimator);
+    self->residual[0] = sample_before(self, self->waiting_n)->innovation;
+    self->residual[1] = sample_before(self, self->waiting_n + 1U)->innovation;
 }
 
 bool est_isolation_init(est_isolation_t* const self, const est_config_t* const config, const float force_zero) {
@@ -428,15 +436,15 @@ bool est_isolation_init(est_isolation_t* const self, const est_config_t* const c
            (config->edge_instants != EST_EDGES_ANYWHERE);
 }
 
-/// The plant is well: this is what it is.
+/// Store theta and C as the plant before a change.
 static void take_theta(est_isolation_t* const self, const est_t* const estimator) {
     const uint8_t count = est_theta_count(estimator);
     self->quiet         = true;
     for (uint8_t i = 0U; i < count; i++) {
-        self->believed.theta[i] = est_theta(estimator, i);
+        self->plant.theta[i] = est_theta(estimator, i);
     }
-    self->believed.c[0] = est_prefilter(estimator, 0U);
-    self->believed.c[1] = est_prefilter(estimator, 1U);
+    self->plant.c[0] = est_prefilter(estimator, 0U);
+    self->plant.c[1] = est_prefilter(estimator, 1U);
 }
 
 static void enter_quiet(est_isolation_t* const self, const est_t* const estimator, const est_step_t step) {
@@ -446,13 +454,16 @@ static void enter_quiet(est_isolation_t* const self, const est_t* const estimato
     } else if ((step.statistic <= 0.0F) && (self->since_n >= SETTLED_N)) {
         take_theta(self, estimator);
     } else {
-        // theta takes the change in
+        // theta absorbs a change
     }
 }
 
-void est_isolation_enter(est_isolation_t* const self, const est_t* const estimator, const est_sample_t sample, const est_step_t step) {
+void est_isolation_enter(est_isolation_t* const self,
+                         const est_t* const     estimator,
+                         const est_sample_t     sample,
+                         const est_step_t       step) {
     EST_ASSERT((self != NULL) && (estimator != NULL));
-    self->since_n = one_more(self->since_n);
+    self->since_n = count_up(self->since_n);
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {
         self->known_n = 0U;
         stop(self);
@@ -472,13 +483,13 @@ void est_isolation_enter(est_isolation_t* const self, const est_t* const estimat
     }
 }
 
-/// The onset has come, and the sample is the first after it or a later one.
+/// True iff the present sample comes after this onset.
 static bool has_begun(const est_isolation_t* const self, const est_onset_t* const onset) {
     return (self->worked_n + onset->before_n) > self->onsets[0].before_n;
 }
 
-/// How many this sample takes: up to the alarm nothing is judged.
-static uint8_t slices(const est_isolation_t* const self) {
+/// Number of slices of the present sample. Hypotheses are weighed only after the alarm.
+static uint8_t count_slices(const est_isolation_t* const self) {
     uint8_t out = 1U;
     for (uint8_t i = 0U; i < EST_ISOLATION_ONSETS_N; i++) {
         out = has_begun(self, &self->onsets[i]) ? (uint8_t)(out + 1U) : out;
@@ -487,11 +498,11 @@ static uint8_t slices(const est_isolation_t* const self) {
 }
 
 static void begin_sample(est_isolation_t* const self, const uint32_t ago) {
-    begin_round(&self->fit);
+    clear_fit(&self->fit);
     enter_residual(self, ago);
     drive(self, ago, 2U, self->driving);
     self->worked_n++;
-    self->slices_n = slices(self);
+    self->slices_n = count_slices(self);
 }
 
 static void enter_and_judge(est_isolation_t* const self, const uint8_t number) {

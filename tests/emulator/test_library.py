@@ -28,11 +28,11 @@ def test_an_engine_that_does_not_load_is_reported_with_its_path(
 
 
 def test_the_limits_and_the_structures_are_those_of_the_header() -> None:
-    header = Path(library.__file__).with_name("engine.h").read_text(encoding="utf-8")
+    header = Path(library.__file__).with_name("engine").joinpath("engine.h").read_text(encoding="utf-8")
     limits = {name: int(value) for name, value in re.findall(r"#define ENGINE_(MAX_\w+|LEVELS) (\d+)", header)}
     assert limits.pop("LEVELS") == TICKS_PER_SAMPLE.bit_length()
     assert limits == {name: getattr(library, name) for name in limits}
-    for structure, name in ((library.Counts, "engine_counts"), (library.System, "engine_system")):
-        body = re.search(rf"struct {name} \{{(.*?)\}};", header, re.DOTALL)
+    for structure, name in ((library.Counts, "engine_counts_t"), (library.System, "engine_system_t")):
+        body = re.search(rf"typedef struct \{{([^}}]*)\}} {name};", header, re.DOTALL)
         assert body is not None
         assert [field[0] for field in structure._fields_] == re.findall(r"^ .*?(\w+);", body[1], re.MULTILINE)

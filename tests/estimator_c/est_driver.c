@@ -32,34 +32,78 @@ static float normalise(void* context, float innovation, float variance, bool ane
 
 int driver_init(const driver_config_t* in) {
     config = (est_config_t){
-        .na = (uint8_t)in->na, .nb = (uint8_t)in->nb, .nk = (uint8_t)in->nk, .nc = (uint8_t)in->nc,
-        .offset = in->offset != 0, .noise_estimated = in->noise_estimated != 0, .refresh_n = (uint16_t)in->refresh_n,
-        .stuck_n = (uint8_t)in->stuck_n, .idle_n = (uint16_t)in->idle_n,
-        .edge_instants = (est_edge_instants_t)in->edge_instants, .forgetting = (float)in->forgetting,
-        .random_walk = (float)in->random_walk, .p0 = (float)in->p0, .p0_offset = (float)in->p0_offset,
-        .noise_variance = (float)in->noise_variance, .c = { (float)in->c[0], (float)in->c[1] },
-        .edge_codes = (float)in->edge_codes, .code_low = (float)in->code_low, .code_high = (float)in->code_high,
-        .trigger = { .kind = (est_trigger_kind_t)in->kind, .ceiling = (float)in->ceiling,
-                     .hold_off_n = (uint16_t)in->hold_off_n, .warm_up_n = (uint16_t)in->warm_up_n,
-                     .absolute = in->absolute != 0, .reset = (est_reset_t)in->reset,
-                     .custom = (in->custom == 2) ? normalise : ((in->custom == 1) ? count_innovations : 0),
-                     .context = &counted },
+        .na              = (uint8_t)in->na,
+        .nb              = (uint8_t)in->nb,
+        .nk              = (uint8_t)in->nk,
+        .nc              = (uint8_t)in->nc,
+        .offset          = in->offset != 0,
+        .noise_estimated = in->noise_estimated != 0,
+        .refresh_n       = (uint16_t)in->refresh_n,
+        .stuck_n         = (uint8_t)in->stuck_n,
+        .idle_n          = (uint16_t)in->idle_n,
+        .edge_instants   = (est_edge_instants_t)in->edge_instants,
+        .forgetting      = (float)in->forgetting,
+        .random_walk     = (float)in->random_walk,
+        .p0              = (float)in->p0,
+        .p0_offset       = (float)in->p0_offset,
+        .noise_variance  = (float)in->noise_variance,
+        .c               = { (float)in->c[0], (float)in->c[1] },
+        .edge_codes      = (float)in->edge_codes,
+        .code_low        = (float)in->code_low,
+        .code_high       = (float)in->code_high,
+        .trigger         = { .kind       = (est_trigger_kind_t)in->kind,
+                             .ceiling    = (float)in->ceiling,
+                             .hold_off_n = (uint16_t)in->hold_off_n,
+                             .warm_up_n  = (uint16_t)in->warm_up_n,
+                             .absolute   = in->absolute != 0,
+                             .reset      = (est_reset_t)in->reset,
+                             .custom     = (in->custom == 2) ? normalise : ((in->custom == 1) ? count_innovations : 0),
+                             .context    = &counted },
     };
     return est_init(&self, &config) ? 1 : 0;
 }
 
 void driver_default(driver_config_t* out) {
     const est_config_t c = est_config_default();
-    *out = (driver_config_t){ c.na, c.nb, c.nk, c.nc, c.offset, c.noise_estimated, c.refresh_n, c.stuck_n, c.idle_n,
-                              c.edge_instants, c.forgetting, c.random_walk, c.p0, c.p0_offset, c.noise_variance,
-                              { c.c[0], c.c[1] }, c.edge_codes, c.code_low, c.code_high, c.trigger.kind,
-                              c.trigger.ceiling, c.trigger.hold_off_n, c.trigger.warm_up_n, c.trigger.absolute,
-                              c.trigger.reset, 0 };
+    *out                 = (driver_config_t){ c.na,
+                                              c.nb,
+                                              c.nk,
+                                              c.nc,
+                                              c.offset,
+                                              c.noise_estimated,
+                                              c.refresh_n,
+                                              c.stuck_n,
+                                              c.idle_n,
+                                              c.edge_instants,
+                                              c.forgetting,
+                                              c.random_walk,
+                                              c.p0,
+                                              c.p0_offset,
+                                              c.noise_variance,
+                                              { c.c[0], c.c[1] },
+                                              c.edge_codes,
+                                              c.code_low,
+                                              c.code_high,
+                                              c.trigger.kind,
+                                              c.trigger.ceiling,
+                                              c.trigger.hold_off_n,
+                                              c.trigger.warm_up_n,
+                                              c.trigger.absolute,
+                                              c.trigger.reset,
+                                              0 };
 }
 
 /* theta: (n, est_theta_count()); returns whether the invariants held after every sample. */
-int driver_run(size_t n, const double* u, const double* y, const unsigned char* valid, float* theta, float* innovation,
-               float* statistic, unsigned char* alarm, unsigned char* status, unsigned char* idle) {
+int driver_run(size_t               n,
+               const double*        u,
+               const double*        y,
+               const unsigned char* valid,
+               float*               theta,
+               float*               innovation,
+               float*               statistic,
+               unsigned char*       alarm,
+               unsigned char*       status,
+               unsigned char*       idle) {
     const uint8_t count = est_theta_count(&self);
     int           held  = 1;
     for (size_t k = 0; k < n; k++) {
@@ -99,9 +143,9 @@ float driver_variance(int index) { return est_variance(&self, (uint8_t)index); }
 
 /* Sets counters to one below their limits, as after years. */
 void driver_age_counters(void) {
-    self.counters = (est_counters_t){ UINT32_MAX - 1U, UINT32_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
-                                      UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
-                                      UINT16_MAX - 1U };
+    self.counters =
+        (est_counters_t){ UINT32_MAX - 1U, UINT32_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U,
+                          UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U, UINT16_MAX - 1U };
 }
 
 /* Damages the state in one way, asks for the invariants, and mends it. */
@@ -110,16 +154,35 @@ int driver_invariants_hold_if_damaged(int way) {
     est_config_t invalid = config;
     invalid.forgetting   = 2.0F;
     switch (way) {
-    case 0: self.config = 0; break;
-    case 1: self.config = &invalid; break;
-    case 2: self.factors.weight = 0.0F; break;
-    case 3: self.factors.d[1] = -1.0F; break;
-    case 4: self.theta[0] = __builtin_nanf(""); break;
-    case 5: self.trigger.statistic = -1.0F; break;
-    case 6: self.noise_variance = 0.0F; break;
-    case 7: self.factors.d[1] = __builtin_inff(); break;
-    case 9: self.factors.weight = 1.5F; break;
-    default: break;
+    case 0:
+        self.config = 0;
+        break;
+    case 1:
+        self.config = &invalid;
+        break;
+    case 2:
+        self.factors.weight = 0.0F;
+        break;
+    case 3:
+        self.factors.d[1] = -1.0F;
+        break;
+    case 4:
+        self.theta[0] = __builtin_nanf("");
+        break;
+    case 5:
+        self.trigger.statistic = -1.0F;
+        break;
+    case 6:
+        self.noise_variance = 0.0F;
+        break;
+    case 7:
+        self.factors.d[1] = __builtin_inff();
+        break;
+    case 9:
+        self.factors.weight = 1.5F;
+        break;
+    default:
+        break;
     }
     const int held = est_invariants_hold((way == 8) ? 0 : &self) ? 1 : 0;
     self           = kept;
@@ -129,9 +192,9 @@ int driver_invariants_hold_if_damaged(int way) {
 float driver_noise_variance(void) { return est_noise_variance(&self); }
 
 void driver_counters(unsigned out[9]) {
-    const est_counters_t c = est_counters(&self);
-    const unsigned all[9]  = { c.updated, c.missing, c.refused, c.alarms, c.restarts, c.slips, c.saturated, c.stuck,
-                               c.refreshes };
+    const est_counters_t c      = est_counters(&self);
+    const unsigned       all[9] = { c.updated, c.missing,   c.refused, c.alarms,   c.restarts,
+                                    c.slips,   c.saturated, c.stuck,   c.refreshes };
     for (int i = 0; i < 9; i++) {
         out[i] = all[i];
     }
@@ -145,8 +208,15 @@ int driver_can_isolate(void) {
 /* t runs of n samples, each from the start; `slices` calls of est_isolation_work() after each sample. found, (t, 8): the first
    alarm at or after `from`, the sample of the diagnosis (n: none), class, extent then and at the end, onset before the alarm,
    the least and the most. */
-void driver_isolate(size_t t, size_t n, const double* u, const double* y, const unsigned char* valid, const long long* from,
-                    int slices, double force_zero, double* found) {
+void driver_isolate(size_t               t,
+                    size_t               n,
+                    const double*        u,
+                    const double*        y,
+                    const unsigned char* valid,
+                    const long long*     from,
+                    int                  slices,
+                    double               force_zero,
+                    double*              found) {
     static est_isolation_t isolation;
     for (size_t run = 0; run < t; run++) {
         double* const out = &found[run * 8U];
@@ -180,8 +250,16 @@ void driver_isolate(size_t t, size_t n, const double* u, const double* y, const 
 
 /* What est_isolation makes of n steps that are given, the estimate being theta all the time; `slices` calls of
    est_isolation_work() after each. worked, (n,): how many of them left more to do. found, (3,): class, extent, samples. */
-void driver_diagnose(size_t n, const double* theta, const double* u, const double* y, const double* statistic,
-                     const unsigned char* status, const unsigned char* alarm, int slices, int* worked, double* found) {
+void driver_diagnose(size_t               n,
+                     const double*        theta,
+                     const double*        u,
+                     const double*        y,
+                     const double*        statistic,
+                     const unsigned char* status,
+                     const unsigned char* alarm,
+                     int                  slices,
+                     int*                 worked,
+                     double*              found) {
     static est_isolation_t isolation;
     est_init(&self, &config);
     for (uint8_t i = 0; i < est_theta_count(&self); i++) {
@@ -189,15 +267,18 @@ void driver_diagnose(size_t n, const double* theta, const double* u, const doubl
     }
     est_isolation_init(&isolation, &config, 0.0F);
     for (size_t k = 0; k < n; k++) {
-        const est_step_t step = { .status = (est_status_t)status[k], .statistic = (float)statistic[k], .alarm = alarm[k] != 0 };
-        est_isolation_enter(&isolation, &self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true }, step);
+        const est_step_t step = { .status    = (est_status_t)status[k],
+                                  .statistic = (float)statistic[k],
+                                  .alarm     = alarm[k] != 0 };
+        est_isolation_enter(&isolation, &self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true },
+                            step);
         worked[k] = 0;
         for (int i = 0; i < slices; i++) {
             worked[k] += est_isolation_work(&isolation) ? 1 : 0;
         }
     }
     const est_diagnosis_t now = est_isolation_diagnosis(&isolation);
-    found[0] = (double)now.change;
-    found[1] = now.extent;
-    found[2] = now.samples_n;
+    found[0]                  = (double)now.change;
+    found[1]                  = now.extent;
+    found[2]                  = now.samples_n;
 }

@@ -7,9 +7,12 @@
 
 typedef uint32_t routine_t(uint32_t a, uint32_t b);
 
-#define WITH_EACH_ROUTINE(X)                                                                                           \
-    X(fadd) X(fsub) X(frsub) X(fmul) X(fdiv) X(fcmpeq) X(fcmplt) X(fcmple) X(fcmpge) X(fcmpgt) X(fcmpun)               \
+// The layout of X-macros by clang-format is not stable.
+// clang-format off
+#define WITH_EACH_ROUTINE(X) \
+    X(fadd) X(fsub) X(frsub) X(fmul) X(fdiv) X(fcmpeq) X(fcmplt) X(fcmple) X(fcmpge) X(fcmpgt) X(fcmpun) \
     X(i2f) X(ui2f) X(f2iz) X(f2uiz)
+// clang-format on
 
 #define DECLARE(name) routine_t __aeabi_##name;
 WITH_EACH_ROUTINE(DECLARE)

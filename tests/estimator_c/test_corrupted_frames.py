@@ -52,9 +52,9 @@ class CorruptedLine:
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     product = tmp_path_factory.mktemp("corrupted") / "corrupted_frames.so"
-    device = ROOT / "estimator_c" / "device"
+    device, core = (ROOT / "estimator_c" / part for part in ("device", "core"))
     sources = [Path(__file__).with_name("corrupted_frames.c"), device / "frame.c", GENERATED / "analogrig_catalogue.c"]
-    flags = [*STRICT, "-O2", "-fPIC", "-shared", f"-I{device}", f"-I{GENERATED}"]
+    flags = [*STRICT, "-O2", "-fPIC", "-shared", f"-I{device}", f"-I{core}", f"-I{GENERATED}"]
     subprocess.run(["gcc", *flags, *map(str, sources), "-o", str(product)], check=True)
     return product
 

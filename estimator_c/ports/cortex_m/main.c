@@ -1,6 +1,7 @@
-/// The device as firmware of the MPS2 boards, on either of their first two UARTs (Arm's CMSDK APB UART, DDI 0479): frames on the
-/// first, slcan on the second; the one that speaks first is served until the board is reset. Received bytes come by interrupt
-/// and wait in a ring, so that none is lost while the estimator works; else the processor sleeps.
+/// The device as firmware of the MPS2 boards, on either of their first two UARTs (Arm's CMSDK APB UART, DDI 0479):
+/// frames on the first, slcan on the second. The UART that first receives a byte is served until the board is reset.
+/// Interrupts store received bytes in a ring, so that none is lost while the estimator runs. The processor sleeps
+/// while there is no work.
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
@@ -17,7 +18,7 @@ typedef struct {
     volatile uint32_t data;
     volatile uint32_t state;
     volatile uint32_t control;
-    volatile uint32_t interrupts;  ///< read: pending; write: done with
+    volatile uint32_t interrupts;  ///< read: pending; write: clear
     volatile uint32_t divider;
 } uart_t;
 
@@ -36,13 +37,13 @@ typedef struct {
 #define INTERRUPT_RECEIVE 0x2U
 #define DIVIDER 217U  ///< 25 MHz / 115,200
 
-/// Set-enable register of the interrupt controller; those of the two UARTs are its first four.
+/// Set-enable register of the interrupt controller. Its first four bits are the interrupts of the two UARTs.
 #define NVIC_ENABLE (*(volatile uint32_t*)0xE000E100U)
 #define NVIC_UARTS 0xFU
 
 #define RING_SIZE 4096U  ///< a power of 2
 
-/// Written by the interrupt at `to`, read by the loop at `from`; both count on for ever.
+/// Received bytes. The interrupt writes at `to`, the loop reads at `from`; both counters run freely modulo 2^32.
 typedef struct {
     volatile uint32_t from;
     volatile uint32_t to;
@@ -50,7 +51,7 @@ typedef struct {
     volatile uint8_t  bytes[RING_SIZE];
 } ring_t;
 
-/// A UART and what has come there.
+/// A UART and its received bytes.
 typedef struct {
     uart_t* uart;
     ring_t* ring;
@@ -61,7 +62,7 @@ static ring_t       slcan_ring;
 static const port_t serial_port = { .uart = UART_SERIAL, .ring = &serial_ring };
 static const port_t slcan_port  = { .uart = UART_SLCAN, .ring = &slcan_ring };
 
-/// The one that is served.
+/// The UART that is served.
 static const port_t* port;
 
 void serial_receive_interrupt(void);
@@ -69,7 +70,7 @@ void serial_transmit_interrupt(void);
 void slcan_receive_interrupt(void);
 void slcan_transmit_interrupt(void);
 
-/// A UART holds one byte: the next one has an interrupt of its own.
+/// Move a byte from the UART to the ring. A UART holds one byte; the next byte has an interrupt of its own.
 static void take_byte(uart_t* const uart, ring_t* const ring) {
     uart->interrupts     = INTERRUPT_RECEIVE;
     const uint32_t state = uart->state;
@@ -89,7 +90,7 @@ static void take_byte(uart_t* const uart, ring_t* const ring) {
     }
 }
 
-/// There is room again: that it wakes the processor is all.
+/// Clear the interrupt that reports room to transmit. Its only purpose is to wake the processor.
 static void note_room(uart_t* const uart) {
     uart->control    = CONTROL_USUAL;
     uart->interrupts = INTERRUPT_TRANSMIT;
@@ -126,7 +127,7 @@ size_t port_transmit(const uint8_t* const bytes, const size_t n) {
     return sent;
 }
 
-/// An interrupt that comes between the look and the sleep is pending, and ends the sleep at once.
+/// An interrupt between the check and the sleep remains pending and ends the sleep at once.
 bool port_idle(const bool wants_input, const bool has_output) {
     __asm volatile("cpsid i" ::: "memory");
     const bool has_input = port->ring->from != port->ring->to;
@@ -143,7 +144,7 @@ bool port_idle(const bool wants_input, const bool has_output) {
 
 static bool has_spoken(const port_t* const candidate) { return candidate->ring->from != candidate->ring->to; }
 
-/// Sleeps until a byte has come on either line.
+/// Sleep until a byte has arrived on either UART, and serve that one.
 static void choose_port(void) {
     while (!has_spoken(&serial_port) && !has_spoken(&slcan_port)) {
         __asm volatile("cpsid i" ::: "memory");
@@ -158,7 +159,7 @@ static void choose_port(void) {
 static void begin(uart_t* const uart) {
     uart->divider = DIVIDER;
     uart->control = CONTROL_USUAL;
-    (void)uart->data;  // QEMU begins to receive after the first read
+    (void)uart->data;  // QEMU receives only after a first read
 }
 
 int main(void) {

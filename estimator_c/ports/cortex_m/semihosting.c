@@ -14,7 +14,7 @@ static uint32_t call(const uint32_t operation, const void* const argument) {
     return r0;
 }
 
-/// -1 for what is no hexadecimal digit.
+/// Value of a hexadecimal digit; -1 for any other character.
 static int32_t digit(const char c) {
     if ((c >= '0') && (c <= '9')) {
         return c - '0';
@@ -27,12 +27,12 @@ uint32_t semihosting_argument(void) {
     struct {
         char*    text;
         uint32_t size;
-    } block = { .text = line, .size = sizeof(line) };
+    } block        = { .text = line, .size = sizeof(line) };
     uint32_t value = 0U;
     if (call(SYS_GET_CMDLINE, &block) != 0U) {
         return value;
     }
-    bool in_argument = false;  // after the name of the program
+    bool in_argument = false;  // the name of the program comes first
     for (const char* c = line; *c != '\0'; c++) {
         const int32_t next = digit(*c);
         if (*c == ' ') {
@@ -40,7 +40,7 @@ uint32_t semihosting_argument(void) {
         } else if (in_argument && (next >= 0)) {
             value = (value << 4U) | (uint32_t)next;
         } else {
-            // the name, or no digit
+            // part of the name, or not a digit
         }
     }
     return value;

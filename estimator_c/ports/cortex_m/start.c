@@ -1,4 +1,4 @@
-/// From reset to main(): the vector table, the memory as C expects it, the floating-point unit. For any Cortex-M.
+/// Start-up code for any Cortex-M, from reset to main(): vector table, initialised memory, floating-point unit.
 
 #include "semihosting.h"
 
@@ -11,15 +11,15 @@
 
 int main(void);
 
-/// Set by mps2.ld.
-extern uint32_t data_begin;
-extern uint32_t data_end;
+/// Symbols of mps2.ld.
+extern uint32_t       data_begin;
+extern uint32_t       data_end;
 extern const uint32_t data_image;
-extern uint32_t bss_begin;
-extern uint32_t bss_end;
-extern uint32_t stack_top;
+extern uint32_t       bss_begin;
+extern uint32_t       bss_end;
+extern uint32_t       stack_top;
 
-/// The port has them.
+/// Interrupt handlers of the port.
 void serial_receive_interrupt(void);
 void serial_transmit_interrupt(void);
 void slcan_receive_interrupt(void);
@@ -27,7 +27,7 @@ void slcan_transmit_interrupt(void);
 
 void start(void);
 
-/// Before any code that the compiler may have given floating-point instructions.
+/// Enable the floating-point unit before any C code: the compiler may use its instructions anywhere.
 __attribute__((naked)) void start_reset(void) {
 #ifdef __ARM_FP
     __asm volatile("ldr r0, =0xE000ED88\n"
@@ -60,7 +60,7 @@ static void unexpected(void) { semihosting_end("analogrig: an interrupt that nob
 
 typedef void (*handler_t)(void);
 
-/// Armv6-M and Armv7-M: 16 of the processor, then those of the board.
+/// Vector table of Armv6-M and Armv7-M: 16 entries of the processor, followed by those of the board.
 __attribute__((section(".vectors"), used)) static const struct {
     const uint32_t* stack;
     handler_t       system[15];
@@ -69,10 +69,11 @@ __attribute__((section(".vectors"), used)) static const struct {
     .stack  = &stack_top,
     .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
                 NULL, unexpected, unexpected },
-    .board  = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
+    .board = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
 };
 
-// What the compiler calls on its own. Volatile, or it might take their loops for calls of themselves.
+// Functions that the compiler calls implicitly. The pointers are volatile, because gcc would replace the loops by calls
+// of the same functions.
 
 void* memset(void* const to, const int value, const size_t n) {
     volatile uint8_t* const bytes = to;
@@ -92,11 +93,11 @@ void* memcpy(void* const restrict to, const void* const restrict from, const siz
 }
 
 void* memmove(void* const to, const void* const from, const size_t n) {
-    volatile uint8_t* const bytes  = to;
-    const uint8_t* const    source = from;
+    volatile uint8_t* const bytes   = to;
+    const uint8_t* const    source  = from;
     const bool              is_down = (uintptr_t)to < (uintptr_t)from;
     for (size_t i = 0U; i < n; i++) {
-        const size_t at = is_down ? i : (n - 1U - i);  // what is overwritten has been read
+        const size_t at = is_down ? i : (n - 1U - i);  // never overwrites a byte that is still to be read
         bytes[at]       = source[at];
     }
     return to;

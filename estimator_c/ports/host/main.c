@@ -1,6 +1,6 @@
 /// analogrig-device: the device as a process of this computer, behind a pseudo-terminal or a serial device.
 ///
-/// It ends when its standard input does, so that it cannot outlive the process that started it and holds the other end.
+/// The process ends with its standard input, so that it cannot outlive the process that started it.
 
 #include "analogrig_catalogue.h"
 #include "analogrig_codec.h"
@@ -43,11 +43,11 @@ typedef struct {
     uint32_t    catalogue_hash;
 } options_t;
 
-/// The line to the harness.
+/// Line to the harness.
 static struct {
     int  fd;
-    bool is_socket;  ///< of CAN frames; otherwise bytes
-    bool lost;       ///< errno says why
+    bool is_socket;  ///< carries CAN frames; otherwise bytes
+    bool lost;       ///< errno holds the cause
 } line;
 
 static int fail(const char* const what, const char* const name) {
@@ -70,7 +70,7 @@ static bool parse_hash(const char* const text, uint32_t* const out) {
     return (errno == 0) && (end != text) && (*end == '\0') && (value <= UINT32_MAX);
 }
 
-/// Returns true if the device is to be served; otherwise all is done and *status says how it went.
+/// Parse the command line. Return false if the process must exit with *status instead of serving the device.
 static bool parse(const int argc, char* const argv[], options_t* const options, int* const status) {
     *status = EXIT_SUCCESS;
     for (int i = 1; i < argc; i++) {
@@ -116,7 +116,7 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
 
 // ---------------------------------------------        THE LINE        ---------------------------------------------
 
-/// Every byte as it is: no echo, no signals, no translation.
+/// Set the terminal to raw bytes: no echo, no signals, no translation.
 static bool make_raw(const int fd) {
     struct termios settings;
     if (tcgetattr(fd, &settings) != 0) {
@@ -142,8 +142,8 @@ static int open_serial(const char* const path) {
     return ((fd >= 0) && make_raw(fd)) ? fd : -1;
 }
 
-/// The master of a new pseudo-terminal; prints the path of its slave. The slave stays open for ever: without it a read
-/// of the master would fail whenever the harness lets go of the line.
+/// Open a pseudo-terminal, print the path of its slave, and return its master. The slave stays open: otherwise a read
+/// of the master would fail whenever the harness closes the line.
 static int open_terminal(void) {
     const int master = posix_openpt(O_RDWR | O_NOCTTY);
     if ((master < 0) || (grantpt(master) != 0) || (unlockpt(master) != 0)) {
@@ -188,16 +188,16 @@ size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) 
         }
         return (frames > 0) ? (size_t)frames : 0U;
     }
-    const ssize_t received = read(line.fd, bytes, n);  // what is not read waits in the line
+    const ssize_t received = read(line.fd, bytes, n);  // the rest stays in the line
     if (received > 0) {
         return (size_t)received;
     }
     if (received == 0) {
-        lose(EIO);  // the end of a serial device is no success
+        lose(EIO);  // end of file: the serial device is gone
     } else if (!is_transient()) {
         lose(errno);
     } else {
-        // nothing has come
+        // no data
     }
     return 0U;
 }
@@ -210,7 +210,7 @@ size_t port_transmit(const uint8_t* const bytes, const size_t n) {
     return (sent > 0) ? (size_t)sent : 0U;
 }
 
-/// True iff standard input has ended. What it says before does not matter.
+/// True iff standard input has ended. Its content is discarded.
 static bool parent_is_gone(const short events) {
     char ignored[256];
     if ((events & (POLLIN | POLLHUP | POLLERR | POLLNVAL)) == 0) {
@@ -220,7 +220,7 @@ static bool parent_is_gone(const short events) {
     return (n == 0) || ((n < 0) && !is_transient());
 }
 
-/// Hung up, and nothing left to read.
+/// True iff the other end has hung up and nothing is left to read.
 static bool has_hung_up(const short events) {
     return ((events & (POLLHUP | POLLERR | POLLNVAL)) != 0) && ((events & POLLIN) == 0);
 }

@@ -1,4 +1,4 @@
-#define _DEFAULT_SOURCE  // SO_RXQ_OVFL is of Linux
+#define _DEFAULT_SOURCE  // for SO_RXQ_OVFL, which is specific to Linux
 
 #include "socket_can.h"
 
@@ -14,7 +14,7 @@
 #include <time.h>
 #include <unistd.h>
 
-/// A driver whose queue is full says so, and cannot be waited for.
+/// Delay before the next attempt if the queue of the driver is full: poll() does not report room in it.
 #define FULL_QUEUE_NS 200000L
 
 static bool set_up(const int fd, const char* const interface, const bool is_fd) {
@@ -42,7 +42,7 @@ int socket_can_open(const char* const interface, const bool is_fd) {
     return fd;
 }
 
-/// What the system has counted as lost since the socket was opened.
+/// Read the system's count of frames lost since the socket was opened. Return false if the message has none.
 static bool overflows(struct msghdr* const message, uint32_t* const count) {
     for (struct cmsghdr* part = CMSG_FIRSTHDR(message); part != NULL; part = CMSG_NXTHDR(message, part)) {
         if ((part->cmsg_level == SOL_SOCKET) && (part->cmsg_type == SO_RXQ_OVFL)) {
@@ -53,7 +53,7 @@ static bool overflows(struct msghdr* const message, uint32_t* const count) {
     return false;
 }
 
-/// One frame; false with errno if none has come.
+/// Receive one frame. Return false with errno if there is none.
 static bool receive(const int fd, can_frame_t* const frame, uint32_t* const lost) {
     static uint32_t    lost_before = 0U;
     struct canfd_frame raw         = { 0 };
@@ -95,7 +95,7 @@ ssize_t socket_can_receive(const int fd, uint8_t* const bytes, const size_t n, u
     return (taken > 0U) ? (ssize_t)taken : -1;
 }
 
-/// One frame, as classic CAN: all answers fit; false with errno if it is not taken.
+/// Transmit one frame as classic CAN, which all answers fit. Return false with errno if it is not accepted.
 static bool transmit(const int fd, const can_frame_t* const frame) {
     struct can_frame raw = { .can_id = frame->id, .can_dlc = frame->length };
     (void)memcpy(raw.data, frame->data, frame->length);

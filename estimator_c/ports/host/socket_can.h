@@ -1,4 +1,4 @@
-/// socket_can: the frames of a CAN interface of this computer, as objects of can_frame_t one after the other.
+/// socket_can: frames of a CAN interface of Linux, as consecutive objects of can_frame_t.
 
 #ifndef SOCKET_CAN_H_INCLUDED
 #define SOCKET_CAN_H_INCLUDED
@@ -8,17 +8,18 @@
 #include <stdint.h>
 #include <sys/types.h>
 
-/// A raw socket on an interface; is_fd: one that carries CAN FD. -1 if there is none, and errno says why.
+/// Open a raw socket on an interface. `is_fd`: enable CAN FD. Return -1 with errno on failure.
 int socket_can_open(const char* interface, bool is_fd);
 
-/// Takes as many frames as have come and n bytes hold, and never waits; returns bytes, -1 with errno if there are none. Adds to
-/// *lost how many the system had to drop.
+/// Receive as many frames as have arrived and fit n bytes, without waiting. Return the number of bytes, -1 with errno
+/// if there are none. Add the number of frames that the system has dropped to *lost.
 ssize_t socket_can_receive(int fd, uint8_t* bytes, size_t n, uint32_t* lost);
 
-/// Sends what frames the interface takes, in their order; returns bytes, -1 with errno if it takes none.
+/// Transmit frames in order until the interface refuses one. Return the number of bytes, -1 with errno if there are
+/// none.
 ssize_t socket_can_transmit(int fd, const uint8_t* bytes, size_t n);
 
-/// What the system has against the socket: an interface that went down, for one.
+/// Return and clear the pending error of the socket, such as an interface that went down.
 int socket_can_error(int fd);
 
 #endif  // SOCKET_CAN_H_INCLUDED

@@ -10,7 +10,8 @@ settings_result_t library_set(library_t* const self, const uint8_t key, const fl
 
 bool library_start(library_t* const self) { return est_init(&self->estimator, &self->settings.estimator); }
 
-static void keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
+static void
+keep(const library_t* const self, const size_t k, const est_step_t* const step, const library_out_t* const out) {
     if (out->theta != 0) {
         const uint8_t count = est_theta_count(&self->estimator);
         for (uint8_t i = 0U; i < count; i++) {

@@ -11,7 +11,7 @@ static void init_fd(void* const state, const device_identity_t* const identity) 
     can_device_init(state, identity, true);
 }
 
-/// The bytes need not be aligned as frames are: each is copied.
+/// Run the device on whole frames. Each is copied, because the bytes need not be aligned.
 static device_progress_t
 run(void* const state, const uint8_t* const in, const size_t in_n, uint8_t* const out, const size_t out_n) {
     device_progress_t progress = { .taken = 0U, .given = 0U };

@@ -1,4 +1,4 @@
-/// device_line: what the loop of a port must know about the shell that it runs.
+/// device_line: interface between the loop of a port and the shell that it runs.
 ///
 /// Distributed under the terms of the MIT License.
 
@@ -14,20 +14,20 @@
 extern "C" {
 #endif
 
-/// A kind of line. `state` is the shell's, which begins with its device_t.
+/// A kind of line. `state` is the state of its shell; a pointer to it is one to its device_t.
 typedef struct {
     void (*init)(void* state, const device_identity_t* identity);
     device_progress_t (*run)(void* state, const uint8_t* in, size_t in_n, uint8_t* out, size_t out_n);
-    size_t block_size;  ///< bytes that a SampleBlock takes in the input; of a frame, where there are none
+    size_t block_size;  ///< bytes of a SampleBlock in the input; without SampleBlocks, of a frame
 } device_line_t;
 
-/// Of a serial_device_t: frames of bytes.
+/// Line of a serial_device_t: frames of bytes.
 extern const device_line_t serial_line;
 
-/// Of a slcan_device_t: CAN frames as text.
+/// Line of an slcan_device_t: CAN frames as text.
 extern const device_line_t slcan_line;
 
-/// Of a can_device_t: whole objects of can_frame_t, one after the other, as a controller or a socket gives them.
+/// Lines of a can_device_t: consecutive objects of can_frame_t, as from a controller or a socket.
 extern const device_line_t can_line;     ///< classic CAN
 extern const device_line_t can_fd_line;  ///< CAN FD
 

@@ -4,7 +4,7 @@
 #error "each of the buffers must hold a frame of any line: DEVICE_LOOP_LEAST bytes"
 #endif
 
-/// What is on its way from and to the line.
+/// Bytes on their way from and to the line.
 typedef struct {
     uint8_t input[DEVICE_LOOP_INPUT_SIZE];
     size_t  input_from;
@@ -14,7 +14,8 @@ typedef struct {
     size_t  output_to;
 } buffers_t;
 
-/// New input is taken only when the old is done with: until then it waits in the line, and its sender with it.
+/// True iff new input is wanted: only after the old is processed. Until then it stays in the line and holds up its
+/// sender.
 static bool wants_input(const device_t* const device, const buffers_t* const buffers) {
     return (buffers->input_from == buffers->input_to) && !device_is_busy(device);
 }
@@ -37,7 +38,7 @@ static void transmit(buffers_t* const buffers) {
     }
 }
 
-/// Lets the device work on what has come, as far as its answers have room.
+/// Run the device on the input, as far as its answers have room.
 static void work(const device_line_t* const line, void* const state, buffers_t* const buffers) {
     const device_progress_t progress =
         line->run(state, &buffers->input[buffers->input_from], buffers->input_to - buffers->input_from,
@@ -46,7 +47,7 @@ static void work(const device_line_t* const line, void* const state, buffers_t* 
     buffers->output_to += progress.given;
 }
 
-/// So many SampleBlocks may wait: at least the one that is being taken.
+/// Number of SampleBlocks that fit the input; at least the one that is being processed.
 static uint8_t input_blocks(const device_line_t* const line) {
     const size_t room = DEVICE_LOOP_INPUT_SIZE / line->block_size;
     const size_t most = (room < UINT8_MAX) ? room : UINT8_MAX;
@@ -73,7 +74,7 @@ void device_loop(const device_line_t* const line,
         if (has_output(&buffers)) {
             transmit(&buffers);
         }
-        // Work that is left over while the output is empty waits for nobody.
+        // With the output empty, remaining work can go on at once.
         const bool wants = wants_input(device, &buffers);
         if (wants || has_output(&buffers)) {
             more = port_idle(wants, has_output(&buffers));

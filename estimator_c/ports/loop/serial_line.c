@@ -8,6 +8,4 @@ run(void* const state, const uint8_t* const in, const size_t in_n, uint8_t* cons
     return serial_device_run(state, in, in_n, out, out_n);
 }
 
-const device_line_t serial_line = { .init       = init,
-                                    .run        = run,
-                                    .block_size = FRAME_SIZE(ANALOGRIG_LENGTH_MAX) };
+const device_line_t serial_line = { .init = init, .run = run, .block_size = FRAME_SIZE(ANALOGRIG_LENGTH_MAX) };

@@ -8,6 +8,4 @@ run(void* const state, const uint8_t* const in, const size_t in_n, uint8_t* cons
     return slcan_device_run(state, in, in_n, out, out_n);
 }
 
-const device_line_t slcan_line = { .init       = init,
-                                   .run        = run,
-                                   .block_size = SLCAN_STANDARD_LINE(ANALOGRIG_LENGTH_MAX) };
+const device_line_t slcan_line = { .init = init, .run = run, .block_size = SLCAN_STANDARD_LINE(ANALOGRIG_LENGTH_MAX) };

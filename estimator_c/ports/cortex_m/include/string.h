@@ -1,4 +1,4 @@
-/// A bare compiler has no C library: what the generated codecs ask of one. start.c has it.
+/// Part of a C library that the generated codecs need; a bare compiler has none. Defined in start.c.
 
 #ifndef STRING_H_INCLUDED
 #define STRING_H_INCLUDED

@@ -1,0 +1,162 @@
+/// Engine: exact stepping of a piecewise-linear circuit between events.
+///
+///     dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e + P phi(w),   y = L x + M u + n + R phi(w)
+///
+/// phi acts on each element of w separately. It is continuous and has three linear pieces; an element of phi is called a
+/// kink. A mode is one piece for every kink. Within a mode the circuit is affine and is stepped with its matrix
+/// exponential. The inputs u are constant between edges. Where phi feeds w (P is not 0), w is solved for; the solution
+/// must exist and be unique.
+///
+/// Time is counted in ticks of 2^-22 sample periods. For every mode that occurs, the engine keeps a ladder: the matrices
+/// exp(A h / 2^k) - I for k = 22 .. 0. Any number of ticks is a product of a few of them, and an event is found by
+/// bisection to the tick. Where a Lyapunov function proves that no event comes before the next edge, only the states
+/// that last longer than a sample period are stepped.
+///
+/// The library is C99 with malloc and libm, for the host: not for interrupts and not for the device. One engine must not be
+/// used by two threads at once; different engines may. Results depend on the inputs alone, not on how a run is cut into
+/// calls. RAM: 420 kB an engine; for each of up to 64 modes 26 kB with ten states, and 380 kB once it has been quiet.
+///
+/// Rows of [A B c], [C D e] and [L M n] are stored side by side: (states + inputs + 1) columns, row-major.
+///
+/// Distributed under the terms of the MIT License.
+
+#ifndef ENGINE_H
+#define ENGINE_H
+
+#include <stdint.h>
+
+#define ENGINE_MAX_STATES 32
+#define ENGINE_MAX_INPUTS 8
+#define ENGINE_MAX_KINKS 64
+#define ENGINE_MAX_OUTPUTS 256
+#define ENGINE_MAX_UNKNOWNS 256
+#define ENGINE_LEVELS 23
+#define ENGINE_TICKS_PER_SAMPLE (INT64_C(1) << (ENGINE_LEVELS - 1))
+
+typedef struct engine engine_t;
+
+typedef enum {
+    ENGINE_OK         = 0,
+    ENGINE_NO_MEMORY  = 1,  ///< malloc failed
+    ENGINE_TOO_STIFF  = 2,  ///< a time constant is 10^17 times shorter than a sample period
+    ENGINE_EVENTS     = 3,  ///< more events within one sample period than allowed
+    ENGINE_NOT_FINITE = 4,  ///< the state is no longer finite
+    ENGINE_EDGE      = 5,  ///< an edge is out of order, in the past, beyond the run, or of an input that does not exist
+    ENGINE_NO_SYSTEM = 6,  ///< no circuit was set, or the last one was refused
+    ENGINE_NOT_UNIQUE = 7,  ///< w = r + P phi(w) has no solution, or several, for some r
+} engine_status_t;
+
+/// One kink: phi(w) = slope[p] w + intercept[p], with p = 0 below lower, 1 between, 2 above upper.
+typedef struct {
+    double lower;
+    double upper;
+    double slope[3];
+    double intercept[3];
+} engine_kink_t;
+
+/// A circuit, as arrays of the caller. They are copied.
+typedef struct {
+    const double*        abc;    ///< states rows
+    const double*        g;      ///< states x kinks
+    const double*        cde;    ///< kinks rows
+    const double*        w_phi;  ///< P, kinks x kinks
+    const double*        lmn;    ///< outputs rows
+    const double*        y_phi;  ///< R, outputs x kinks
+    const engine_kink_t* kinks;
+} engine_system_t;
+
+/// Counters since engine_new() or engine_restart().
+typedef struct {
+    int64_t samples;      ///< samples recorded
+    int64_t events;       ///< changes of mode at an instant that the engine had to find
+    int64_t steps;        ///< matrix products tried, accepted or not
+    int64_t quiet;        ///< samples stepped with the slow states alone
+    int64_t modes_built;  ///< ladders computed; exceeds the number of modes if the store is too small
+} engine_counts_t;
+
+/// Return a new engine at rest before its first sample: x = 0, u = 0. NULL iff a size is out of range, the sample period is
+/// not positive, or memory is short. Cost: one calloc.
+engine_t* engine_new(int states, int inputs, int kinks, int outputs, double sample_period_s, int64_t events_per_sample);
+
+/// Free the engine. NULL is allowed.
+void engine_free(engine_t* self);
+
+/// Return the engine to the state of engine_new(), without a circuit. Memory already allocated is kept.
+void engine_restart(engine_t* self);
+
+/// Set or replace the circuit; to be called before engine_run(). x and u keep their values. A circuit equal to the present
+/// one to the bit changes nothing.
+///
+/// Fails with ENGINE_NOT_UNIQUE, or as engine_run() where it enters the mode. Without a circuit, engine_run() then fails.
+/// Cost: a copy, one determinant for each combination of pieces of the kinks that feed a w, and later one ladder for each
+/// mode that occurs: about 30 n^2 (n + m + 1) multiplications with n states and m inputs. Of more than 4096 combinations,
+/// only those that occur are checked.
+engine_status_t engine_set_system(engine_t* self, const engine_system_t* system);
+
+/// Copy the state to x. Cannot fail.
+void engine_get_state(const engine_t* self, double* x);
+
+/// Copy x to the state, and enter its mode. Fails with ENGINE_NO_SYSTEM, or as engine_run().
+engine_status_t engine_set_state(engine_t* self, const double* x);
+
+/// Advance to tick `until`, and record y at every sample instant up to it that is not recorded yet. Sample k is at tick
+/// k ENGINE_TICKS_PER_SAMPLE, and follows the edges of that tick.
+///
+/// y: one row of outputs for each of these samples. edges: at tick[i], input[i] becomes level[i]. Ticks must not decrease,
+/// lie before the present tick, or exceed `until`.
+///
+/// On failure the engine stands where it failed; only engine_restart() and engine_free() are then allowed.
+/// Cost: one product of (states + inputs + 1) x states a step; about one step a sample, some 50 an event.
+engine_status_t engine_run(engine_t*      self,
+                           int64_t        until,
+                           int64_t        edges,
+                           const int64_t* tick,
+                           const int32_t* input,
+                           const double*  level,
+                           double*        y);
+
+/// Call engine_set_system() and engine_run() in turn: circuit[i] up to tick until[i], which must not decrease. A circuit whose
+/// tick has been reached is set, but not run. edges: those of all turns. Fails as these two functions.
+engine_status_t engine_play(engine_t*              self,
+                            int64_t                turns,
+                            const engine_system_t* circuit,
+                            const int64_t*         until,
+                            int64_t                edges,
+                            const int64_t*         tick,
+                            const int32_t*         input,
+                            const double*          level,
+                            double*                y);
+
+/// Watch, from the present tick on, for kinks that stay outside their middle piece for `patience` ticks without a break.
+/// Before the first call, patience is one sample period. Cost: none while no mode changes.
+void engine_watch(engine_t* self, int64_t patience);
+
+/// For each kink, write the first tick since engine_watch() at which it had been outside for that long; -1 if there is none.
+void engine_get_overdue(const engine_t* self, int64_t* tick);
+
+/// Copy the counters.
+void engine_get_counts(const engine_t* self, engine_counts_t* counts);
+
+/// Solve a x = b by Gaussian elimination with partial pivoting. a: n x n, b: n x columns, both row-major and overwritten, b
+/// by x. Return -1 on success, else the index of the unknown that has no pivot; ENGINE_MAX_UNKNOWNS if n exceeds that.
+/// Written by hand because LAPACK's bits differ between machines. Cost: n^3 / 3 + n^2 columns multiplications.
+int engine_solve(int n, int columns, double* a, double* b);
+
+/// Gather white noise of intensity q (n x n, symmetric) that drives dx/dt = a x for period_s. All results are n x n:
+/// phi = exp(a period_s); cov, the integral of exp(a s) q exp(a' s) ds; factor, lower triangular with factor factor' = cov
+/// and zero columns for directions without noise. Return 1 iff phi and cov are finite. n is at most ENGINE_MAX_STATES.
+int engine_noise_gather(
+    int n, double period_s, const double* a, const double* q, double* phi, double* cov, double* factor);
+
+/// For each sample, record y = reading x, then set x = phi x + factor v. reading: outputs x n; v: the next n of normal.
+void engine_noise_run(int           n,
+                      int           outputs,
+                      int64_t       samples,
+                      const double* phi,
+                      const double* factor,
+                      const double* reading,
+                      const double* normal,
+                      double*       x,
+                      double*       y);
+
+#endif  // ENGINE_H
