@@ -46,7 +46,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults defects \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -119,6 +119,9 @@ fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZ
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED
 	@$(BIN)/python -m tests.harness.fault_runs $(FAULTS_N) $(FAULTS_SEED)
+
+hostile: $(PRODUCTS) ## 5,000 mutated recordings, 2,000 descriptions, 500 logs and every key at absurd values; ARGS="--seed 7" goes to tests.mutated
+	@$(BIN)/python -m tests.mutated $(ARGS)
 
 defects: $(PRODUCTS) ## whether the shipped properties find each defect that is planted in the device; the table of tests/properties/README.md
 	@$(BIN)/python -m tests.properties.planted

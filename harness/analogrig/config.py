@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import tomllib
 import types
 import typing
@@ -31,6 +32,22 @@ MOST_NUMBER = 1e30
 MOST_INTEGER = 2**63 - 1
 
 MOST_SHOWN = 200
+
+MAX_DEPTH = 32
+"""Of tables and arrays in a file."""
+
+MAX_WORD = 2_000
+"""Characters of a bare key or a number in a file."""
+
+_QUOTES = "\"'#"
+"""Strings and comments, which may be long, begin with one of these."""
+
+_TOKENS = re.compile(
+    r"""\"{3}(?:[^"\\]|\\.|"(?!""))*+(?:\"{3}|\Z) | '{3}(?:[^']|'(?!''))*+(?:'{3}|\Z)
+    | "(?:[^"\\\n]|\\.)*+"? | '[^'\n]*+'? | \#[^\n]*+ | [][{}.,=\n] | [\w+:-]++""",
+    re.DOTALL | re.VERBOSE,
+)
+"""What nests in TOML, its bare words, and the strings and comments in which the same characters mean nothing."""
 
 
 def fixtures() -> Path:
@@ -89,11 +106,35 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigurationError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        _check_nesting(text)
+        return tomllib.loads(text)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:  # among them TOMLDecodeError, UnicodeDecodeError, too long a number
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+
+
+def _check_nesting(text: str) -> None:
+    """Refuse what takes tomllib memory and time out of proportion.
+
+    :raises ValueError: brackets or dots of a key are nested too deep, or a bare word is too long.
+    """
+    brackets = dots = 0
+    for token in _TOKENS.finditer(text):
+        match token[0]:
+            case "[" | "{":
+                brackets, dots = brackets + 1, 0
+            case "]" | "}":
+                brackets -= 1
+            case ".":
+                dots += 1
+            case "," | "\n" | "=":
+                dots = 0
+            case word if len(word) > MAX_WORD and word[0] not in _QUOTES:
+                raise ValueError(f"a word or number is longer than {MAX_WORD} characters")
+        if max(brackets, dots) > MAX_DEPTH:
+            raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
 
 
 def to_toml(table: Mapping[str, Any]) -> str:
@@ -145,34 +186,38 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     hints = typing.get_type_hints(cls)
     for key in table:
         if key not in fields:
-            raise ConfigurationError(f"{where}: unknown key {key!r} (known: {', '.join(fields)})")
+            raise ConfigurationError(f"{where}: unknown key {_shown(key)} (known: {', '.join(fields)})")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in table:
             raise ConfigurationError(f"{where}: the key {name!r} is lacking")
-    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    values = {key: converted(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
-    except (ValueError, ArithmeticError, EmulatorError) as error:
+    except (ValueError, ArithmeticError, ConfigurationError, EmulatorError) as error:
         table_name = where.rpartition(": ")[2]
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
+def converted(hint: Any, value: Any, where: str) -> Any:
+    """A plain value as the type ``hint``, as for a field of ``build``; ``where`` leads every error.
+
+    :raises ConfigurationError: it is of another type.
+    """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(arguments, value, where)
     if origin is Literal:
         if value in arguments:
             return value
-        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {value!r}")
+        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_shown(value)}")
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):
         table = _expect(dict, value, "a table", where)
-        return {key: _convert(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
+        return {key: converted(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
     return _convert_scalar(hint, value, where)
 
 
@@ -180,14 +225,14 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
     if (kinds := _by_kind(arguments)) and isinstance(value, dict):
         if "kind" not in value:
             raise ConfigurationError(f"{where}: the key 'kind' is lacking")
-        kind = _convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
-        return _convert(kinds[kind], value, where)
+        kind = converted(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
+        return converted(kinds[kind], value, where)
     problems = []
     for argument in arguments:
         if argument is types.NoneType:
             continue
         try:
-            return _convert(argument, value, where)
+            return converted(argument, value, where)
         except ConfigurationError as error:
             problems.append(str(error).removeprefix(f"{where}: "))
     raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
@@ -202,13 +247,13 @@ def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
 
 
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    items = _expect(list, value, "an array", where)
+    items = _expect(list, list(value) if isinstance(value, tuple) else value, "an array", where)
     if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return tuple(_convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+        return tuple(converted(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
     if len(items) != len(arguments):
         raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
     return tuple(
-        _convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
+        converted(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
     )
 
 

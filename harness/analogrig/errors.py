@@ -24,9 +24,14 @@ Errors of the operating system and of libraries are wrapped once, where they app
 
 from __future__ import annotations
 
+from analogrig.wording import one_line
+
 
 class AnalogrigError(Exception):
     """The root: catch this to catch everything that the harness raises on purpose."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(one_line(message))
 
 
 class ConfigurationError(AnalogrigError):

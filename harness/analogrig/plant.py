@@ -6,8 +6,7 @@ This is the harness's own model of what the rig computes: it is used to say how 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ PARAMETERS = ("M", "B", "K")
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
 
-MOST_PARAMETER = 1e12
+LEAST_PARAMETER, MOST_PARAMETER = 1e-12, 1e12
 """Of any of the three, in its unit."""
 
 
@@ -36,8 +35,9 @@ class Plant:
 
     def __post_init__(self) -> None:
         for name, value in self.parameters().items():
-            if not 0.0 < value < MOST_PARAMETER:
-                raise ValueError(f"{name} must be more than 0 and less than {MOST_PARAMETER:g}, not {value:g}")
+            if not LEAST_PARAMETER < value < MOST_PARAMETER:
+                limits = f"more than {LEAST_PARAMETER:g} and less than {MOST_PARAMETER:g}"
+                raise ValueError(f"{name} must be {limits}, not {value:g}")
 
     def parameters(self) -> dict[str, float]:
         """The values under their short names ``M``, ``B``, ``K``."""
@@ -85,10 +85,16 @@ class SampledPlant:
     @classmethod
     def of(cls, plant: Plant, period_s: float) -> SampledPlant:
         """Every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
-        m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
-        generator = np.array([[0.0, 1.0, 0.0], [-k / m, -b / m, 1.0 / m], [0.0, 0.0, 0.0]])
-        (xx, xv, xf), (vx, vv, vf), _ = _exponential(generator * period_s).tolist()
-        return cls(transition=(xx, xv, vx, vv), response=(xf, vf))
+        return cls.of_each([plant], period_s)[0]
+
+    @classmethod
+    def of_each(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
+        """As ``of``, bit for bit, for many plants in less time."""
+        parameters = np.array([(each.mass_kg, each.damping_n_s_per_m, each.stiffness_n_per_m) for each in plants])
+        return [
+            cls(transition=(xx, xv, vx, vv), response=(xf, vf))
+            for (xx, xv, xf), (vx, vv, vf) in sampled(parameters.reshape(-1, 3), period_s).tolist()
+        ]
 
     def next(self, state: State, force_n: float) -> State:
         """The state one sample later."""
@@ -98,12 +104,30 @@ class SampledPlant:
         return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
 
 
-def _exponential(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """exp(matrix) by scaling, a Taylor series, and squaring; relative error near 1e-15 for the norms used here."""
-    norm = float(np.abs(matrix).sum(axis=1).max())
-    squarings = max(0, math.frexp(norm)[1] + 4)
-    scaled = matrix / 2.0**squarings
-    term = result = np.eye(len(matrix))
+def sampled(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
+    """One sample period of (n, 3) values of M, B, K: of each the rows of x and v from x, v and force, (n, 2, 3)."""
+    m, b, k = parameters.T
+    generators = np.zeros((len(parameters), 3, 3))
+    generators[:, 0, 1] = 1.0
+    generators[:, 1] = np.stack([-k / m, -b / m, 1.0 / m], axis=1)
+    return _exponentials(generators * period_s)[:, :2]
+
+
+def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Exponential of each of (k, n, n) matrices, of the same shape."""
+    norms = np.abs(matrices).sum(axis=2).max(axis=1)
+    squarings = np.maximum(0, np.frexp(norms)[1] + 4)
+    out = np.empty_like(matrices)
+    for count in np.unique(squarings).tolist():
+        alike = squarings == count
+        out[alike] = _exponential(matrices[alike], count)
+    return out
+
+
+def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.float64]:
+    """Exponential by scaling, a Taylor series, and squaring; relative error near 1e-15 for the norms used here."""
+    scaled = matrices / 2.0**squarings
+    term = result = np.eye(matrices.shape[-1])
     for order in range(1, 13):
         term = term @ scaled / order
         result = result + term

@@ -10,11 +10,12 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import math
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Self
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +26,25 @@ from analogrig.plant import Plant
 from analogrig.protocol.catalogue import Change
 from analogrig.storage import replacing
 
+if TYPE_CHECKING:
+    from analogrig.protocol.estimator_config import EstimatorConfig
+
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
 
 CHUNK_SAMPLES = 1 << 16
 """Long runs are worked on in parts of this length, so that intermediate results take no memory to speak of."""
 
-_FAR = 1e9
-"""Beyond any unit, time or noise that is one."""
+MAX_SAMPLES = 10_000_000
+"""A run is kept in memory, some 70 bytes a sample."""
+
+MAX_CHANGES = 1_000
+"""Changes of the plant in a run, and its records: what can be known of each takes milliseconds to compute."""
+
+MAX_CODES = 1 << 16
+
+_NEAR, _FAR = 1e-12, 1e9
+"""Short of and beyond any unit, time or noise that is one."""
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """Order of the columns of ``Run.codes`` and ``Run.clipped``."""
@@ -302,7 +314,7 @@ class Run:
             with path.open("rb") as raw:
                 _check_archive(raw)
                 with np.load(raw, allow_pickle=False) as file:
-                    header = json.loads(str(file["header"]))
+                    header = json.loads(str(file["header"]), parse_float=_finite, parse_constant=_finite)
                     names = (*_ARRAYS, *(name for name in _LATER_ARRAYS if name in file))
                     arrays = {name: _checked(name, file[name]) for name in names}
         except OSError as error:
@@ -312,6 +324,18 @@ class Run:
         run = cls(conditions=_conditions(header, path), **arrays)
         run._check_consistency(path)
         return run
+
+    def _estimator(self, path: Path) -> EstimatorConfig:
+        """:raises RecordingError: a table of the header is not what is read of it later."""
+        from analogrig.header import check_tables  # which needs the types of scenarios, and these ours
+
+        ran = self.conditions
+        try:
+            return check_tables(
+                f"{path}: the header of the recording", scenario=ran.scenario, rig=ran.rig, dut=ran.dut, line=ran.line
+            )
+        except ConfigurationError as error:
+            raise RecordingError(str(error)) from error
 
     def _check_consistency(self, path: Path) -> None:
         """The arrays belong together, and so do they and the header."""
@@ -333,23 +357,29 @@ class Run:
             and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
             "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
-            "sample times": all(0.0 < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale)),
-            "number of samples": n <= conditions.samples_asked,
+            "sample times": all(_NEAR < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale))
+            and all(0.0 <= each < _FAR for each in (conditions.real_time, conditions.line_s)),
+            "number of samples": n <= conditions.samples_asked <= MAX_SAMPLES,
+            "seed": 0 <= conditions.seed < 2**63,
             "units": all(
-                0.0 < channel.lsb_v < _FAR and 0.0 < abs(channel.unit_per_v) < _FAR and 0.0 <= channel.noise_lsb < _FAR
+                _NEAR < channel.lsb_v < _FAR
+                and _NEAR < abs(channel.unit_per_v) < _FAR
+                and abs(channel.low_v) < _FAR
+                and 0.0 <= channel.noise_lsb < _FAR
+                and 1 <= channel.codes <= MAX_CODES
                 for channel in conditions.channels.values()
             ),
             "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
-            "records": conditions.records[:1] == (0,) and list(conditions.records) == sorted(set(conditions.records)),
-            "segments": all(_ascend(starts) for starts in (earliest, starts, latest))
+            "records": _ascend(conditions.records) and 1 <= len(conditions.records) <= MAX_CHANGES,
+            "segments": len(starts) <= MAX_CHANGES + 1
+            and all(_ascend(starts) for starts in (earliest, starts, latest))
             and all(low <= start <= high for low, start, high in zip(earliest, starts, latest, strict=True)),
-            "alarms": bool(((self.alarm_index >= 0) & (self.alarm_index < n)).all()),
-            "diagnoses": bool(((self.diagnosis_index >= 0) & (self.diagnosis_index < n)).all())
+            "alarms": _is_rising(self.alarm_index, n),
+            "diagnoses": _is_rising(self.diagnosis_index, n)
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
-            "names": all("name" in table for table in (conditions.scenario, conditions.rig, conditions.dut)),
-            "estimator": self.theta.shape[1] == _parameters(conditions.dut.get("estimator")),
+            "estimator": self.theta.shape[1] == self._estimator(path).parameters,
         }
         wrong = [what for what, holds in checks.items() if not holds]
         if wrong:
@@ -363,6 +393,22 @@ def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
     rows = np.atleast_1d(array)
     for first in range(0, len(rows), CHUNK_SAMPLES):
         file.write(rows[first : first + CHUNK_SAMPLES].tobytes())
+
+
+def _finite(number: str) -> float:
+    """A number of the header, which goes to other programs as JSON again.
+
+    :raises ValueError: it is none that JSON has.
+    """
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"{number} in the header")
+    return value
+
+
+def _is_rising(indices: NDArray[np.int64], n: int) -> bool:
+    """True if all are samples of a run, in their order."""
+    return not len(indices) or bool(indices[0] >= 0 and indices[-1] < n and (np.diff(indices) >= 0).all())
 
 
 def _ascend(starts: Sequence[int]) -> bool:
@@ -379,14 +425,6 @@ def _check_archive(raw: BinaryIO) -> None:
         if damaged is not None:
             raise ValueError(damaged)
     raw.seek(0)
-
-
-def _parameters(estimator: Any) -> int | None:
-    """How many elements theta has."""
-    try:
-        return sum(int(estimator[key]) for key in ("na", "nb", "offset")) + int(estimator.get("nc", 0))
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return None
 
 
 def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:

@@ -11,9 +11,10 @@ from typing import Any, Literal
 import numpy as np
 
 from analogrig import config
-from analogrig.plant import Plant
-from analogrig.run import Segment
+from analogrig.plant import LEAST_PARAMETER, MOST_PARAMETER, Plant
+from analogrig.run import MAX_CHANGES, MAX_SAMPLES, Segment
 from analogrig.trust import FiledName, beside
+from analogrig.wording import number_of
 from analogrig_emulator.excitation import Excitation
 from analogrig_emulator.suspension import PROGRAMS
 
@@ -29,9 +30,6 @@ PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in P
 """The parameters with which each program of the computer starts."""
 
 MOST_SEED = 2**63
-
-MAX_SAMPLES = 10_000_000
-"""A run is kept in memory, some 70 bytes a sample."""
 
 Limit = bool | int | float | str
 """Of a statement."""
@@ -53,7 +51,7 @@ class PlantChoice:
     stiffness_n_per_m: float | None = None
 
     def __post_init__(self) -> None:
-        _check_positive(self)
+        _check_parameters(self)
 
     def given(self) -> dict[str, float]:
         """The parameters that do not stand where the set has them, under their names in Plant."""
@@ -78,7 +76,7 @@ class Tweak:
     ramp_n: int = 0
 
     def __post_init__(self) -> None:
-        _check_positive(self)
+        _check_parameters(self)
         if self.sample < 1:
             raise ValueError(f"sample must be at least 1, not {self.sample}")
         if not 0 <= self.ramp_n <= MAX_RAMP_N:
@@ -124,7 +122,8 @@ class Expectations:
         if missing <= self.max_missing_fraction * samples:
             return []
         allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
-        return [f"{missing} of {samples} samples were {words}, {allowed}"]
+        verb = "was" if missing == 1 else "were"
+        return [f"{missing} of {number_of(samples, 'sample')} {verb} {words}, {allowed}"]
 
 
 @dataclass(frozen=True)
@@ -175,15 +174,18 @@ class Scenario:
             raise ValueError(f"seed must be 0 to 2^63 - 1, not {self.seed}")
         if not 1 <= self.samples <= MAX_SAMPLES:
             raise ValueError(f"samples must be in 1 .. {MAX_SAMPLES}, not {self.samples}")
+        if len(self.tweaks) > MAX_CHANGES:
+            raise ValueError(f"there must be at most {MAX_CHANGES} tweaks, not {len(self.tweaks)}")
         instants = [tweak.sample for tweak in self.tweaks]
         if instants != sorted(set(instants)):
             raise ValueError(f"tweaks must come in the order of their samples, each sample once, not {instants}")
         if instants and instants[-1] >= self.samples:
-            raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {self.samples} samples")
+            of = number_of(self.samples, "sample")
+            raise ValueError(f"the tweak at sample {instants[-1]} is beyond the last of {of}")
         for tweak, following in itertools.pairwise(self.tweaks):
             if tweak.sample + tweak.ramp_n > following.sample:
                 raise ValueError(
-                    f"the tweak at sample {tweak.sample} lasts {tweak.ramp_n} samples,"
+                    f"the tweak at sample {tweak.sample} lasts {number_of(tweak.ramp_n, 'sample')},"
                     f" beyond the next one at {following.sample}"
                 )
 
@@ -242,10 +244,12 @@ def _changed(plant: Plant, change: PlantChoice | Tweak) -> Plant:
     return dataclasses.replace(plant, **_given(change))
 
 
-def _check_positive(change: PlantChoice | Tweak) -> None:
+def _check_parameters(change: PlantChoice | Tweak) -> None:
     for name, value in _given(change).items():
-        if not value > 0.0:
-            raise ValueError(f"{name} must be more than 0, not {value:g}")
+        if not LEAST_PARAMETER < value < MOST_PARAMETER:
+            limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
+            limit = limit if value > 0.0 else "more than 0"
+            raise ValueError(f"{name} must be {limit}, not {value:g}")
 
 
 def _plain(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -176,13 +176,14 @@ def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, refere
 
 def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
     path, plan = tmp_path / "out.json.journal", planned(tmp_path)
+    rows = {chunk: play_chunk(plan.as_json(), chunk) for chunk in (Chunk((0, 0)), Chunk((0, 1)), Chunk((1, 0)))}
     with Journal(path, plan) as journal:
-        journal.add(Chunk((0, 0)), [])
-        journal.add(Chunk((0, 1)), [])
+        journal.add(Chunk((0, 0)), rows[Chunk((0, 0))])
+        journal.add(Chunk((0, 1)), rows[Chunk((0, 1))])
     path.write_bytes(path.read_bytes()[:-3])
     with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0)]
-        journal.add(Chunk((1, 0)), [])
+        journal.add(Chunk((1, 0)), rows[Chunk((1, 0))])
     with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0), (1, 0)]
 

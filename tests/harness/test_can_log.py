@@ -529,7 +529,7 @@ def test_device_of_another_catalogue_is_refused(tmp_path: Path, traffic: tuple[R
     ("name", "text", "said"),
     [
         ("can.log", "", "holds no run of a device"),
-        ("can.log", "  can0  018   [8]  00 11 22 33 44 55 66 77\n", "1 lines are no frames (at 1); candump -L writes"),
+        ("can.log", "  can0  018   [8]  00 11 22 33 44 55 66 77\n", "1 line is no frame (at 1); candump -L writes"),
         ("can.csv", "a,b", "not a CAN log: the suffix must be one of .log, .blf, .asc, .mf4, .trc"),
         ("none.log", None, "No such file or directory"),
     ],

@@ -37,6 +37,7 @@ from analogrig.judging.statistics import (
 )
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
+from analogrig.wording import number_of
 
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
 """About so many samples in a run: in this process, or over a line."""
@@ -213,12 +214,13 @@ def _of_rare_alarms(question: Question, count: int, workers: Workers) -> Certifi
     alarms, samples = sum(each.alarms for each in estimates), sum(each.samples for each in estimates)
     fruitless = sum(not each.alarms for each in estimates)
     if fruitless:
-        said = f"in {fruitless} of {len(estimates)} estimates no branch came to an alarm"
+        said = f"in {fruitless} of {number_of(len(estimates), 'estimate')} no branch came to an alarm"
         return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
     rates = [each.rate for each in estimates]
     low, high = mean_bounds(rates, question.confidence)
-    said = f"the rate is {math.fsum(rates) / len(rates):.3g}, {low:.3g} to {high:.3g}, from {len(rates)} estimates"
-    return Certificate(_answer(question.far, low, high), f"{said}, {samples} samples", alarms, samples, (low, high))
+    said = f"the rate is {math.fsum(rates) / len(rates):.3g}, {low:.3g} to {high:.3g}"
+    said += f", from {number_of(len(rates), 'estimate')}, {number_of(samples, 'sample')}"
+    return Certificate(_answer(question.far, low, high), said, alarms, samples, (low, high))
 
 
 def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
@@ -256,18 +258,18 @@ def _run_n(question: Question, most: int) -> int:
 
 def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
     if question.sequential:
-        said = f"{alarms} alarms in {samples} samples, and still undecided"
+        said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and still undecided"
         return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
     low = lower_rate(alarms, samples, question.confidence)
     high = upper_rate(alarms, samples, question.confidence)
-    said = f"{alarms} alarms in {samples} samples: the rate is {low:.3g} to {high:.3g}"
+    said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}: the rate is {low:.3g} to {high:.3g}"
     return Certificate(_answer(question.far, low, high), said, alarms, samples, (low, high))
 
 
 def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:
     """Wald's test certifies; a confidence sequence refutes, which it does in the end for any rate above the limit."""
     error, far = 1.0 - question.confidence, question.far
-    said = f"{alarms} alarms in {samples} samples, and no more were needed"
+    said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and no more were needed"
     better = SequentialTest(far / APART, far, error, error, trials=samples, events=alarms)
     if better.decision is Decision.BELOW:
         return Certificate("certified", said, alarms, samples, (0.0, 1.0))

@@ -88,7 +88,7 @@ class Journal:
         with open(self._file.fileno(), "rb", closefd=False) as lines:
             first = next(lines, b"")
             self._check(first, head, plan)
-            whole = self._read(lines, len(head)) if len(first) >= len(head) else 0
+            whole = self._read(lines, len(head), plan) if len(first) >= len(head) else 0
         self._file.truncate(whole)
         if not whole:
             self._write(head)
@@ -106,17 +106,16 @@ class Journal:
             raise ConfigurationError(f"{self.path}: is a file {what}: choose another --out, or remove it")
         plan.check_same(entry.get("plan"), f"{self.path}: what was kept there is of another campaign")
 
-    def _read(self, lines: Iterator[bytes], whole: int) -> int:
+    def _read(self, lines: Iterator[bytes], whole: int, plan: Plan) -> int:
         """Takes in all whole lines; the number of bytes up to their end."""
+        chunks = set(plan.chunks())
         for line in lines:
             entry = _entry(line)
             if entry is None:
                 break
             try:
-                chunk, rows = Chunk(entry["chunk"]), list(entry["rows"])
-                for row in rows:
-                    check_row(row)
-            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                chunk, rows = _checked(Chunk(entry["chunk"]), list(entry["rows"]), chunks, plan)
+            except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 raise RecordingError(f"{self.path}: a line that no campaign writes ({error}): remove it") from error
             self.rows[chunk] = rows
             whole += len(line)
@@ -126,6 +125,18 @@ class Journal:
         while line:
             line = line[self._file.write(line) :]
         os.fsync(self._file.fileno())
+
+
+def _checked(chunk: Chunk, rows: list[Row], chunks: set[Chunk], plan: Plan) -> tuple[Chunk, list[Row]]:
+    """:raises LookupError, TypeError, ValueError, AttributeError, OverflowError: the plan has no such chunk, or the
+    rows are not those of its trials."""
+    if chunk not in chunks:
+        raise ValueError(f"no chunk {list(chunk)} in the plan")
+    for row in rows:
+        check_row(row)
+    if [row["seed"] for row in rows] != list(plan.seeds(chunk)):
+        raise ValueError("rows of other seeds than the plan has")
+    return chunk, rows
 
 
 def _line(entry: dict[str, Any]) -> bytes:
@@ -138,5 +149,8 @@ def _entry(line: bytes) -> dict[str, Any] | None:
     check, _, text = line.rstrip(b"\n").partition(b" ")
     if not line.endswith(b"\n") or check != b"%08x" % zlib.crc32(text):
         return None
-    entry = json.loads(text)
+    try:
+        entry = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
     return entry if isinstance(entry, dict) else None

@@ -30,6 +30,7 @@ from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario, Tweak
 from analogrig.trust import Trust
+from analogrig.wording import number_of
 
 _DRAWS = 20_000
 """Of the seeds: the stream of the campaign's own draws, apart from those of the rig."""
@@ -185,7 +186,7 @@ class Plan:
         where = f"campaign {spec.name}"
         if self.size > MAX_CELLS or self.size * spec.trials > MAX_TRIALS:
             raise ConfigurationError(
-                f"{where}: {self.size} cells of {spec.trials} trials;"
+                f"{where}: {number_of(self.size, 'cell')} of {number_of(spec.trials, 'trial')};"
                 f" at most {MAX_CELLS} cells and {MAX_TRIALS} trials in all"
             )
         axes = {*spec.grid.axes(), *spec.draw.axes()}

@@ -15,6 +15,7 @@ from analogrig.campaigns.rows import RATES, Row, changes, check_row, counts, is_
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import PARAMETERS
 from analogrig.storage import replacing
+from analogrig.wording import number_named, number_of
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 
@@ -86,7 +87,7 @@ class Results:
 
     def _check(self) -> None:
         if len(self.rows) != self.plan.size:
-            raise ValueError(f"{len(self.rows)} cells, where the plan has {self.plan.size}")
+            raise ValueError(f"{number_of(len(self.rows), 'cell')}, where the plan has {self.plan.size}")
         spec = self.plan.spec
         for rows in self.rows:
             for row in rows:
@@ -94,7 +95,7 @@ class Results:
             if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
                 raise ValueError("rows of other seeds than the plan has")
             if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
-                raise ValueError(f"a cell of {len(rows)} trials")
+                raise ValueError(f"a cell of {number_of(len(rows), 'trial')}")
 
 
 @dataclass(frozen=True)
@@ -170,8 +171,9 @@ def anytime_text(counted: Mapping[str, int]) -> str:
     parts = []
     for name, rate in RATES.items():
         if counted[rate.exposure]:
-            what, below = name.replace("_", " "), rate.known(counted, CONFIDENCE).bounds[1]
-            parts.append(f"{counted[name]} {what} in {counted[rate.exposure]} {rate.unit} (rate below {below:.2g})")
+            below = rate.known(counted, CONFIDENCE).bounds[1]
+            events, exposure = number_named(counted[name], name), number_named(counted[rate.exposure], rate.unit)
+            parts.append(f"{events} in {exposure} (rate below {below:.2g})")
     return ", ".join(parts)
 
 
@@ -216,7 +218,8 @@ def text(results: Results) -> str:
     cells = results.cells()
     labels = [label(results.plan, cell) for cell, _ in cells]
     names = list(labels[0]) if len(cells) > 1 else []
-    head = f"campaign {spec.name}: {len(cells)} cells, {total.trials} trials, {total.samples} samples: "
+    counts = ((len(cells), "cell"), (total.trials, "trial"), (total.samples, "sample"))
+    head = f"campaign {spec.name}: {', '.join(number_of(*each) for each in counts)}: "
     rows = [[*names, *(column.short for column in COLUMNS)]]
     rows += [
         [*(each[name] for name in names), *_numbers(summary)] for each, (_, summary) in zip(labels, cells, strict=True)
@@ -226,7 +229,8 @@ def text(results: Results) -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
     notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
-    notes += [f"{total.inconclusive} trials inconclusive, such as {total.doubt}"] if total.inconclusive else []
+    if total.inconclusive:
+        notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.doubt}")
     return "\n".join(
         [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
     )

@@ -11,8 +11,7 @@ from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import TweakVerdict, Verdict
 from analogrig.plant import PARAMETERS
-from analogrig.run import Run
-from analogrig.scenario import MAX_SAMPLES
+from analogrig.run import MAX_SAMPLES, Run
 
 Row = dict[str, Any]
 """Of one trial, in plain values; see ``row``."""

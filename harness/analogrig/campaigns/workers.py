@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import multiprocessing
 import os
+import resource
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, forkserver, resource_tracker
 from typing import Any, Protocol, TypeVar
 
 from analogrig.errors import ConfigurationError, WorkerError
+from analogrig.wording import number_of
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -29,18 +32,27 @@ _LOADED = ("analogrig.campaigns.trial", "analogrig.campaigns.certificate")
 MOST_DEATHS = 3
 """Workers that may be lost over one task."""
 
+_DESCRIPTORS, _DESCRIPTORS_EACH = 48, 8
+"""Files that must be allowed to be open at once, and those for each worker."""
+
 _IN_HAND = 2
 """Tasks for each worker of a cluster, so that none waits for the way there and back."""
 
 _ANSWER_S = 10
 """A scheduler that does not answer within so long is not there."""
 
+_TALKATIVE = ("distributed", "distributed.client", "tornado.application", "asyncio")
+"""Loggers that print tracebacks of a connection that is lost, which the WorkerError reports in one line."""
+
 
 def prepare() -> None:
     """Begin to load, in the process that the workers of this machine are forked from, what they need.
 
     Worth a call before all else that takes long.
+
+    :raises ConfigurationError: too few files may be open.
     """
+    _check_descriptors(0)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_LOADED))
     resource_tracker.ensure_running()  # it would unblock it
@@ -49,6 +61,19 @@ def prepare() -> None:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _check_descriptors(workers: int) -> None:
+    """Refuse what would end halfway: the processes that fork workers report it by a traceback of their own.
+
+    :raises ConfigurationError: too few files may be open.
+    """
+    allowed, needed = resource.getrlimit(resource.RLIMIT_NOFILE)[0], _DESCRIPTORS + _DESCRIPTORS_EACH * workers
+    if allowed < needed:
+        raise ConfigurationError(
+            f"only {allowed} files may be open at once, and workers need {needed}:"
+            " raise `ulimit -n`, or pass --workers 1"
+        )
 
 
 class Workers(Protocol):
@@ -75,6 +100,7 @@ class Processes:
     def __init__(self, count: int) -> None:
         if count < 1:
             raise ConfigurationError(f"there must be at least one worker, not {count}")
+        _check_descriptors(count)
         self._count = count
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
@@ -115,6 +141,8 @@ class Dask:
             self._dask: Any = importlib.import_module("distributed")  # it ships no complete annotations
         except ImportError as error:
             raise ConfigurationError("--cluster needs Dask: pip install 'analogrig[cluster]'") from error
+        for name in _TALKATIVE:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._address = address
         try:
             self._client = self._dask.Client(address, timeout=_ANSWER_S)
@@ -147,11 +175,15 @@ class Dask:
                 if another is not None:
                     completed.add(another)
                 yield task, result
+        except (OSError, CancelledError) as error:  # Dask cancels the futures of a client that has lost its scheduler
+            raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
         finally:
-            self._client.cancel(list(sent))
+            with contextlib.suppress(OSError, CancelledError):
+                self._client.cancel(list(sent))
 
     def close(self) -> None:
-        self._client.close()
+        with contextlib.suppress(OSError, CancelledError):
+            self._client.close()
 
 
 def _submit(
@@ -193,4 +225,4 @@ def _end(pool: ProcessPoolExecutor) -> None:
 
 def _check_deaths(task: object, deaths: int, error: Exception) -> None:
     if deaths >= MOST_DEATHS:
-        raise WorkerError(f"{task}: {deaths} workers died over it, one after the other") from error
+        raise WorkerError(f"{task}: {number_of(deaths, 'worker')} died over it, one after the other") from error

@@ -6,6 +6,7 @@ Everything heavy is imported inside the command that needs it, so that ``--help`
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 from collections.abc import Sequence
 from typing import NoReturn
@@ -51,6 +52,15 @@ _COMMANDS = (
 """Each has ``add(commands)``; in the order of ``--help``."""
 
 
+_EXHAUSTED = {
+    errno.EMFILE: "raise the limit of this shell (ulimit -n)",
+    errno.ENFILE: "close programs, or raise the limit of this machine (sysctl fs.file-max)",
+    errno.ENOMEM: "close programs",
+    errno.ENOSPC: "make room on the disk",
+}
+"""Cures for what any operation of the system can fail by, an import among them."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Every failure is one line on standard error."""
     open_standard_streams()
@@ -75,6 +85,10 @@ def _explain(error: Exception) -> int:
         return complain(str(error), USAGE)
     if "ANALOGRIG_DEBUG" in os.environ:
         raise error
+    if isinstance(error, MemoryError):
+        return complain("not enough memory", INCONCLUSIVE)
+    if isinstance(error, OSError) and error.errno in _EXHAUSTED:
+        return complain(f"{error.strerror}: {_EXHAUSTED[error.errno]}", INCONCLUSIVE)
     what = " ".join(f"{type(error).__name__}: {error}".split())
     return complain(f"a fault of analogrig itself: {what} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from analogrig.cli.campaign import add_workers, begin, workers
 from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, watched
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     from analogrig.campaigns.certificate import Certificate, Question
@@ -121,6 +122,6 @@ def _progress() -> Callable[[int, int, int], None] | None:
         return None
 
     def tell(samples: int, most: int, alarms: int) -> None:
-        line.show(f"{samples} of {most} samples, {alarms} alarms", is_last=samples >= most)
+        line.show(f"{samples} of {most} samples, {number_of(alarms, 'alarm')}", is_last=samples >= most)
 
     return tell

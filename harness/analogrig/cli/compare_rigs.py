@@ -20,6 +20,7 @@ from analogrig.cli.options import (
     trust_of,
 )
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     from analogrig.hardware.rig_comparison import RigComparison
@@ -103,7 +104,7 @@ def _text(found: RigComparison) -> str:
     lines = [found.sentence, "", *_signal_lines(found), *_latency_lines(found)]
     for name, of in zip("AB", found.false_alarms, strict=True):
         rates = f"{of.least:.2g} to {of.most:.2g} per sample"
-        lines.append(f"  false alarms on {name}: {of.alarms} in {of.samples} samples ({rates})")
+        lines.append(f"  false alarms on {name}: {of.alarms} in {number_of(of.samples, 'sample')} ({rates})")
     lines += [f"  not compared: {why}" for why in found.invalid]
     return "\n".join([*lines, "", differences_text(found.verdicts)])
 

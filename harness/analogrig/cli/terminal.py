@@ -16,6 +16,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
+from analogrig.wording import one_line, printable
+
 if TYPE_CHECKING:
     from analogrig.bench import Progress
 
@@ -40,13 +42,13 @@ _PROGRESS_S = 1.0
 
 def complain(message: str, status: int) -> int:
     """Print one line on standard error; return ``status``."""
-    _print(_coloured(f"analogrig: {message}\n", sys.stderr), sys.stderr, 2)
+    _print(_coloured(f"analogrig: {one_line(message)}\n", sys.stderr), sys.stderr, 2)
     return status
 
 
 def show(text: str) -> None:
     """Print text for people on standard output."""
-    _show(_coloured(f"{text}\n", sys.stdout))
+    _show(_coloured(f"{printable(text)}\n", sys.stdout))
 
 
 def show_plain(text: str) -> None:

@@ -105,6 +105,14 @@ class DeviceDescription:
         return config.build(cls, cls._sorted_out(table), name)
 
     @classmethod
+    def check_place(cls, name: str, place: str) -> None:
+        """:raises ConfigurationError: a colon is the whole of ``place``, which would read as the default."""
+        if place == ":":
+            raise ConfigurationError(
+                f"device {name!r}: nothing follows the colon: pass {cls.kind} for the default, or {cls.kind}:WHICH"
+            )
+
+    @classmethod
     def _sorted_out(cls, table: dict[str, Any]) -> dict[str, Any]:
         """Keys and values, each in its place."""
         return table
@@ -490,6 +498,10 @@ class SerialDevice(ByteDevice):
     baud: int | None = DEFAULT_BAUD
 
     @classmethod
+    def check_place(cls, name: str, place: str) -> None:
+        """``named`` does, whose message names a URL."""
+
+    @classmethod
     def named(cls, name: str, rest: str) -> Self:
         """All of ``rest`` is the URL."""
         if not rest:
@@ -547,6 +559,10 @@ class CanDevice(FrameDevice):
             raise ValueError(
                 f"device: inproc needs a connection of its own, and {interface} is an adapter that takes but one"
             )
+
+    @classmethod
+    def check_place(cls, name: str, place: str) -> None:
+        """``can:`` is the bus that python-can's own configuration describes."""
 
     @classmethod
     def _located(cls, name: str, where: str) -> dict[str, Any]:  # noqa: ARG003
@@ -665,6 +681,7 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
     """The description, and the file that holds it; empty if the name says all."""
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
+        KINDS[kind].check_place(name, name[len(kind) :].partition("?")[0])
         return KINDS[kind].named(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
     _check_not_compiled(name)
     path = config.locate("devices", name)

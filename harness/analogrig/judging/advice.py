@@ -10,6 +10,7 @@ from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.judging.verdict import Verdict
 from analogrig.run import Run
+from analogrig.wording import number_of
 from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Excitation
 
 NOISE_MARGIN = 1.05
@@ -41,8 +42,13 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
 def _assumed(run: Run) -> Iterator[str]:
     assumed_n = run.conditions.dut.get("assumed_n", 0)
     if assumed_n:
+        settings = number_of(
+            assumed_n,
+            "setting of the device is not in the log and was",
+            "settings of the device are not in the log and were",
+        )
         yield (
-            f"{assumed_n} settings of the device are not in the log and were taken to be as by default:"
+            f"{settings} taken to be as by default:"
             " if they were not, bounds and estimates are wrong; capture from the handshake on"
         )
 
@@ -92,8 +98,8 @@ def _warm_up(run: Run) -> Iterator[str]:
     instants = excitation.edges(0, _SAMPLES_LOOKED_AT * TICKS_PER_SAMPLE, rate_hz).ticks[1:] / TICKS_PER_SAMPLE
     if len(instants) < WARM_UP_EDGES or instants[WARM_UP_EDGES - 1] >= warm_up_n:
         yield (
-            f"the device's warm-up of {warm_up_n} samples ends before {WARM_UP_EDGES} edges of the excitation came:"
-            " false alarms are to be expected at the first ones until its warm_up_n is longer"
+            f"the device's warm-up of {number_of(warm_up_n, 'sample')} ends before {WARM_UP_EDGES} edges of the"
+            " excitation came: false alarms are to be expected at the first ones until its warm_up_n is longer"
         )
 
 

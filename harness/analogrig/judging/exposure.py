@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from analogrig.protocol.catalogue import SteppedFlag
 from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, Run
+from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
 """Of the noise of the force: less is no edge, whatever the device takes for one. By chance two samples differ as much
@@ -45,9 +46,10 @@ class Exposure:
     @property
     def no_evidence(self) -> str:
         """Why its silence is no evidence of anything, in one line; empty if it is."""
+        of = number_of(self.samples, "sample")
         if self.numberless:
-            return f"in {self.numberless} of {self.samples} samples what the device estimated was no number"
-        return "" if self.armed else f"no alarm could come in any of {self.samples} samples: {self._because()}"
+            return f"in {self.numberless} of {of} what the device estimated was no number"
+        return "" if self.armed else f"no alarm could come in any of {of}: {self._because()}"
 
     def _because(self) -> str:
         if self.estimator.get("trigger") == "none":
@@ -57,7 +59,7 @@ class Exposure:
         edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
         return (
             f"in {self.unexcited} it was not excited (the force had no edge of {edge_codes:g} codes, or none for"
-            f" {idle_n} samples)"
+            f" {number_of(idle_n, 'sample')})"
         )
 
 

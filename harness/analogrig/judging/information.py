@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State
+from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, sampled
 from analogrig.run import CHUNK_SAMPLES, Run
 from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.suspension import PROGRAMS
@@ -155,15 +155,17 @@ def isolation_bounds(run: Run) -> list[int | None]:
     parameter, be it by the factor that looks most like it; None: not before the next change or the end.
     """
     period_s = run.conditions.sample_period_problem_s
-    out = []
-    for change in _changes(run):
+    out: list[int | None] = []
+    for (start, _, _), change in zip(run.segments[1:], _changes(run), strict=True):
+        if start in run.conditions.records or change.before == change.after:
+            out.append(None)  # nothing for the device to tell: it begins afresh with each record
+            continue
         changed = tuple(change.before.changes_to(change.after))
         course = _Motion.after(change, period_s).under(change.force_n[:ISOLATION_HORIZON_N])
         least = np.full(len(course), np.inf)
         for name in PARAMETERS:
             if changed != (name,):
-                rivals = [change.before.scaled(name, factor) for factor in _RIVAL_FACTORS]
-                apart = (_courses(change, rivals, period_s) - course) ** 2 * change.weight[: len(course)]
+                apart = (_courses(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
                 least = np.minimum(least, _least(np.cumsum(apart, axis=1)))
         out.append(first_reaching(least, LN_CERTAIN))
     return out
@@ -209,9 +211,9 @@ def _courses_of(
 
 def _turning(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
     """The plant in each of the sample periods of a ramp, in the middle of the period."""
-    return [
-        SampledPlant.of(before.on_the_way(after, (k + 0.5) / ramp_n), period_s) for k in range(min(ramp_n, samples))
-    ]
+    return SampledPlant.of_each(
+        [before.on_the_way(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
+    )
 
 
 def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
@@ -220,11 +222,11 @@ def first_reaching(information: Sequence[float] | NDArray[np.float64], level: fl
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _courses(change: _Change, plants: Sequence[Plant], period_s: float) -> NDArray[np.float64]:
-    """(p, n) metres, of each of p plants, up to the horizon."""
-    sampled = [SampledPlant.of(plant, period_s) for plant in plants]
-    xx, xv, vx, vv = np.array([each.transition for each in sampled]).T
-    xf, vf = np.array([each.response for each in sampled]).T
+def _courses(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
+    """(f, n) metres, had ``M``, ``B`` or ``K`` alone changed by each of the rival factors; up to the horizon."""
+    plants = np.tile(list(change.before.parameters().values()), (len(_RIVAL_FACTORS), 1))
+    plants[:, PARAMETERS.index(name)] *= _RIVAL_FACTORS
+    (xx, xv, xf), (vx, vv, vf) = sampled(plants, period_s).transpose(1, 2, 0)
     x, v = (np.full(len(plants), value) for value in change.state)
     forces = change.force_n[:ISOLATION_HORIZON_N].tolist()
     out = np.empty((len(plants), len(forces)))

@@ -28,6 +28,7 @@ from analogrig.plant import PARAMETERS, physical_parameters
 from analogrig.protocol.catalogue import Change, SteppedFlag
 from analogrig.run import LOST, Run, Segment
 from analogrig.scenario import MISSING, Expectations
+from analogrig.wording import number_of
 
 LARGEST_LEVEL = 700.0
 """exp() of more does not fit a float."""
@@ -298,7 +299,7 @@ def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outc
     counts = sorted(len(each.false_alarms) for each in judged)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
-            f"{counts[0]} or {counts[-1]} false alarms, depending on when the changes came;"
+            f"{counts[0]} or {number_of(counts[-1], 'false alarm')}, depending on when the changes came;"
             f" at most {expect.false_alarms} expected"
         )
     doubts = undecided if any(each.failures for each in judged) else []  # which then are some
@@ -399,7 +400,7 @@ def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:
 def _invalidities(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
-        reasons.append(f"the run ended after {run.samples} of {run.conditions.samples_asked} samples")
+        reasons.append(f"the run ended after {run.samples} of {number_of(run.conditions.samples_asked, 'sample')}")
     reasons += _losses(run)
     refused, missing = run.conditions.counters.get("refused", 0), int(run.missing.sum())
     return reasons + no_evidence(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
@@ -413,7 +414,7 @@ def no_evidence(
     :param refused: so many it refused.
     :param missing: so many were missing; ``words`` say of what kind these are.
     """
-    refusals = [f"the device refused {refused} samples"] if refused else []
+    refusals = [f"the device refused {number_of(refused, 'sample')}"] if refused else []
     unarmed = [shown.no_evidence] if shown.no_evidence else []
     return [*refusals, *expect.gaps(shown.samples, missing, words), *unarmed]
 
@@ -422,16 +423,16 @@ def _losses(run: Run) -> list[str]:
     """Samples that never came to the device: more than its description allows, or not those that the harness knows."""
     most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
     where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
-    reasons = [f"{lost} samples were {where}, more than {most}"] if lost > most else []
+    reasons = [f"{number_of(lost, 'sample was', 'samples were')} {where}, more than {most}"] if lost > most else []
     after_n = int(np.argmin(run.lost[::-1])) if lost < run.samples else run.samples
     known = lost - after_n  # of those after the last one heard it cannot know
     missed = run.conditions.counters.get("samples_lost", known)
     if missed != known:
-        reasons.append(f"the device never saw {missed} samples, where {known} are known to be lost")
+        reasons.append(f"the device never saw {number_of(missed, 'sample')}, where {known} are known to be lost")
     heard_of = int(((run.flags & (LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)) == 0).sum())
     taken_in = run.conditions.counters.get("updated", heard_of)
     if taken_in != heard_of:
-        reasons.append(f"the device took in {taken_in} samples, where {heard_of} were heard of")
+        reasons.append(f"the device took in {number_of(taken_in, 'sample')}, where {heard_of} were heard of")
     return reasons
 
 
@@ -441,15 +442,16 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
     missed = [tweak for tweak in judged if tweak.missed]
     if len(missed) > expect.missed:
         names = "; ".join(f"{tweak.what} at {tweak.sample}" for tweak in missed)
-        reasons.append(f"missed {len(missed)} of {len(judged)} changes ({names}), at most {expect.missed} expected")
+        of = number_of(len(judged), "change")
+        reasons.append(f"missed {len(missed)} of {of} ({names}), at most {expect.missed} expected")
     reasons += [
-        f"{tweak.what} at {tweak.sample} was noticed after {tweak.latency_n} samples,"
+        f"{tweak.what} at {tweak.sample} was noticed after {number_of(tweak.latency_n or 0, 'sample')},"
         f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
         for tweak in judged
         if tweak.late
     ]
     if len(false_alarms) > expect.false_alarms:
-        reasons.append(f"{len(false_alarms)} false alarms, at most {expect.false_alarms} expected")
+        reasons.append(f"{number_of(len(false_alarms), 'false alarm')}, at most {expect.false_alarms} expected")
     return reasons
 
 

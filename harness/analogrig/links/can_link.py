@@ -16,6 +16,7 @@ from analogrig.links.can_bus import CanBus
 from analogrig.links.link import CanListener
 from analogrig.links.python_can import can
 from analogrig.protocol.catalogue import LAYOUTS, Message, pack, unpack_any
+from analogrig.wording import number_of
 
 _OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
 _DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}
@@ -69,7 +70,7 @@ class CanLink:
         if errors := self._counted["error_frames"]:
             said.append(f"{errors} error frames (the last: {self._last_error})")
         if foreign := self._counted["frames_foreign"]:
-            said.append(f"{foreign} frames of others")
+            said.append(number_of(foreign, "frame of others", "frames of others"))
         return ", ".join(said)
 
     def listen(self, listener: CanListener) -> bool:

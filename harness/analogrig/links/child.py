@@ -47,7 +47,8 @@ class Child:
                 process_group=0,  # Ctrl-C is for the harness, which then ends the device
             )
         except OSError as error:
-            raise LinkError(f"cannot start {TETHER}: {error.strerror}; run `make setup`") from error
+            cure = "; run `make setup`" if isinstance(error, FileNotFoundError) else ""
+            raise LinkError(f"cannot start {TETHER}: {error.strerror}{cure}") from error
 
     @property
     def tether_pid(self) -> int:

@@ -12,6 +12,7 @@ from typing import TypeVar
 from analogrig.errors import DeviceError, LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.link import Link
 from analogrig.protocol.catalogue import SEQS, Configured, Controlled, Firmware, Hello, Message, Status, brief, pack
+from analogrig.wording import number_of
 
 LATEST = 32
 """A message is one that comes again, and not one after a loss, if its number is at most so far behind."""
@@ -94,7 +95,8 @@ class Conversation:
                 lost = (message.seq - self._expected) % SEQS
                 damaged = self.link.counters["frames_dropped"] - self._damaged_before_n
                 raise LinkError(
-                    f"device {self.name}: {lost} messages were lost between {self.last} and {brief(message)}, or"
+                    f"device {self.name}: {number_of(lost, 'message was', 'messages were')} lost"
+                    f" between {self.last} and {brief(message)}, or"
                     f" somebody else speaks as the device ({damaged} frames were damaged in this run)"
                 )
             before = self._heard.get(message.seq)

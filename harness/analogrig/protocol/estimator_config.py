@@ -181,6 +181,12 @@ class EstimatorConfig:
         yield Key.EDGE_INSTANTS, float(_EDGE_INSTANTS.index(self.edge_instants))
         yield Key.RESET, float(_RESETS.index(self.reset))
 
+    def check_ranges(self) -> None:
+        """:raises ValueError: no device can have these settings."""
+        for key, value in self.settings():
+            if not _is_possible(key, value):
+                raise ValueError(f"estimator: {key.name.lower()} = {value:g} is no setting of an estimator")
+
     @classmethod
     def from_settings(cls, settings: Mapping[int, float], where: str, most_parameters: int = MAX_PARAMETERS) -> Self:
         """What a device says that it has, by its keys; what it has not said is as by default.
@@ -190,11 +196,8 @@ class EstimatorConfig:
         """
         said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
         for key, value in said.items():
-            name = key.name.lower()
-            low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
-            is_whole = name not in _IN_RANGE or name in _NOT_WHOLE or value.is_integer()
-            if not low <= value <= high or not is_whole:
-                raise ConfigurationError(f"{where}: {name} = {value:g} is no setting of an estimator")
+            if not _is_possible(key, value):
+                raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
         table: dict[str, Any] = {}
         kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
         for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
@@ -222,6 +225,13 @@ class EstimatorConfig:
         """In plain values, from which the same can be made; the ceiling instead of arl0."""
         table = dataclasses.asdict(self) | {"c": list(self.c), "ceiling": self.statistic_ceiling, "arl0": None}
         return {key: value for key, value in table.items() if value is not None}
+
+
+def _is_possible(key: Key, value: float) -> bool:
+    name = key.name.lower()
+    low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
+    is_whole = name not in _IN_RANGE or name in _NOT_WHOLE or value.is_integer()
+    return low <= value <= high and is_whole
 
 
 def _shortest(value: float) -> float:

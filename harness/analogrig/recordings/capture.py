@@ -18,6 +18,7 @@ from analogrig.recordings.frames import CapturedFrames
 from analogrig.recordings.talk import CapturedRun, CapturedTalk
 from analogrig.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from analogrig.scenario import Scenario
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
@@ -53,7 +54,8 @@ def captured_run(
     said = _chosen(talk, frames, number)
     if said.extent > scenario.samples:
         raise ConfigurationError(
-            f"{path}: has {said.extent} samples, scenario {scenario.name} {scenario.samples}: is it another one?"
+            f"{path}: has {number_of(said.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
+            " is it another one?"
         )
     return _run(path, said, scenario, rig, most_lost_n=most_lost_n, line=_line(talk, frames), end=frames.end)
 
@@ -65,7 +67,7 @@ def retold(run: Run, scenario: Scenario) -> Run:
     """
     if run.samples > scenario.samples:
         raise ConfigurationError(
-            f"the recording has {run.samples} samples, scenario {scenario.name} {scenario.samples}"
+            f"the recording has {number_of(run.samples, 'sample')}, scenario {scenario.name} {scenario.samples}"
         )
     conditions = dataclasses.replace(
         run.conditions,
@@ -99,9 +101,11 @@ def _why(talk: CapturedTalk, frames: CapturedFrames) -> str:
         return f": {frames.end}"
     if frames.damaged:
         first = ", ".join(map(str, frames.damaged[:_MOST_NAMED]))
-        return f": {len(frames.damaged)} lines are no frames (at {first}); candump -L writes what can be read"
+        lines = number_of(len(frames.damaged), "line is no frame", "lines are no frames")
+        return f": {lines} (at {first}); candump -L writes what can be read"
     foreign = talk.line["frames_foreign"]
-    return f": {foreign} frames have other identifiers; --dbc says which are ours" if foreign else ""
+    others = number_of(foreign, "frame has another identifier", "frames have other identifiers")
+    return f": {others}; --dbc says which are ours" if foreign else ""
 
 
 def _run(
@@ -157,7 +161,7 @@ def _gaps(path: Path, said: CapturedRun) -> Iterator[str]:
     """What the device did by its counters and the capture does not hold."""
     alarms = said.counters.get("alarms", len(said.alarms))
     if alarms != len(said.alarms):
-        yield f"the device raised {alarms} alarms, {path} holds {len(said.alarms)}"
+        yield f"the device raised {number_of(alarms, 'alarm')}, {path} holds {len(said.alarms)}"
     lacking = [name for name in _COUNTERS if name not in said.counters]
     if lacking:
         yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from analogrig.errors import ConfigurationError
 from analogrig.protocol import catalogue
 from analogrig.protocol.catalogue import LAYOUTS, Message, pack, unpack
+from analogrig.recordings.frames import silenced
 
 if TYPE_CHECKING:
     import can
@@ -49,7 +50,8 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     import cantools
 
     try:
-        database: Any = cantools.database.load_file(str(dbc), database_format="dbc")
+        with silenced("cantools"):
+            database: Any = cantools.database.load_file(str(dbc), database_format="dbc")
     except OSError as error:
         raise ConfigurationError(f"--dbc {dbc}: {error.strerror or error}") from error
     except Exception as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
+import logging
 import sys
 import typing
 from collections.abc import Iterator, Mapping
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from analogrig.errors import RecordingError
 from analogrig.recordings.log import WRITTEN
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     import can
@@ -89,16 +91,30 @@ class CapturedFrames:
         # Opened here, since readers that fail leave the file open.
         with self.path.open("rb") as raw:
             file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
-            with _asammdf_silenced():
+            with silenced("asammdf"), silenced("can"), _asammdf_silenced():
                 try:
                     for frame in readers[suffix](file):
                         yield frame
                         n += 1
                 except Exception as error:  # noqa: BLE001 - as above
                     said = " ".join(str(error).split()) or type(error).__name__
-                    self.end = f"{self.path} is damaged after {n} frames: {said}"
+                    self.end = f"{self.path} is damaged after {number_of(n, 'frame')}: {said}"
                 if self.end:
                     gc.collect()
+
+
+@contextlib.contextmanager
+def silenced(library: str) -> Iterator[None]:
+    """Keep what a library logs of a file off standard error: the error that it raises is reported in one line."""
+    logger = logging.getLogger(library)
+    before = logger.level, logger.disabled
+    logger.setLevel(logging.CRITICAL + 1)  # of those below it as well
+    logger.disabled = True  # whatever level the library, loaded only now, gives it
+    try:
+        yield
+    finally:
+        logger.disabled = before[1]
+        logger.setLevel(before[0])
 
 
 @contextlib.contextmanager

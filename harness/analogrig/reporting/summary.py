@@ -9,6 +9,7 @@ from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVe
 from analogrig.links.bus_load import BusLoad, load_of
 from analogrig.plant import UNITS
 from analogrig.run import Run
+from analogrig.wording import number_named, number_of
 
 SHOWN_ALARMS = 10
 
@@ -31,12 +32,12 @@ def summary(run: Run, verdict: Verdict) -> str:
             "  sample  named    right  extent   error  said after  bound  onset off by  (samples)",
             *diagnoses,
         ]
-    lines += ["", f"  false alarms: {_false_alarms(verdict)} in {run.samples} samples"]
+    lines += ["", f"  false alarms: {_false_alarms(verdict)} in {number_of(run.samples, 'sample')}"]
     if verdict.doubtful_alarms:
         at = ", ".join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))
         lines += [f"  false or not, depending on when the changes came: alarms at {at}"]
     if verdict.missing_n:
-        lines += [f"  {missing_text(run)}: {verdict.missing_n} samples"]
+        lines += [f"  {missing_text(run)}: {number_of(verdict.missing_n, 'sample')}"]
     if verdict.overloads:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
     if seen := line_text(conditions.link_counters):
@@ -51,8 +52,8 @@ def summary(run: Run, verdict: Verdict) -> str:
 
 
 def line_text(link_counters: Mapping[str, int]) -> str:
-    """What was on the line besides the device's messages: ``12 frames foreign, 1 error frames``."""
-    return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in link_counters.items() if n)
+    """What was on the line besides the device's messages: ``12 frames foreign, 1 error frame``."""
+    return ", ".join(number_named(n, name) for name, n in link_counters.items() if n)
 
 
 def lamps_text(overloads: Mapping[str, int]) -> str:

@@ -13,6 +13,7 @@ from analogrig.plant import PARAMETERS, UNITS
 from analogrig.reporting.payload import is_thinned, marked_alarms
 from analogrig.reporting.summary import lamps_text, latency_text, load_text
 from analogrig.run import Run
+from analogrig.wording import number_of
 
 _MAX_FALSE_ALARMS = 20
 """Rows of their table; the plots mark more."""
@@ -105,10 +106,10 @@ def false_alarms(run: Run, verdict: Verdict) -> str:
         at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
         return f"<p>None for certain; depending on when the changes came the alarms at {at} are such.</p>"
     if not count:
-        return f"<p>None in {run.samples:,} samples.</p>"
+        return f"<p>None in {number_of(run.samples, 'sample', form=',')}.</p>"
     statistics = dict(zip(run.alarm_index.tolist(), run.alarm_statistic.tolist(), strict=True))
     shown = verdict.false_alarms[:_MAX_FALSE_ALARMS]
-    caption = f"{count:,} in {run.samples:,} samples" + (
+    caption = f"{count:,} in {number_of(run.samples, 'sample', form=',')}" + (
         f"; the first {len(shown)} are listed" if count > len(shown) else ""
     )
     rows = (_row([_zoom(index), _number(statistics.get(index))]) for index in shown)
@@ -179,8 +180,7 @@ def _tally(run: Run, verdict: Verdict) -> str:
 
 
 def _plural(count: int, noun: str) -> str:
-    number = f"{count:,}" if count else "no"
-    return f"{number} {noun}{'' if count == 1 else 's'}"
+    return number_of(count, noun, form=",") if count else f"no {noun}s"
 
 
 def _samples(run: Run, verdict: Verdict) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import enum
 import functools
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Self
@@ -13,6 +14,7 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Plant
 from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
@@ -177,6 +179,7 @@ class CardDescription:
         for fault in self.faults:
             if fault not in known:
                 raise ValueError(f"faults: unknown key {fault!r} (known: {', '.join(sorted(known))})")
+        self._faults()
         if set(self.range_v) != set(CHANNELS):
             raise ValueError(f"range_v must give the channels {', '.join(CHANNELS)}, not {', '.join(self.range_v)}")
         for name, (low, high) in self.range_v.items():
@@ -192,6 +195,14 @@ class CardDescription:
             if not 0.0 <= noise_lsb <= MOST_NOISE_LSB:
                 raise ValueError(f"noise_lsb must be 0 to {MOST_NOISE_LSB:g}, not {noise_lsb:g}")
 
+    def _faults(self) -> dict[str, Any]:
+        """``faults`` in the types of the card's fields.
+
+        :raises ConfigurationError: one is of another type.
+        """
+        hints = typing.get_type_hints(Card)
+        return {name: config.converted(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
+
     def _noises_lsb(self) -> tuple[float, ...] | None:
         """Of each channel, if given."""
         if isinstance(self.noise_lsb, Mapping):
@@ -199,9 +210,7 @@ class CardDescription:
         return None if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS)
 
     def card(self) -> Card:
-        """:raises SamplerError: a value is out of range.
-        :raises ConfigurationError: a fault is of the wrong type.
-        """
+        """:raises SamplerError: a value is out of range."""
         model = CARDS[self.model]
         noises_lsb = self._noises_lsb()
         fields: dict[str, Any] = {
@@ -210,11 +219,7 @@ class CardDescription:
             "ranges_v": tuple(self.range_v[channel] for channel in CHANNELS),
             "noise_lsb": model.noise_lsb if noises_lsb is None else noises_lsb,
         }
-        fields |= {name: tuple(value) if isinstance(value, list) else value for name, value in self.faults.items()}
-        try:
-            return dataclasses.replace(model, **fields)
-        except TypeError as error:
-            raise ConfigurationError(f"card: faults: {error}") from error
+        return dataclasses.replace(model, **(fields | self._faults()))
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from analogrig.reporting.summary import latency_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.testing.statement import Finding, make_known, said
+from analogrig.wording import number_of
 
 Arguments = ParamSpec("Arguments")
 
@@ -106,7 +107,8 @@ class Played:
         if doubtful and not alarms:
             return Finding(holds=False, why=f"INCONCLUSIVE: the alarm at {doubtful[0]} is false, or not: {_UNKNOWN}")
         where = ", ".join(map(str, alarms[:5])) + (", ..." if len(alarms) > 5 else "")
-        return Finding(not alarms, f"{len(alarms)} false alarms in {self.run.samples} samples: {where}".rstrip(": "))
+        of = number_of(self.run.samples, "sample")
+        return Finding(not alarms, f"{number_of(len(alarms), 'false alarm')} in {of}: {where}".rstrip(": "))
 
     @_of_a_valid_play
     def isolates(self) -> Finding:
@@ -183,7 +185,8 @@ def _too_late(tweak: TweakVerdict, within: float | None) -> str:
     else:
         limit = round(within * (tweak.bound_n or 0)) + 1
         late = tweak.latency_n > limit
-    return f"{tweak.what} at {tweak.sample}: {tweak.latency_n} samples, allowed {limit}" if late else ""
+    latency = number_of(tweak.latency_n or 0, "sample")
+    return f"{tweak.what} at {tweak.sample}: {latency}, allowed {limit}" if late else ""
 
 
 def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> Finding:
@@ -205,14 +208,16 @@ def rate_below(rate: float, played: Iterable[Played], *, confidence: float) -> F
 def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Finding:
     invalid = [each.verdict.reasons[0] for each in plays if not each.verdict.valid]
     if invalid:
-        return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {len(plays)} plays, such as: {invalid[0]}")
+        of = number_of(len(plays), "play")
+        return Finding(holds=False, why=f"INCONCLUSIVE: {len(invalid)} of {of}, such as: {invalid[0]}")
     events = sum(len(each.verdict.false_alarms) for each in plays)
     samples = sum(exposure(each.run).armed for each in plays)
     if not samples:
         why = exposure(plays[0].run).no_evidence if plays else "there is none"
-        return Finding(holds=False, why=f"no alarm could be raised in any of {len(plays)} plays: {why}")
+        return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
     bound = upper_rate(events, samples, confidence)
-    why = f"{events} false alarms in {samples} samples: below {bound:.3g} a sample with {confidence:.4%} confidence"
+    why = f"{number_of(events, 'false alarm')} in {number_of(samples, 'sample')}"
+    why += f": below {bound:.3g} a sample with {confidence:.4%} confidence"
     if bound > rate:
         needed = Design(rate=rate, confidence=confidence, allowed=events).trials
         why += f", allowed {rate:g}: with so many alarms that takes {needed} samples"

@@ -1,0 +1,84 @@
+"""Tables in the header of a recording: what is computed from them later is checked when the file is read.
+
+``Conditions`` keeps the tables of scenario, rig and device as they were written, for people. A verdict reads a few of
+their keys, and a hostile or damaged file may hold anything there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from analogrig import config
+from analogrig.protocol.estimator_config import MAX_PARAMETERS, EstimatorConfig
+from analogrig.scenario import Expectations
+from analogrig_emulator.excitation import Excitation
+
+_MOST = 2**31
+
+
+@dataclass(frozen=True)
+class _Rig:
+    name: str
+
+
+@dataclass(frozen=True)
+class _Scenario:
+    name: str
+    description: str = ""
+    expect: Expectations = field(default_factory=Expectations)
+    excitation: Excitation | None = None
+
+
+@dataclass(frozen=True)
+class _Device:
+    name: str
+    estimator: EstimatorConfig
+    kind: str = ""
+    report_interval_n: int = 1
+    most_lost_n: int = 0
+    assumed_n: int = 0
+    identity: Mapping[str, int | str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, least in (("report_interval_n", 1), ("most_lost_n", 0), ("assumed_n", 0)):
+            if not least <= getattr(self, name) <= _MOST:
+                raise ValueError(f"{name} must be {least} to {_MOST}, not {getattr(self, name)}")
+        self.estimator.check_ranges()
+        if self.estimator.parameters > MAX_PARAMETERS:
+            raise ValueError(f"estimator: {self.estimator.parameters} parameters, of at most {MAX_PARAMETERS}")
+
+
+@dataclass(frozen=True)
+class _Line:
+    """``Conditions.line``."""
+
+    bitrate: int = 1
+    data_bitrate: int = 1
+    baud: int = 1
+    samples_per_message: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 1 <= value <= _MOST:
+                raise ValueError(f"{name} must be 1 to {_MOST}, not {value}")
+
+
+def check_tables(
+    where: str, *, scenario: Mapping[str, Any], rig: Mapping[str, Any], dut: Mapping[str, Any], line: Mapping[str, int]
+) -> EstimatorConfig:
+    """The settings of the recorded estimator, if the tables hold what a verdict needs; ``where`` leads every error.
+
+    :raises ConfigurationError: a key that is read later is lacking or wrong.
+    """
+    _known(_Scenario, scenario, f"{where}: scenario")
+    _known(_Rig, rig, f"{where}: rig")
+    _known(_Line, line, f"{where}: line")
+    estimator: EstimatorConfig = _known(_Device, dut, f"{where}: dut").estimator
+    return estimator
+
+
+def _known(cls: type[Any], table: Mapping[str, Any], where: str) -> Any:
+    """The keys that ``cls`` has; others are only shown."""
+    return config.build(cls, {key: value for key, value in table.items() if key in cls.__dataclass_fields__}, where)

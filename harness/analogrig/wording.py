@@ -1,0 +1,48 @@
+"""Texts for people: foreign text made printable, and counted nouns."""
+
+from __future__ import annotations
+
+MOST_MESSAGE = 1_000
+"""Characters of a message: paths and values from files are of any length."""
+
+
+def one_line(text: str) -> str:
+    """A text in one printable line of bounded length; of a longer one the middle is left out.
+
+    Messages quote files, devices and instruments. Their control characters would drive the user's terminal.
+    """
+    return _shortened(printable(" ".join(_shortened(text).split())))
+
+
+def _shortened(text: str) -> str:
+    end = MOST_MESSAGE // 3
+    return text if len(text) <= MOST_MESSAGE else f"{text[: MOST_MESSAGE - end - 5]} ... {text[-end:]}"
+
+
+def printable(text: str) -> str:
+    """The text with control characters, line ends excepted, as escape sequences of Python."""
+    if text.isascii() and text.replace("\n", "").isprintable():
+        return text
+    return "".join(char if char.isprintable() or char == "\n" else _escaped(char) for char in text)
+
+
+def _escaped(char: str) -> str:
+    return char.encode("unicode_escape").decode("ascii")
+
+
+def number_of(n: int, one: str, several: str = "", *, form: str = "") -> str:
+    """A count with its noun: ``1 false alarm``, ``2 false alarms``.
+
+    :param several: the plural, where it is not ``one`` and an s.
+    :param form: format of the number, such as ``,``.
+    """
+    return f"{n:{form}} {one if n == 1 else several or f'{one}s'}"
+
+
+def number_named(n: int, name: str) -> str:
+    """A counter with its value: ``12 frames foreign``, ``1 error frame`` of frames_foreign and error_frames."""
+    words = name.split("_")
+    if n == 1:
+        noun = next((i for i, word in enumerate(words) if word.endswith("s") and not word.endswith("ss")), None)
+        words = [word[:-1] if i == noun else word for i, word in enumerate(words)]
+    return f"{n} {' '.join(words)}"

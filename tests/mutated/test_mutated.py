@@ -1,0 +1,20 @@
+"""A sample of the soak that ``make hostile`` is."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_mutated_files_end_in_one_line_in_time_and_in_little_memory() -> None:
+    """In a process of its own, which forks and so must have no threads."""
+    counts = {"--recordings": "110", "--files": "90", "--logs": "50", "--keys": "60"}
+    command = [sys.executable, "-m", "tests.mutated", *(word for pair in counts.items() for word in pair)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    assert ran.returncode == 0, ran.stdout[-5000:] + ran.stderr[-2000:]
+    assert "\nall " in ran.stdout
