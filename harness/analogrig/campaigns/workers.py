@@ -19,6 +19,7 @@ from multiprocessing import connection, forkserver, resource_tracker
 from typing import Any, Protocol, TypeVar
 
 from analogrig.errors import ConfigurationError, WorkerError
+from analogrig.signals import ENDING, leave_to_parent
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -43,9 +44,10 @@ def prepare() -> None:
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_LOADED))
-    resource_tracker.ensure_running()  # it would unblock it
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the interrupt key is for this process alone
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # they are for this process alone
     try:
+        resource_tracker.ensure_running()  # which leaves SIGHUP blocked, and unblocks the others here
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -171,8 +173,8 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """In a worker: the interrupt key is for the parent alone, and without a parent there is nothing to do."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In a worker: signals are for the parent, and without a parent there is nothing to do."""
+    leave_to_parent()
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -187,7 +189,7 @@ def _end(pool: ProcessPoolExecutor) -> None:
     """At once, whatever it is doing."""
     for process in list((getattr(pool, "_processes", None) or {}).values()):
         with contextlib.suppress(OSError, ValueError):
-            process.terminate()
+            process.kill()
     pool.shutdown(wait=True, cancel_futures=True)
 
 
