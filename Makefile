@@ -46,7 +46,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -88,6 +88,9 @@ format: $(PRODUCTS) ## lay out the Python sources, and the C with clang-format
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+kills: $(PRODUCTS) ## end commands by signals at random instants, 40 of each command by each signal; ARGS="5 7" takes 5 with the seed 7
+	@$(BIN)/python -m tests.harness.kills $(ARGS)
 
 can-guest: $(PRODUCTS) $(BUILD)/can_guest/linux ## CAN on real SocketCAN, in a Linux that QEMU emulates; ARGS="-k fd" goes to its pytest
 	@$(BIN)/python -m tests.can_guest $(ARGS)

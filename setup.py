@@ -23,12 +23,14 @@ from typing import ClassVar
 from setuptools import Command, Distribution, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build import build
+from setuptools.command.sdist import sdist
 
 CATALOGUE = Path("harness/analogrig/_catalogue.py")
 ENGINE = Path("emulator/analogrig_emulator/_engine.so")
 DEVICE = Path("harness/analogrig/_device.so")
 HOST = Path("harness/analogrig/bin/analogrig-device")
 TETHER = Path("harness/analogrig/bin/analogrig-tether")
+STAMP = Path("harness/analogrig/_commit.txt")
 UPLOT = {
     Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
@@ -114,6 +116,7 @@ class BuildProducts(Command):
             for copied, path in self._shipped(generated).items():
                 copied.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, copied)
+            (Path(self.build_lib) / in_wheel(STAMP)).write_text(f"{commit()}\n", encoding="ascii")
 
     def _shipped(self, generated: Path) -> dict[Path, Path]:
         """Files of the wheel that are copies, and their originals."""
@@ -139,6 +142,24 @@ class BuildProducts(Command):
 def in_wheel(product: Path) -> Path:
     """Path below site-packages: the folders ``harness`` and ``emulator`` hold packages and are none themselves."""
     return Path(*product.parts[1:])
+
+
+def commit() -> str:
+    """Commit that a wheel will name as its origin: of this checkout, or the one that made this sdist; empty if unknown.
+
+    A checkout itself holds no stamp, which would be wrong after the next commit.
+    """
+    if not Path(".git").exists():
+        return STAMP.read_text(encoding="ascii").strip() if STAMP.is_file() else ""
+    described = []
+    for words in (("rev-parse", "--short=12", "HEAD"), ("status", "--porcelain", "--untracked-files=no")):
+        try:
+            done = subprocess.run(["git", *words], capture_output=True, text=True, check=False)
+        except OSError:
+            return ""
+        described.append(done.stdout.strip() if done.returncode == 0 else "")
+    head, changes = described
+    return f"{head}+dirty" if head and changes else head
 
 
 def sources(patterns: Iterable[str]) -> tuple[Path, ...]:
@@ -197,6 +218,15 @@ class CleanBuild(build):
         super().run()
 
 
+class StampedSdist(sdist):
+    """A source distribution that names its commit, for the wheels that are built from it."""
+
+    def make_release_tree(self, base_dir: str, files: list[str]) -> None:
+        """Part of the protocol of setuptools."""
+        super().make_release_tree(base_dir, files)
+        (Path(base_dir) / STAMP).write_text(f"{commit()}\n", encoding="ascii")
+
+
 class PlatformWheel(bdist_wheel):
     """A wheel for one platform and every Python 3: its C does not know Python."""
 
@@ -215,5 +245,10 @@ class PlatformDistribution(Distribution):
 
 setup(
     distclass=PlatformDistribution,
-    cmdclass={"bdist_wheel": PlatformWheel, "build": CleanBuild, "build_products": BuildProducts},
+    cmdclass={
+        "bdist_wheel": PlatformWheel,
+        "build": CleanBuild,
+        "build_products": BuildProducts,
+        "sdist": StampedSdist,
+    },
 )

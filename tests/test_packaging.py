@@ -38,6 +38,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig_emulator/_engine.so",
         "analogrig_emulator/py.typed",
         "analogrig/_catalogue.py",
+        "analogrig/_commit.txt",
         "analogrig/_device.so",
         "analogrig/bin/analogrig-device",
         "analogrig/bin/analogrig-tether",

@@ -105,6 +105,16 @@ def _since(first: int, reply: Replies) -> Replies:
     )
 
 
+def uninterrupted(run: Run) -> Run:
+    """Return the run, for a caller to whom a part of it is of no use.
+
+    :raises KeyboardInterrupt: the user interrupted it.
+    """
+    if INTERRUPTED_BY_USER in run.conditions.faults:
+        raise KeyboardInterrupt
+    return run
+
+
 @contextlib.contextmanager
 def _undisturbed(pace: Pace | None) -> Iterator[None]:
     """In real time the collector of garbage waits: among as many answers it takes longer than a message lasts."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.identity import Identity
 from analogrig.plant import Plant
 from analogrig.protocol.catalogue import Change
 from analogrig.storage import replacing
@@ -193,6 +194,8 @@ class Conditions:
     """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
     line: Mapping[str, int] = field(default_factory=dict)
     """How the samples went (``Dut.line``); empty if that is not recorded."""
+    identity: Identity | None = None
+    """Provenance; None in older recordings, and where a program plays that keeps none."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -282,6 +285,10 @@ class Run:
                 supposed = dataclasses.replace(supposed, start=min(max(supposed.start, first + 1), end - 1))
             segments.append(supposed)
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, segments=tuple(segments)))
+
+    def made_by(self, identity: Identity) -> Run:
+        """Return the same run with this provenance."""
+        return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, identity=identity))
 
     def theta_hash(self) -> str:
         """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
@@ -436,6 +443,8 @@ def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
 
 def _to_json(conditions: Conditions) -> dict[str, Any]:
     out = dict(vars(conditions))
+    if (identity := out.pop("identity")) is not None:
+        out["identity"] = identity.as_table()
     out["channels"] = {name: vars(channel) for name, channel in conditions.channels.items()}
     out["segments"] = [
         {**{key: value for key, value in vars(s).items() if value is not None}, "plant": vars(s.plant)}

@@ -38,6 +38,9 @@ from analogrig_thesis.tracking import Track, marks, performance, track
 
 PRINTED_5_4 = Arx(-1.5628, 0.0766, 0.1817e-5, 0.0766e-5)
 
+RECORDED = ("fig-5.4", "fig-5.5", "fig-5.7-quantised", "fig-5.7")
+"""Names of the recordings."""
+
 FIRST_N = 1000
 """Section 5.4: "The first 1000 samples of this data were used"."""
 
@@ -59,12 +62,8 @@ class Circuit:
     @property
     def recordings(self) -> dict[str, Run]:
         """By the names of their files."""
-        return {
-            "fig-5.4": self.comparison,
-            "fig-5.5": self.identification,
-            "fig-5.7-quantised": self.quantised.run,
-            "fig-5.7": self.noisy.run,
-        }
+        runs = (self.comparison, self.identification, self.quantised.run, self.noisy.run)
+        return dict(zip(RECORDED, runs, strict=True))
 
 
 def play_circuit() -> Circuit:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from analogrig.bench import Bench
+from analogrig.bench import Bench, uninterrupted
 from analogrig.devices.devices import HostDevice
 from analogrig.plant import Plant, physical_parameters
 from analogrig.protocol.dut import connect
@@ -102,7 +102,7 @@ def play(rig_name: str, scenario: Scenario, config: EstimatorConfig, seed: int =
     """
     device = HostDevice(name="host", exchange="block", estimator=config, timeout_s=PATIENCE_S)
     with open_rig(rig_name) as rig, connect(device) as dut:
-        return Bench(rig, dut).play(scenario, seed)
+        return uninterrupted(Bench(rig, dut).play(scenario, seed))
 
 
 def record(rig_name: str, scenario: Scenario, seed: int = SEED) -> Recording:

@@ -22,6 +22,9 @@ FORMAT, VERSION = "analogrig-thesis", 1
 
 PAGE, CLAIMS, RECORDINGS = "thesis.html", "claims.json", "recordings"
 
+FILES = (CLAIMS, *(f"{RECORDINGS}/{name}.npz" for name in (*chapter5.RECORDED, "simulated")))
+"""What is written beside the page."""
+
 DIGITS = 6
 """Significant ones of every figure in claims.json: the rest is rounding."""
 

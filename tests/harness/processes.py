@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import time
 from pathlib import Path
 
 LONG_S = 600.0
@@ -29,3 +30,28 @@ def ends(pid: int, within_s: float = LONG_S) -> bool:
         return bool(select.select([fd], [], [], within_s)[0])
     finally:
         os.close(fd)
+
+
+def marked(mark: str) -> list[int]:
+    """The processes that have it in their environment, as what they start has too."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (process / "environ").read_bytes():
+                found.append(int(process.name))
+        except OSError:  # it has just ended, or is none of ours
+            continue
+    return found
+
+
+def gone(mark: str) -> bool:
+    """True if all of them end in time."""
+    deadline_s = time.monotonic() + LONG_S
+    while marked(mark) and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    return not marked(mark)
+
+
+def with_default_signals(*command: str | Path) -> list[str | Path]:
+    """The command, started with no signal ignored, as ``nohup`` would have it: children inherit that."""
+    return ["env", "--default-signal=INT,TERM,HUP", *command]

@@ -603,7 +603,7 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     first = capsys.readouterr().out
     (digest,) = [line for line in first.splitlines() if "theta hash" in line]
     assert "bus: 1000000 bit/s: 24.3 times what it carries, in real time; at most 823.05 samples/s" in first
-    assert {path.name for path in out.iterdir()} == {"can.log", "run.npz", "report.html"}
+    assert {path.name for path in out.iterdir()} == {"can.log", "run.npz", "report.html", "verdict.json"}
     log = str(out / "can.log")
     for words in (["judge", log], ["judge", str(out / "run.npz")], ["replay", log, "--dut", "inproc"]):
         assert main([*words, "--scenario", "thesis", "--out", str(tmp_path / "again")]) == 0
@@ -614,20 +614,24 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
     assert "say --dut" in capsys.readouterr().err
 
 
-def test_log_that_is_played_or_of_an_earlier_run_is_not_lost_before_the_run(
+def test_log_that_is_played_stays_and_one_of_an_earlier_run_moves_aside(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = written(tmp_path / "can.log", traffic[1])
+    out, previous = tmp_path / "out", tmp_path / "out.previous"
+    out.mkdir()
+    log = written(out / "can.log", traffic[1])
     before = log.read_bytes()
-    (tmp_path / "can.blf").write_text("of an earlier run")
-    replay = ["replay", str(log), "--scenario", "thesis", "--out", str(tmp_path)]
+    (out / "can.blf").write_text("of an earlier run")
+    replay = ["replay", str(log), "--scenario", "thesis", "--out", str(out)]
     for words in ([*replay, "--dut", "inproc"], [*replay, "--dut", DEVICE, "--can-log", "mf4"]):
         assert main(words) == 2
         assert "would overwrite the CAN log that is played; choose another folder" in capsys.readouterr().err
+        assert log.read_bytes() == before
     unreachable = ["--dut", DEVICE, "--wire-faults", "drop@1.0"]
-    assert main(["run", *unreachable, "--scenario", "thesis", "--out", str(tmp_path)]) == 2
-    assert log.read_bytes() == before
-    assert (tmp_path / "can.blf").read_text() == "of an earlier run"
+    assert main(["run", *unreachable, "--scenario", "thesis", "--out", str(out)]) == 2
+    assert {path.name for path in out.iterdir()} == {"report.html", "verdict.json"}
+    assert (previous / "can.log").read_bytes() == before
+    assert (previous / "can.blf").read_text() == "of an earlier run"
 
 
 @pytest.mark.parametrize("option", ["--most-lost", "--run"])
@@ -643,10 +647,10 @@ def test_serial_run_leaves_no_can_log(tmp_path: Path, capsys: pytest.CaptureFixt
     words = ["run", "--dut", "inproc", "--scenario", "thesis", "--out", str(tmp_path)]
     assert main([*words, "--can-log", "blf"]) == 2
     assert "--can-log blf: device inproc is not on a CAN bus" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "verdict.json"}
     for more in ([], ["--can-log", "none"]):
         assert main([*words, *more]) == 0
-        assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html"}
+        assert {path.name for path in tmp_path.iterdir()} == {"run.npz", "report.html", "verdict.json"}
 
 
 def test_replay_of_a_log_plays_the_samples_that_it_has(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:

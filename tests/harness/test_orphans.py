@@ -17,28 +17,9 @@ from pathlib import Path
 import pytest
 
 from tests.harness.firmware import needs_firmware
-from tests.harness.processes import LONG_S
+from tests.harness.processes import LONG_S, gone, marked
 
 KILLS = 12
-
-
-def marked(mark: str) -> list[int]:
-    """The processes that have it in their environment, as what they start has too."""
-    found = []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if mark.encode() in (process / "environ").read_bytes():
-                found.append(int(process.name))
-        except OSError:  # it has just ended, or is none of ours
-            continue
-    return found
-
-
-def gone(mark: str) -> bool:
-    deadline_s = time.monotonic() + LONG_S
-    while marked(mark) and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    return not marked(mark)
 
 
 @contextmanager

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from analogrig.campaigns.results import COLUMNS, CONFIDENCE, Results, Summary, label
 from analogrig.errors import ConfigurationError
+from analogrig.identity import Identity
 from analogrig.reporting.page import FOLDER, assembled
+from analogrig.reporting.tables import provenance
 from analogrig.storage import replacing
 
 _TEMPLATE = FOLDER / "campaign.html"
@@ -59,16 +61,17 @@ def page_of(out: Path) -> Path:
     return page
 
 
-def write_page(results: Results, path: Path) -> None:
-    """Write the page: either all of it or nothing. The same results give the same bytes.
+def write_page(results: Results, path: Path, played_by: Sequence[Identity] = ()) -> None:
+    """Write the page: either all of it or nothing. The same arguments give the same bytes.
 
+    :param played_by: the commands that have played the campaign.
     :raises RecordingError: the page cannot be written.
     """
     with replacing(path) as file:
-        file.write(render(results).encode("utf-8", "replace"))
+        file.write(render(results, played_by).encode("utf-8", "replace"))
 
 
-def render(results: Results) -> str:
+def render(results: Results, played_by: Sequence[Identity] = ()) -> str:
     """The page as text."""
     spec, total = results.plan.spec, results.total()
     scenario = str(results.plan.scenario["name"])
@@ -86,6 +89,7 @@ def render(results: Results) -> str:
         ),
         maps=_maps(results),
         table=_table(results),
+        provenance=_provenance(played_by),
     )
 
 
@@ -154,6 +158,20 @@ def _table(results: Results) -> str:
     return (
         f'<div class="scroll"><table class="numbers"><caption>{caption}</caption>'
         f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _provenance(played_by: Sequence[Identity]) -> str:
+    if not played_by:
+        return ""
+    rows = "".join(
+        f'<tr><th scope="row">{html.escape(name)}</th><td>{html.escape(value)}</td></tr>'
+        for identity in played_by
+        for name, value in provenance(identity)
+    )
+    return (
+        '<section aria-labelledby="made"><h2 id="made">What made it</h2><table class="pairs">'
+        f"<caption>Every command that has played a part</caption><tbody>{rows}</tbody></table></section>"
     )
 
 

@@ -21,6 +21,7 @@ from multiprocessing import connection, forkserver, resource_tracker
 from typing import Any, Protocol, TypeVar
 
 from analogrig.errors import ConfigurationError, WorkerError
+from analogrig.signals import ENDING, leave_to_parent
 from analogrig.wording import number_of
 
 Task = TypeVar("Task")
@@ -55,9 +56,10 @@ def prepare() -> None:
     _check_descriptors(0)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_LOADED))
-    resource_tracker.ensure_running()  # it would unblock it
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the interrupt key is for this process alone
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)  # they are for this process alone
     try:
+        resource_tracker.ensure_running()  # which leaves SIGHUP blocked, and unblocks the others here
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -203,8 +205,8 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """In a worker: the interrupt key is for the parent alone, and without a parent there is nothing to do."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """In a worker: signals are for the parent, and without a parent there is nothing to do."""
+    leave_to_parent()
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
@@ -219,7 +221,7 @@ def _end(pool: ProcessPoolExecutor) -> None:
     """At once, whatever it is doing."""
     for process in list((getattr(pool, "_processes", None) or {}).values()):
         with contextlib.suppress(OSError, ValueError):
-            process.terminate()
+            process.kill()
     pool.shutdown(wait=True, cancel_futures=True)
 
 

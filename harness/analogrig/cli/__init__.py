@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import errno
 import os
+import shlex
+import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -30,6 +32,8 @@ from analogrig.cli import (
     thesis,
 )
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
+from analogrig.identity import now
+from analogrig.signals import ending
 
 _COMMANDS = (
     run,
@@ -64,16 +68,19 @@ _EXHAUSTED = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Every failure is one line on standard error."""
     open_standard_streams()
-    try:
-        parser = _parser()
-        if completion.VARIABLE in os.environ:
-            completion.complete(parser)
-        arguments = parser.parse_args(argv)
-        return int(arguments.command(arguments))
-    except KeyboardInterrupt:
-        return complain("interrupted", INTERRUPTED)
-    except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
-        return _explain(error)
+    with ending():
+        try:
+            parser = _parser()
+            if completion.VARIABLE in os.environ:
+                completion.complete(parser)
+            arguments = parser.parse_args(argv)
+            arguments.command_line = shlex.join(["analogrig", *(sys.argv[1:] if argv is None else argv)])
+            arguments.started = now()
+            return int(arguments.command(arguments))
+        except KeyboardInterrupt:
+            return complain("interrupted", INTERRUPTED)
+        except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
+            return _explain(error)
 
 
 def _explain(error: Exception) -> int:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
+from analogrig.cli.options import add_command, add_json, add_rig, add_seed, files_read, trust_of
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 
 if TYPE_CHECKING:
     from analogrig.hardware.calibration.fit import Calibration, Estimate
@@ -68,11 +68,13 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError, RigError
     from analogrig.hardware.calibration.check import difference_lsb
     from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate
+    from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
     from analogrig.storage import replacing
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
+    move_aside(arguments.out, files_read(arguments))
     try:
         with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
             recordings = _recorded(rig, arguments)
@@ -88,9 +90,9 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if check_lsb <= MOST_LSB:
         with replacing(arguments.out) as file:
-            file.write(_toml(found, arguments.rig, arguments.program, check_lsb).encode("utf-8"))
+            file.write(_toml(found, arguments, check_lsb).encode("utf-8"))
     if arguments.json:
-        show_json(_as_json(found, check_lsb, arguments))
+        show_result(_as_json(found, check_lsb, arguments), arguments)
     else:
         show(_table(found, check_lsb, arguments))
     return PASSED if check_lsb <= MOST_LSB else FAILED
@@ -166,19 +168,23 @@ def _caveats(found: Calibration) -> list[str]:
     return [f"caveat: {left}: the rig does {why}"]
 
 
-def _toml(found: Calibration, rig: str, program: str, check_lsb: float) -> str:
+def _toml(found: Calibration, arguments: argparse.Namespace, check_lsb: float) -> str:
     """The description, which ``open_rig`` gives back; what it is and how sure, as comments."""
     from dataclasses import asdict, replace
 
     from analogrig.config import to_toml
+    from analogrig.identity import Identity
+    from analogrig.reporting.tables import provenance
 
+    made_by = provenance(Identity.here(arguments.command_line, arguments.started))
     heading = [
-        f"Twin of the rig {rig!r}, program {program}: the emulator as analogrig calibrate fitted it.",
+        f"Twin of the rig {arguments.rig!r}, program {arguments.program}: the emulator as fitted by calibrate.",
         "A value stands for all that acts as it does; the parts that are not named are as in the diagram.",
         *(f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates),
         *_said(found, check_lsb),
+        *(f"{name}: {' '.join(value.split())}" for name, value in made_by),
     ]
-    described = asdict(replace(found.twin, description=f"twin of {rig}"))
+    described = asdict(replace(found.twin, description=f"twin of {arguments.rig}"))
     del described["name"]
     return "".join(f"# {line}\n" for line in heading) + "\n" + to_toml(described)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import CAMPAIGN, FILE, add_allow, add_command, add_json, trust_of
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, show_json, watched
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, show_result, watched
 
 if TYPE_CHECKING:
     from analogrig.campaigns.conduct import Tally
@@ -68,14 +68,18 @@ def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from analogrig.campaigns.conduct import conduct, journal_of, unreachable
     from analogrig.campaigns.plan import Plan, one_worker_only
+    from analogrig.campaigns.provenance import load, provenance_of
     from analogrig.campaigns.report import page_of, write_page
     from analogrig.campaigns.results import as_json, text
     from analogrig.campaigns.spec import CampaignSpec
     from analogrig.errors import WorkerError
+    from analogrig.output import move_aside
 
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
     page = page_of(out)
+    if not out.exists():
+        move_aside(page)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
         with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
@@ -84,17 +88,33 @@ def _run(arguments: argparse.Namespace) -> int:
                 return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)
             for name, why in lacking.items():
                 complain(f"{name} cannot be had, and its trials are INCONCLUSIVE: {why}", INCONCLUSIVE)
+            _note_session(plan, out, arguments)
             results = conduct(plan, crew, out, progress(plan))
     except KeyboardInterrupt:
         return complain(f"interrupted: {kept}", INTERRUPTED)
     except WorkerError as error:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
-    write_page(results, page)
+    played_by = load(provenance_of(out))
+    write_page(results, page, played_by)
     if arguments.json:
-        show_json({**as_json(results), "results": str(out), "page": str(page)})
+        places = {"results": str(out), "page": str(page)}
+        show_result({**as_json(results), "played_by": [each.as_table() for each in played_by], **places}, arguments)
     else:
         show(f"{text(results)}\nresults: {out}\npage:    {page}")
     return STATUS[results.outcome()]
+
+
+def _note_session(plan: Plan, out: Path, arguments: argparse.Namespace) -> None:
+    """Keep the identity of this command beside the results that it will play a part of, if they lack any."""
+    from analogrig.campaigns.conduct import journal_of
+    from analogrig.campaigns.provenance import device_files, load, provenance_of, save
+    from analogrig.identity import Identity
+
+    if out.exists():
+        return
+    earlier = load(provenance_of(out)) if journal_of(out).exists() else ()
+    identity = Identity.here(arguments.command_line, arguments.started, device_files(plan.devices))
+    save(provenance_of(out), (*earlier, identity))
 
 
 @contextlib.contextmanager

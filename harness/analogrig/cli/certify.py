@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
 from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, watched
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, watched
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
     from analogrig.campaigns.certificate import certify, question_of
     from analogrig.campaigns.plan import device_table, one_worker_only, rig_table
+    from analogrig.campaigns.provenance import device_files
     from analogrig.errors import DeviceError, LinkError, RigError, WorkerError
     from analogrig.scenario import Scenario
 
@@ -93,7 +94,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_json(_as_json(question, answer))
+        show_result(_as_json(question, answer), arguments, device_files([question.device]))
     else:
         show(_sentence(question, answer))
     return _STATUS[answer.outcome]

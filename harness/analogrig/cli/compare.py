@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import FILE, add_command, add_json
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, working
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
 
 if TYPE_CHECKING:
     from analogrig.campaigns.comparison import Comparison
@@ -49,7 +49,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with working(f"comparing {arguments.a} and {arguments.b}"):
         found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
     if arguments.json:
-        show_json(asdict(found))
+        show_result(asdict(found), arguments)
     else:
         show(_text(found))
     if not found.differences:

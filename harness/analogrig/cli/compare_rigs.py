@@ -19,7 +19,7 @@ from analogrig.cli.options import (
     count,
     trust_of,
 )
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_json
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
@@ -76,12 +76,13 @@ def _run(arguments: argparse.Namespace) -> int:
         open_rig(arguments.b, allow=trust) as b,
         open_dut(arguments.dut, allow=trust, **changes_of_dut(arguments)) as dut,
     ):
+        devices = dut.files()
         bench_a, bench_b = (Bench(rig, dut, real_time=arguments.real_time) for rig in (a, b))
         found = compare_rigs(bench_a, bench_b, scenario, seeds, arguments.confidence, progress_line("plays"))
     if not isinstance(found, RigComparison):
         return complain(f"INCONCLUSIVE: nothing can be compared: {found[0]}", INCONCLUSIVE)
     if arguments.json:
-        show_json(asdict(found) | {"sentence": found.sentence})
+        show_result(asdict(found) | {"sentence": found.sentence}, arguments, devices)
     else:
         show(_text(found))
     return FAILED if _differ(found, arguments) else PASSED

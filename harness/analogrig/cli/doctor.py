@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_json, working
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
 
 if TYPE_CHECKING:
     from analogrig.hardware.self_test.findings import Check, Findings
@@ -46,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> int:
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_json(_as_json(findings, arguments.seed))
+        show_result(_as_json(findings, arguments.seed), arguments)
     else:
         show(_text(findings))
     if findings.having("wrong"):

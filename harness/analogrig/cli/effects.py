@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import FILE, add_command, add_json
-from analogrig.cli.terminal import PASSED, show, show_json, working
+from analogrig.cli.terminal import PASSED, show, show_result, working
 
 
 def add(commands: Any) -> None:
@@ -31,12 +31,16 @@ def _run(arguments: argparse.Namespace) -> int:
         from analogrig.errors import ConfigurationError
 
         raise ConfigurationError(f"{arguments.out}: the file's name must end with .svg")
+    if arguments.out is not None:
+        from analogrig.output import move_aside
+
+        move_aside(arguments.out)
     with working("playing each fault"):
         table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
     if arguments.out is not None:
         effects.write_picture(table, arguments.out)
     if arguments.json:
-        show_json(effects.as_json(table))
+        show_result(effects.as_json(table), arguments)
     else:
         show(effects.text(table))
     return PASSED

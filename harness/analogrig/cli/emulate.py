@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, opened
-from analogrig.cli.terminal import PASSED, progress_line, show, show_json
+from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, files_read, opened
+from analogrig.cli.terminal import PASSED, progress_line, show, show_result
 
 
 def add(commands: Any) -> None:
@@ -31,13 +31,17 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.output import move_aside
+
+    if arguments.out.suffix in (".csv", ".npz"):
+        move_aside(arguments.out, files_read(arguments))
     from analogrig.reporting.emulate import write_signals
     from analogrig.reporting.summary import lamps_text
 
     with opened(arguments) as (rig, scenario, seed):
         written = write_signals(rig, scenario, seed, arguments.out, progress=progress_line())
     if arguments.json:
-        show_json({"file": str(arguments.out), "seed": seed, **written})
+        show_result({"file": str(arguments.out), "seed": seed, **written}, arguments)
     else:
         show(f"{arguments.out}: {written['samples']} samples, {written['clipped']} of them with a clipped channel")
         show(f"overload lamps: {lamps_text(written['overloads'])}")

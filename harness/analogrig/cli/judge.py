@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import FILE, add_capture, add_command, add_output, recorded
-from analogrig.cli.playing import conclude, prepare
+from analogrig.cli.playing import conclude, output_folder
 
 
 def add(commands: Any) -> None:
@@ -25,8 +25,9 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.rigs.recording import RecordingRig
+    with output_folder(arguments) as output:
+        from analogrig.rigs.recording import RecordingRig
 
-    run = recorded(arguments)
-    prepare(arguments.out, RecordingRig.of(run, arguments.file))
-    return conclude(run, arguments)
+        run = recorded(arguments)
+        RecordingRig.of(run, arguments.file)
+        return conclude(run, output, output.identity(), arguments)

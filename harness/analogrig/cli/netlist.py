@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, opened
-from analogrig.cli.terminal import PASSED, show, show_json, show_plain
+from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, files_read, opened
+from analogrig.cli.terminal import PASSED, show, show_plain, show_result
 
 
 def add(commands: Any) -> None:
@@ -25,6 +25,10 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from analogrig.output import move_aside
+
+    if arguments.out is not None:
+        move_aside(arguments.out, files_read(arguments))
     from analogrig.reporting.netlist import netlist
     from analogrig.storage import replacing
 
@@ -36,7 +40,7 @@ def _run(arguments: argparse.Namespace) -> int:
             file.write(text.encode("ascii"))
     if arguments.json:
         where = {"deck": text} if arguments.out is None else {"file": str(arguments.out)}
-        show_json({**where, "samples": deck.samples, "seed": seed})
+        show_result({**where, "samples": deck.samples, "seed": seed}, arguments)
     elif arguments.out is None:
         show_plain(text.rstrip("\n"))
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -219,6 +220,20 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
         recorded = None if recording is None else recording.run.conditions.seed
         seeds = (arguments.seed, scenario.seed, recorded, DEFAULT_SEED)
         yield rig, scenario, next(seed for seed in seeds if seed is not None)
+
+
+def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
+    """Recordings and descriptions that the command line names, directly or by its scenario: none may be overwritten."""
+    from analogrig.config import read_toml
+    from analogrig.errors import AnalogrigError
+
+    given = vars(arguments)
+    names = [str(given[key]) for key in ("file", "rig", "scenario", "dut") if given.get(key) is not None]
+    scenario = Path(given.get("scenario") or "")
+    if scenario.suffix == ".toml" and not given.get("rig"):
+        with contextlib.suppress(AnalogrigError):  # whoever opens it will say what is wrong
+            names.append(str(read_toml(scenario).get("rig", "")))
+    return tuple(Path(re.sub(r"(\.toml):.*$", r"\1", name.removeprefix("recording:"))) for name in names)
 
 
 def add_capture(command: argparse.ArgumentParser) -> None:

@@ -3,142 +3,119 @@
 from __future__ import annotations
 
 import argparse
-import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show, show_json, working
 
 if TYPE_CHECKING:
+    from analogrig.identity import Identity
     from analogrig.judging.verdict import Verdict
+    from analogrig.output import OutputFolder
     from analogrig.protocol.dut import Dut
     from analogrig.recordings import CanLog
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
 
-RUN_FILE, REPORT_FILE, CAN_LOG = "run.npz", "report.html", "can"
+
+def output_folder(arguments: argparse.Namespace) -> OutputFolder:
+    """The folder of --out for the results of a run, as yet untouched."""
+    from analogrig.cli.options import files_read
+    from analogrig.output import OutputFolder
+
+    return OutputFolder(arguments.out, arguments.command_line, arguments.started, reads=files_read(arguments))
 
 
-def prepare(out: Path, rig: Rig) -> None:
-    """Find out before the run whether its results can be kept.
-
-    :raises ConfigurationError: the folder cannot be made, or holds the recording that is being played.
-    """
-    from analogrig.errors import ConfigurationError
-    from analogrig.rigs.recording import RecordingRig
-
-    make_folder(out)
-    if isinstance(rig, RecordingRig) and rig.path.resolve() == (out / RUN_FILE).resolve():
-        raise ConfigurationError(f"--out {out}: would overwrite the recording that is played; choose another folder")
-
-
-def make_folder(out: Path) -> None:
-    """Find out before the work whether its results can be kept.
-
-    :raises ConfigurationError: the folder cannot be made, or cannot be written to.
-    """
-    from analogrig.errors import ConfigurationError
-
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"--out {out}: {error.strerror or error}") from error
-    if not os.access(out, os.W_OK | os.X_OK):
-        raise ConfigurationError(f"--out {out}: cannot be written to")
-
-
-def can_log(rig: Rig, arguments: argparse.Namespace) -> CanLog | None:
-    """What listens to the CAN frames of the run, if they shall be kept; a run on another link has none.
-
-    :raises ConfigurationError: the run would overwrite the log that is being played.
-    """
-    from analogrig.errors import ConfigurationError
+def can_log(output: OutputFolder, arguments: argparse.Namespace) -> CanLog | None:
+    """Listener to the CAN frames of the run, if they shall be kept; a run on another link has none."""
+    from analogrig.output import CAN_LOG
     from analogrig.recordings import WRITTEN, CanLog
-    from analogrig.rigs.recording import RecordingRig
 
-    if isinstance(rig, RecordingRig) and rig.path.resolve() in {path.resolve() for path in _can_logs(arguments.out)}:
-        raise ConfigurationError(
-            f"--out {arguments.out}: would overwrite the CAN log that is played; choose another folder"
-        )
     asked = arguments.can_log or WRITTEN[0]
-    return None if asked == "none" else CanLog(arguments.out / f"{CAN_LOG}.{asked}")
-
-
-def _can_logs(out: Path) -> list[Path]:
-    """Wherever a run leaves one."""
-    from analogrig.recordings import WRITTEN
-
-    return [out / f"{CAN_LOG}.{suffix}" for suffix in WRITTEN]
-
-
-def _begin(log: CanLog | None, out: Path) -> None:
-    """What an earlier run has left goes, now that there is a device to play with.
-
-    :raises RecordingError: it cannot go.
-    """
-    from analogrig.errors import RecordingError
-
-    for path in _can_logs(out):
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be removed: {error.strerror or error}") from error
-    if log is not None:
-        log.begin()
+    return None if asked == "none" else CanLog(output.parts / f"{CAN_LOG}.{asked}")
 
 
 def play(
-    rig: Rig, dut: Dut, scenario: Scenario, seed: int, arguments: argparse.Namespace, log: CanLog | None = None
+    rig: Rig,
+    dut: Dut,
+    scenario: Scenario,
+    seed: int,
+    output: OutputFolder,
+    arguments: argparse.Namespace,
+    log: CanLog | None = None,
 ) -> int:
     """:raises ConfigurationError: a log was asked for of a device that is on no CAN bus."""
     from analogrig.bench import Bench
-    from analogrig.errors import ConfigurationError, RecordingError
+    from analogrig.errors import ConfigurationError
+    from analogrig.signals import held
 
     if arguments.can_log is not None and log is not None and not log.has_heard:
         raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
-    _begin(log, arguments.out)
+    identity = replace(output.identity(), devices=dut.files())
+    if log is not None:
+        log.begin()
     bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
     run = bench.play(scenario, seed)
-    status = conclude(run, arguments)
+    with held():
+        return conclude(_with_log(run, log, output).made_by(identity), output, identity, arguments)
+
+
+def _with_log(run: Run, log: CanLog | None, output: OutputFolder) -> Run:
+    """The run, which is not valid if its CAN log could not be written."""
+    from analogrig.errors import RecordingError
+
     try:
         if log is not None:
             log.close()
     except RecordingError as error:
-        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
-    return status
+        faults = (*run.conditions.faults, output.reason(error))
+        return replace(run, conditions=replace(run.conditions, faults=faults))
+    return run
 
 
-def conclude(run: Run, arguments: argparse.Namespace) -> int:
-    """Judge a run, keep it and its report, show the verdict to whoever listens, and return the exit status."""
+def conclude(run: Run, output: OutputFolder, identity: Identity, arguments: argparse.Namespace) -> int:
+    """Judge a run, keep it and its report, show the verdict to whoever listens, and return the exit status.
+
+    :param identity: of this command.
+    """
     from analogrig.bench import INTERRUPTED_BY_USER
     from analogrig.errors import RecordingError
     from analogrig.judging.verdict import judge
+    from analogrig.output import REPORT_FILE, RUN_FILE
     from analogrig.reporting import write_report
     from analogrig.reporting.summary import summary
 
-    unkept = None
-    with working("judging, writing run and report"):
-        verdict = judge(run)
-        try:
-            run.save(arguments.out / RUN_FILE)
-            write_report(run, verdict, arguments.out / REPORT_FILE)
-        except RecordingError as error:
-            unkept = error
+    def write(folder: Path) -> None:
+        run.save(folder / RUN_FILE)
+        write_report(run, verdict, folder / REPORT_FILE)
+
+    try:
+        with working("judging, writing run and report"):
+            verdict = judge(run)
+            table = _as_json(run, verdict, identity, output)
+            output.conclude(write, table)
+    except RecordingError as error:
+        unkept = {"outcome": "inconclusive", "valid": False, "reasons": [str(error), *verdict.reasons]}
+        if arguments.json:
+            show_json(table | unkept)
+        else:
+            show(summary(run, verdict))
+        return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_json(_as_json(run, verdict, arguments.out))
+        show_json(table)
     else:
-        show(f"{summary(run, verdict)}\nreport: {arguments.out / REPORT_FILE}\nrun:    {arguments.out / RUN_FILE}")
-    if unkept is not None:
-        return complain(f"INCONCLUSIVE: {unkept}", INCONCLUSIVE)
+        show(f"{summary(run, verdict)}\nreport: {output.page}\nrun:    {output.path / RUN_FILE}")
     if not verdict.valid:
         complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
     return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else STATUS[verdict.outcome]
 
 
-def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
+def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolder) -> dict[str, Any]:
     from analogrig.judging.advice import advice
     from analogrig.judging.verdict import as_json
+    from analogrig.output import RUN_FILE
 
     conditions = run.conditions
     return {
@@ -154,6 +131,8 @@ def _as_json(run: Run, verdict: Verdict, out: Path) -> dict[str, Any]:
         "counters": dict(conditions.counters),
         **as_json(verdict),
         "advice": list(advice(run, verdict)),
-        "report": str(out / REPORT_FILE),
-        "run": str(out / RUN_FILE),
+        "identity": identity.as_table(),
+        "recorded_by": None if conditions.identity is None else conditions.identity.as_table(),
+        "report": str(output.page),
+        "run": str(output.path / RUN_FILE),
     }

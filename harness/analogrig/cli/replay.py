@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import (
     FILE,
@@ -19,7 +19,10 @@ from analogrig.cli.options import (
     recorded,
     trust_of,
 )
-from analogrig.cli.playing import can_log, play, prepare
+from analogrig.cli.playing import can_log, output_folder, play
+
+if TYPE_CHECKING:
+    from analogrig.output import OutputFolder
 
 
 def add(commands: Any) -> None:
@@ -41,6 +44,11 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    with output_folder(arguments) as output:
+        return _replayed(arguments, output)
+
+
+def _replayed(arguments: argparse.Namespace, output: OutputFolder) -> int:
     from analogrig.errors import ConfigurationError
     from analogrig.protocol.dut import open_dut, reopen_dut
     from analogrig.rigs.recording import RecordingRig
@@ -49,9 +57,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if named is None and is_capture(arguments.file):
         raise ConfigurationError(f"{arguments.file}: does not say which device it was: say --dut")
     with RecordingRig.of(recorded(arguments), arguments.file) as rig:
-        prepare(arguments.out, rig)
-        log = can_log(rig, arguments)
+        log = can_log(output, arguments)
         changes = {"allow": trust_of(arguments), "listener": log, **changes_of_dut(arguments)}
         device, file = rig.run.conditions.dut, str(arguments.file)
         with open_dut(named, **changes) if named else reopen_dut(device, file, **changes) as dut:
-            return play(rig, dut, rig.scenario(), rig.run.conditions.seed, arguments, log)
+            return play(rig, dut, rig.scenario(), rig.run.conditions.seed, output, arguments, log)

@@ -17,7 +17,7 @@ from analogrig.cli.options import (
     opened,
     trust_of,
 )
-from analogrig.cli.playing import can_log, play, prepare
+from analogrig.cli.playing import can_log, output_folder, play
 
 
 def add(commands: Any) -> None:
@@ -38,11 +38,10 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig.protocol.dut import open_dut
+    with output_folder(arguments) as output, opened(arguments) as (rig, scenario, seed):
+        from analogrig.protocol.dut import open_dut
 
-    with opened(arguments) as (rig, scenario, seed):
         device = arguments.dut or scenario.dut or "host"
-        prepare(arguments.out, rig)
-        log = can_log(rig, arguments)
+        log = can_log(output, arguments)
         with open_dut(device, allow=trust_of(arguments), listener=log, **changes_of_dut(arguments)) as dut:
-            return play(rig, dut, scenario, seed, arguments, log)
+            return play(rig, dut, scenario, seed, output, arguments, log)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -87,11 +86,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
-    """Serve until SIGTERM or, if there is one, until the client ends. Return the exit status."""
-    import asyncio
+    """Serve until a signal ends the command or, if there is one, until the client ends. Return the exit status."""
+    from analogrig.signals import awaited
 
-    enough = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, enough.set)
+    ended = awaited()
     host, number = await server.listen(arguments.host, arguments.port)
     address = f"[{host}]:{number}" if ":" in host else f"{host}:{number}"
     try:
@@ -99,18 +97,13 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
             show_json({**names, "host": host, "port": number, "address": address})
         else:
             show(f"rig {names['rig']} ({names['plant']}, seed {names['seed']}) at {address}")
-        return await _client(arguments.client, enough) if arguments.client else await _waited(enough)
+        return await (_client(arguments.client, ended) if arguments.client else ended)
     finally:
         await server.close()
 
 
-async def _waited(enough: asyncio.Event) -> int:
-    await enough.wait()
-    return PASSED
-
-
-async def _client(command: Sequence[str], enough: asyncio.Event) -> int:
-    """Run a command to its end, or terminate it on SIGTERM. Return its exit status as a shell does.
+async def _client(command: Sequence[str], signalled: asyncio.Future[int]) -> int:
+    """Run a command to its end, or terminate it at a signal. Return its exit status as a shell does.
 
     :raises ConfigurationError: it cannot be started.
     """
@@ -122,15 +115,11 @@ async def _client(command: Sequence[str], enough: asyncio.Event) -> int:
         process = await asyncio.create_subprocess_exec(*command)
     except OSError as error:
         raise ConfigurationError(f"{command[0]}: cannot be started: {error.strerror or error}") from error
-    ended, stopped = asyncio.ensure_future(process.wait()), asyncio.ensure_future(enough.wait())
-    try:
-        await asyncio.wait({ended, stopped}, return_when=asyncio.FIRST_COMPLETED)
-        if not ended.done():
-            process.terminate()
-        status = await ended
-    except asyncio.CancelledError:  # Ctrl-C: the terminal has sent it to the command too
-        await process.wait()
-        raise
-    finally:
-        stopped.cancel()
+    ended = asyncio.ensure_future(process.wait())
+    await asyncio.wait({ended, signalled}, return_when=asyncio.FIRST_COMPLETED)
+    if not ended.done():
+        process.terminate()
+        await ended
+        await signalled
+    status = await ended
     return status if status >= 0 else 128 - status

@@ -13,13 +13,16 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 from analogrig.wording import one_line, printable
 
 if TYPE_CHECKING:
+    import argparse
+
     from analogrig.bench import Progress
+    from analogrig.identity import DeviceFile
 
 PASSED, FAILED, USAGE, INCONCLUSIVE, INTERRUPTED = 0, 1, 2, 3, 130
 """Exit statuses."""
@@ -59,6 +62,14 @@ def show_plain(text: str) -> None:
 def show_json(value: Any) -> None:
     """Print one JSON object on standard output. JSON has no NaN or infinity: they become null."""
     show_plain(json.dumps(_finite(value), allow_nan=False))
+
+
+def show_result(table: Mapping[str, Any], arguments: argparse.Namespace, devices: Sequence[DeviceFile] = ()) -> None:
+    """Print one JSON object on standard output: a result, and the identity of the command."""
+    from analogrig.identity import Identity
+
+    identity = Identity.here(arguments.command_line, arguments.started, devices)
+    show_json({**table, "identity": identity.as_table()})
 
 
 def _finite(value: Any) -> Any:

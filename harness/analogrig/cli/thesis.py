@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import add_command
-from analogrig.cli.playing import make_folder
 from analogrig.cli.terminal import PASSED, show, show_plain, working
 
 
@@ -31,13 +30,16 @@ def add(commands: Any) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from analogrig_thesis import reproduce
-    from analogrig_thesis.reproduction import PAGE
+    from analogrig.output import OutputFolder
+    from analogrig_thesis.reproduction import FILES, PAGE
 
-    make_folder(arguments.out)
-    with working("simulating, playing, estimating"):
-        reproduction = reproduce()
-        reproduction.write(arguments.out)
+    with OutputFolder(arguments.out, arguments.command_line, arguments.started, holds=FILES, page=PAGE) as output:
+        from analogrig_thesis import reproduce
+
+        with working("simulating, playing, estimating"):
+            reproduction = reproduce()
+        verdict = {"outcome": "passed", "valid": True, "reasons": [], "identity": output.identity().as_table()}
+        output.conclude(reproduction.write, verdict)
     if arguments.json:
         show_plain(reproduction.claims().rstrip())
         return PASSED

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench
+from analogrig.bench import Bench, uninterrupted
 from analogrig.campaigns.comparison import Comparison, compare
 from analogrig.campaigns.rows import Row, changes, row
 from analogrig.judging.statistics import mean_interval, rate_interval, upper_rate
@@ -149,7 +149,7 @@ def compare_rigs(
     """
     pairs = []
     for done, seed in enumerate(seeds):
-        runs = a.play(scenario, seed), b.play(scenario, seed)
+        runs = uninterrupted(a.play(scenario, seed)), uninterrupted(b.play(scenario, seed))
         pairs.append(_Pair(*runs, rows=(row(runs[0], judge(runs[0])), row(runs[1], judge(runs[1])))))
         if progress is not None:
             progress(done + 1, len(seeds))

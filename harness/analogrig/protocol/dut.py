@@ -31,6 +31,7 @@ from analogrig.errors import (
     LinkTimeout,
     TimeLimitReached,
 )
+from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.catalogue import (
     CATALOGUE_HASH,
@@ -143,6 +144,11 @@ class Dut:
         """Description and identity in plain values, for the record."""
         table = self._description.as_table()
         return table if self._identity is None else {**table, "identity": dataclasses.asdict(self._identity)}
+
+    def files(self) -> tuple[DeviceFile, ...]:
+        """Library, program or firmware that it runs on this machine, if it does."""
+        program = self._description.program
+        return () if program is None else (DeviceFile.of(self.name, program),)
 
     def __enter__(self) -> Self:
         return self

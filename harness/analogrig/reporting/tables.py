@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from analogrig.identity import Identity
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
 from analogrig.links.bus_load import load_of
@@ -68,8 +69,22 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Samples", _samples(run, verdict)),
         ("Overload lamps", lamps_text(verdict.overloads)),
         ("Theta hash", verdict.theta_hash),
+        *provenance(ran.identity),
     ]
     return _table("What ran, and where", "", (_named(name, value) for name, value in rows), kind="pairs")
+
+
+def provenance(identity: Identity | None) -> list[tuple[str, str]]:
+    """What made a result: names and values, not escaped; empty if it is unknown."""
+    if identity is None:
+        return []
+    made_by = f"{identity.analogrig}, commit {identity.commit or 'unknown'}, Python {identity.python}"
+    return [
+        ("analogrig", made_by),
+        ("Command", identity.command),
+        ("Started", f"{identity.started} on {identity.host}"),
+        *(("Device file", f"{each.path}, SHA-256 {each.sha256 or 'unknown'}") for each in identity.devices),
+    ]
 
 
 def tweaks(verdict: Verdict) -> str:

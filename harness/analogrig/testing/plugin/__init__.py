@@ -19,7 +19,7 @@ import pytest
 
 from analogrig.rigs import CAPABILITIES
 from analogrig.testing import profiles
-from analogrig.testing.plugin import devices, options, playing, scenarios
+from analogrig.testing.plugin import devices, options, playing, provenance, scenarios
 from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, Option, time_limit_s
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
     options.check_command_line(config)
+    provenance.begin(config)
     profile: Callable[[], str] = functools.partial(_value_while_collecting, HIL_PROFILE, config)
     config.stash[_PROFILE] = profile
     profiles.begin_session(profile)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from analogrig.testing.plugin import provenance
 from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
@@ -102,6 +103,7 @@ class Player:
             chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
             drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
             run = self.bench.play(chosen, drawn)
+        run = run.made_by(provenance.identity(self.item.config, self.bench.dut.files()))
         if run.conditions.faults:  # nothing of it may reach the next play of this test
             with contextlib.suppress(AnalogrigError):
                 self.bench.dut.handshake()
@@ -255,6 +257,7 @@ def _properties(played: Played) -> Mapping[str, Any]:
         "bound_n": " ".join(str(tweak.bound_n) for tweak in verdict.tweaks),
         "false_alarms": len(verdict.false_alarms),
         "overruns": conditions.counters.get("receive_overruns", 0),
+        **dict(provenance.properties(conditions.identity)),
     }
 
 

@@ -1,0 +1,209 @@
+"""Commands killed at random instants: what they leave behind, and whether they leave it.
+
+    python -m tests.harness.kills [KILLS] [SEED]     so many of each command by each signal (40)
+
+After every kill there is no process of the command, no result of an earlier command that looks like one of it, and no
+part of a result that looks whole.
+"""
+
+# ruff: noqa: S311, T201 - the instants are drawn from a seed and are no secret; a program prints
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from analogrig.campaigns.results import Results
+from analogrig.config import read_toml
+from analogrig.judging.verdict import judge
+from analogrig.run import Run
+from tests.harness.processes import gone, with_default_signals
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+
+LONG_S = 300.0
+"""For what takes seconds unless something is broken."""
+
+CAMPAIGN = 'trials = 12\nchunk = 2\nsamples = 300\ndevices = ["host"]\n'
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command, and what it may leave in its folder."""
+
+    words: tuple[str, ...]
+    check: Callable[[Path, Path], None]
+    """Told the folder as it is, and as it was before the command."""
+    ends: bool = True
+    """Whether it ends by itself."""
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def check_run(now: Path, before: Path) -> None:
+    """Either untouched, or marked, or the whole result of this command."""
+    out, older = now / "out", contents(before / "out")
+    found = contents(out)
+    if found == older:
+        return
+    verdict = json.loads(found["verdict.json"])
+    (outcome,) = re.findall(r'class="outcome (\w+)"', found["report.html"].decode())
+    assert verdict["outcome"] == outcome, f"verdict.json: {verdict['outcome']}, page: {outcome}"
+    assert found["verdict.json"] != older["verdict.json"], "an older verdict"
+    assert set(found) <= set(older), f"unknown files: {set(found) - set(older)}"
+    if "run.npz" in found:
+        assert found["run.npz"] != older["run.npz"], "an older recording"
+        assert judge(Run.load(out / "run.npz")).outcome == outcome
+    else:
+        assert outcome == "inconclusive"
+    assert contents(now / "out.previous") == older, "the older results are lost"
+
+
+def check_campaign(now: Path, before: Path) -> None:
+    """No results, or all of them; never the older page without results."""
+    results, page = now / "out.json", now / "out.html"
+    if results.exists():
+        Results.load(results)  # which has every trial of the plan; under load some may be inconclusive
+    elif page.exists():
+        assert not (now / "out.json.journal").exists(), "the page of an older campaign beside the journal of this one"
+        assert page.read_bytes() == (before / "out.html").read_bytes(), "a page without results"
+    if page.exists():
+        assert page.read_bytes().rstrip().endswith(b"</html>"), "half a page"
+
+
+def check_twin(now: Path, before: Path) -> None:
+    """The older twin where it was or beside; the new one whole."""
+    twin, older = now / "twin.toml", (before / "twin.toml").read_bytes()
+    if twin.exists() and twin.read_bytes() != older:
+        assert read_toml(twin)["kind"] == "emulator"
+    if not twin.exists() or twin.read_bytes() != older:
+        assert (now / "twin.toml.previous").read_bytes() == older
+
+
+def check_nothing(_: Path, __: Path) -> None:
+    """It writes no files."""
+
+
+CASES = {
+    "run": Case(("run", "--dut", "host", "--out", "out"), check_run),
+    "campaign": Case(("campaign", "spec.toml", "--out", "out.json", "--workers", "2"), check_campaign),
+    "certify": Case(
+        ("certify", "--far", "2e-3", "--confidence", "0.9", "--dut", "host", "--workers", "2"), check_nothing
+    ),
+    "calibrate": Case(
+        ("calibrate", "--components", "nominal", "--pots", "coefficient", "--out", "twin.toml"), check_twin
+    ),
+    "serve": Case(("serve", "--port", "0"), check_nothing, ends=False),
+}
+
+
+def prepared(folder: Path) -> Path:
+    """A folder as it is before every command: an earlier run that has passed, a campaign's page, a twin."""
+    folder.mkdir(parents=True)
+    (folder / "spec.toml").write_text(CAMPAIGN)
+    (folder / "twin.toml").write_text("# of an earlier calibration\n")
+    for words in (
+        ("run", "--dut", "inproc", "--seed", "7", "--out", "out"),
+        ("campaign", "spec.toml", "--out", "out.json", "--workers", "1"),
+    ):
+        command = [sys.executable, "-m", "analogrig.cli", *words]
+        subprocess.run(command, cwd=folder, stdout=subprocess.DEVNULL, timeout=LONG_S, check=False)
+    outcome = json.loads((folder / "out" / "verdict.json").read_text())["outcome"]
+    assert outcome == "passed", outcome
+    (folder / "out.json").unlink()
+    (folder / "out.json.identity").unlink()
+    return folder
+
+
+@contextmanager
+def started(case: Case, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The command at work, and the mark of all that it starts."""
+    mark = str(uuid.uuid4())
+    command = with_default_signals(sys.executable, "-m", "analogrig.cli", *case.words)
+    environment = {**os.environ, "ANALOGRIG_TEST_MARK": mark}
+    with subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            yield process, mark
+        finally:
+            process.kill()
+
+
+def duration_s(case: Case, before: Path) -> float:
+    """How long it takes now; of one that does not end, to be at work."""
+    with tempfile.TemporaryDirectory() as folder:
+        now = Path(shutil.copytree(before, Path(folder) / "now"))
+        start_s = time.monotonic()
+        with started(case, now) as (process, _):
+            if case.ends:
+                process.communicate(timeout=LONG_S)
+            elif process.stdout is not None:
+                process.stdout.readline()
+            return time.monotonic() - start_s
+
+
+def kill(case: Case, number: signal.Signals, before: Path, after_s: float) -> str:
+    """Kill it once, and check what is left; returns how it ended."""
+    with tempfile.TemporaryDirectory() as folder:
+        now = Path(shutil.copytree(before, Path(folder) / "now"))
+        with started(case, now) as (process, mark):
+            try:
+                process.wait(after_s)
+            except subprocess.TimeoutExpired:
+                process.send_signal(number)
+            _, said = process.communicate(timeout=LONG_S)
+            assert gone(mark), "processes are left"
+        # -number: before the command has begun to handle signals, or after its end.
+        assert process.returncode in {0, 130, -number}, f"ended with status {process.returncode}: {said!r}"
+        case.check(now, before)
+        if process.returncode == 0 and case.check is check_run:
+            assert json.loads((now / "out" / "verdict.json").read_text())["outcome"] == "passed"
+        return str(process.returncode)
+
+
+def instants(name: str, number: signal.Signals, kills: int, seed: int, most_s: float) -> list[float]:
+    draw = random.Random(f"{seed} {name} {number.name}")
+    return [draw.uniform(0.0, 1.1) * most_s for _ in range(kills)]
+
+
+def main(kills: int, seed: int) -> int:
+    """Kill every command by every signal so many times; returns the number of faults."""
+    faults = 0
+    with tempfile.TemporaryDirectory() as folder:
+        before = prepared(Path(folder) / "before")
+        for (name, case), number in itertools.product(CASES.items(), SIGNALS):
+            ended: dict[str, int] = {}
+            most_s = duration_s(case, before)
+            for after_s in instants(name, number, kills, seed, most_s):
+                try:
+                    how = kill(case, number, before, after_s)
+                except Exception as error:  # noqa: BLE001 - counted and shown, and the others are still tried
+                    faults += 1
+                    how = "fault"
+                    print(f"{name}, {number.name} after {after_s:.3f} s: {type(error).__name__}: {error}")
+                ended[how] = ended.get(how, 0) + 1
+            print(f"{name:10} {number.name:8} {kills} kills within {most_s:.2f} s; by status {ended}", flush=True)
+    print(f"{faults} faults; seed {seed}")
+    return faults
+
+
+if __name__ == "__main__":
+    given = [int(word) for word in sys.argv[1:]]
+    sys.exit(main(*(given + [40, 1995][len(given) :])) > 0)
