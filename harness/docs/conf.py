@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from importlib.metadata import version
+from importlib import metadata
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -11,7 +11,7 @@ from generated import write_reference  # the module beside this file
 
 project = "analogrig"
 author = "the analogrig authors"
-release = version("analogrig")
+release = metadata.version("analogrig")
 extensions = ["myst_parser"]
 myst_enable_extensions = ["colon_fence", "deflist", "fieldlist"]
 myst_heading_anchors = 3
