@@ -46,7 +46,8 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format bench firmware no-firmware cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs bench firmware no-firmware \
+        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -85,6 +86,10 @@ format: $(PRODUCTS) ## lay out the Python sources, and the C with clang-format
 	@$(BIN)/ruff check --quiet --select I --fix $(PYTHON_SOURCES)
 	@$(BIN)/ruff format $(PYTHON_SOURCES)
 	@$(CLANG_FORMAT) -i $(C_SOURCES)
+
+docs: $(PRODUCTS) ## build the documentation site into build/docs; warnings are errors
+	@$(BIN)/python -m sphinx -q -W --keep-going -b html -d $(BUILD)/doctrees harness/docs $(BUILD)/docs
+	@echo "$(BUILD)/docs/index.html"
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)

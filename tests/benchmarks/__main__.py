@@ -1,17 +1,21 @@
-"""All benchmarks, or those named: prints one table and writes build/bench.json.
+"""Benchmarks, all or those named: print one table, write build/bench.json and the evidence pages of the site.
 
 python -m tests.benchmarks [NAME ...]
 
-bench.json is a list of {name, value, unit, compared_with, ratio, bounds}; earlier figures of other names stay.
+bench.json is a list of {theme, name, value, unit, compared_with, ratio, bounds, measured}; earlier figures of other
+names stay. ``measured`` is date and commit.
 """
 
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from . import (
     bench_calibration,
@@ -24,6 +28,7 @@ from . import (
     bench_self_test,
     bench_statistics,
     bench_trials,
+    pages,
 )
 from .figure import Figure
 
@@ -43,13 +48,23 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
 }
 
 
-def keep(measured: Sequence[Figure], path: Path = RESULTS) -> None:
-    """Put the figures into the file, in place of older ones of the same name."""
+def keep(theme: str, measured: Sequence[Figure], path: Path = RESULTS) -> list[dict[str, Any]]:
+    """Put the figures into the file in place of older ones of the same name; return all entries of the theme."""
     older = json.loads(path.read_text()) if path.exists() else []
     names = {figure.name for figure in measured}
-    kept = [entry for entry in older if entry["name"] not in names]
+    when = {"theme": theme, "measured": _when()}
+    entries = [entry for entry in older if entry["name"] not in names]
+    entries += [{**when, **asdict(figure)} for figure in measured]
     path.parent.mkdir(exist_ok=True)
-    path.write_text(json.dumps(kept + [asdict(figure) for figure in measured], indent=1) + "\n")
+    path.write_text(json.dumps(entries, indent=1) + "\n")
+    return [entry for entry in entries if entry.get("theme") == theme]
+
+
+def _when() -> str:
+    """Return the date and the commit of the checkout."""
+    command = ["git", "describe", "--always", "--dirty"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    return f"{datetime.now(UTC):%Y-%m-%d} {told}".strip()
 
 
 def main(names: Sequence[str]) -> None:
@@ -61,7 +76,7 @@ def main(names: Sequence[str]) -> None:
         for figure in BENCHES[name]():
             print(figure, flush=True)
             measured.append(figure)
-        keep(measured)
+        pages.write(name, keep(name, measured))
 
 
 if __name__ == "__main__":
