@@ -81,7 +81,9 @@ def test_every_python_example_of_a_page_runs(page: Path, tmp_path: Path) -> None
     if not texts:
         return
     for i, text in enumerate(texts):
-        (tmp_path / f"test_example_{i}.py").write_text(text if "def test_" in text else f"def test_it():\n{_indented(text)}")
+        (tmp_path / f"test_example_{i}.py").write_text(
+            text if "def test_" in text else f"def test_it():\n{_indented(text)}"
+        )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hil-dut", "inproc", tmp_path]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -96,7 +98,7 @@ def test_sentences_of_the_pages_are_short() -> None:
     for path in sorted(DOCS.rglob("*.md")):
         if path.parent.name == "reference":
             continue
-        text = re.sub(r"^```.*?^```|^\|.*$|^#.*$", "", path.read_text(encoding="utf-8"), flags=re.S | re.M)
+        text = re.sub(r"^```.*?^```|^\|.*$|^#.*$", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
         long += [f"{path.name}: {s}" for s in re.split(r"(?<=[.!?:])\s+|\n\n", text) if len(s.split()) > MOST_WORDS]
     assert not long
 

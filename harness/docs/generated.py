@@ -123,7 +123,9 @@ def _tables(described: type, path: str) -> Iterator[str]:
         rows.append((field.name, _type_name(hints[field.name]), _default(field), texts.get(field.name, "")))
     yield "| key | type | default | meaning |"
     yield "|---|---|---|---|"
-    yield from (f"| `{name}` | {_cell(kind)} | {_cell(default)} | {_cell(text)} |" for name, kind, default, text in rows)
+    yield from (
+        f"| `{name}` | {_cell(kind)} | {_cell(default)} | {_cell(text)} |" for name, kind, default, text in rows
+    )
     for each, where in nested:
         yield from _tables(each, where)
 
@@ -269,7 +271,10 @@ def _raised(tree: ast.AST) -> Iterator[tuple[str, str]]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and isinstance(node.exc.func, ast.Name):
             kind, arguments = node.exc.func.id, node.exc.args
-            if kind.endswith(("Error", "Timeout", "Closed", "Refused", "Mismatch", "Stale", "Incomplete")) and arguments:
+            if (
+                kind.endswith(("Error", "Timeout", "Closed", "Refused", "Mismatch", "Stale", "Incomplete"))
+                and arguments
+            ):
                 message = _template(arguments[0])
                 if len(message.replace("...", "").strip(" :,")) > len("..."):
                     yield kind, message
@@ -294,7 +299,7 @@ def _documentation(text: str) -> str:
 
 
 def _first_paragraph(text: str) -> str:
-    return _documentation(" ".join(text.split("\n\n")[0].split()))
+    return _documentation(" ".join(text.split("\n\n", maxsplit=1)[0].split()))
 
 
 def _sentence(text: str) -> str:
