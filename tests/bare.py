@@ -67,7 +67,8 @@ def main(arguments: Sequence[str]) -> int:
     make_path(FOLDER)
     status, output = run(arguments)
     expected = {name for name in tools.PACKAGES if not (FOLDER / name).exists()}
-    if status == 0 and not arguments and (found := waited_for(output)) ^ expected:
+    found = waited_for(output) - set(tools.BUILT)  # make tools may have built them already
+    if status == 0 and not arguments and found != expected:
         sys.stderr.write(f"test-bare: the table differs from tests/tools.py in {', '.join(sorted(found ^ expected))}\n")
         return 1
     return status
