@@ -6,8 +6,8 @@ to what the engine plays. With dx = A x dt + B dw, one sample period T takes the
 
     Phi x + w,   Phi = exp(A T),   cov(w) = integral over 0..T of exp(A s) B B' exp(A' s) ds
 
-both by doubling a short step (engine/noise.c). Sources (two-sided densities): 2 k T / R across each resistor and each leg of
-a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. What reaches an output
+both by doubling a short step (engine/noise.c). Sources (two-sided densities): 2 k T / R across each resistor and each
+leg of a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. What reaches an output
 without passing a state is left out: a resistor's noise divided down by an output resistance, white without bound in
 this model, some nV per root Hz in a real one. Elementwise arithmetic only, so a seed has the same bits on every
 machine.
