@@ -1,6 +1,6 @@
 """The options of the plugin, and the source of each value.
 
-Every option has the name of its fixture, on the command line (``--hil-rig``) and in the ini file (``hil_rig``) too.
+An option has one name: as a fixture, on the command line (``--hil-rig``) and in the ini file (``hil_rig``).
 Only a wrong value on the command line ends a session. The environment and the ini file may serve other programs, or
 other tests, than those that run: a wrong value there fails the tests that use it.
 """
