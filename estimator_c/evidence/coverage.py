@@ -25,7 +25,7 @@ SOURCES = tuple(ROOT / "estimator_c" / name for name in ("core", "isolation"))
 
 ELSEWHERE = {
     "a.na == b.na": "shapes differ only where a build knows one alone: tests/estimator_c/test_est_builds.py",
-    "in_this_build": "only a build that leaves something out refuses here: tests/estimator_c/test_est_builds.py",
+    "is_supported": "only a build that leaves something out refuses here: tests/estimator_c/test_est_builds.py",
     **{
         f"EST_WITH_{what} || ": "what is left out of a build is refused there: tests/estimator_c/test_est_builds.py"
         for what in ("EDGES", "TRIGGERS", "ADAPTATION", "WATCH")
