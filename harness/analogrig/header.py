@@ -11,11 +11,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analogrig import config
+from analogrig.errors import ConfigurationError
 from analogrig.protocol.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.scenario import Expectations
 from analogrig_emulator.excitation import Excitation
 
 _MOST = 2**31
+
+_NEEDED = ("na", "nb", "offset", "trigger", "ceiling")
+"""Settings without a default: another value would be another verdict."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,10 @@ def check_tables(
     _known(_Scenario, scenario, f"{where}: scenario")
     _known(_Rig, rig, f"{where}: rig")
     _known(_Line, line, f"{where}: line")
+    settings = dut.get("estimator")
+    for key in _NEEDED if isinstance(settings, Mapping) else ():
+        if key not in settings and not (key == "ceiling" and settings.get("trigger") == "none"):
+            raise ConfigurationError(f"{where}: dut: estimator: the key {key!r} is lacking")
     estimator: EstimatorConfig = _known(_Device, dut, f"{where}: dut").estimator
     return estimator
 

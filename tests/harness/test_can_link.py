@@ -204,11 +204,11 @@ def test_message_that_comes_twice_is_no_other_one(bus: Bus) -> None:
 @pytest.mark.parametrize(
     ("errors", "trouble"),
     [
-        ([error(CONTROLLER, BOTH_PASSIVE)], "the bus is error-passive, 1 error frames (the last: controller)"),
+        ([error(CONTROLLER, BOTH_PASSIVE)], "the bus is error-passive, 1 error frame (the last: controller)"),
         ([error(ACKNOWLEDGE_MISSING), error(OFF)], "the bus is bus-off, 2 error frames (the last: bus-off)"),
         ([error(OFF), error(RESTARTED)], "2 error frames (the last: restarted)"),
         ([error(CONTROLLER, BOTH_PASSIVE), error(CONTROLLER, ACTIVE_AGAIN)], "2 error frames (the last: controller)"),
-        ([error(ACKNOWLEDGE_MISSING), frame(0x123)], "1 error frames (the last: not acknowledged), 1 frames of others"),
+        ([error(ACKNOWLEDGE_MISSING), frame(0x123)], "1 error frame (the last: not acknowledged), 1 frame of others"),
         ([], ""),
     ],
 )

@@ -439,7 +439,7 @@ def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> N
     line.counters = {"frames_dropped": 6}
     dut = started(line)
     line.from_device = about(Estimate, 84, lose)
-    with pytest.raises(LinkError, match=r"1 messages were lost .*\(0 frames were damaged in this run\)$"):
+    with pytest.raises(LinkError, match=r"1 message was lost .*\(0 frames were damaged in this run\)$"):
         feed(dut, 0, N)
 
 
@@ -582,14 +582,14 @@ def test_no_more_blocks_are_on_their_way_than_the_device_can_hold(
 def test_lost_answer_is_told(line: FaultyLink, kind: type, after: str) -> None:
     dut = started(line)
     line.from_device = about(kind, 81, lose)
-    with pytest.raises(LinkError, match=f"1 messages were lost between {after}"):
+    with pytest.raises(LinkError, match=f"1 message was lost between {after}"):
         feed(dut, 0, N)
 
 
 def test_lost_answer_in_a_block_is_told(line: FaultyLink) -> None:
     dut = started(line, exchange="block")
     line.from_device = about(Stepped, 81, lose)
-    said = "1 messages were lost between Estimate 81 and Estimate 82, or somebody else speaks as the device"
+    said = "1 message was lost between Estimate 81 and Estimate 82, or somebody else speaks as the device"
     with pytest.raises(LinkError, match=f"^device bob: {said}"):
         feed(dut, 0, N)
 

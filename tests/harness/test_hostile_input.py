@@ -131,6 +131,14 @@ def test_header_value_that_a_verdict_cannot_use_is_refused(
     assert said in judged(rewritten(recording, tmp_path / "run.npz", change), capsys)
 
 
+@pytest.mark.parametrize("key", ["na", "nb", "offset", "trigger", "ceiling"])
+def test_setting_that_a_verdict_needs_is_not_assumed(
+    recording: Path, tmp_path: Path, key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = rewritten(recording, tmp_path / "run.npz", lambda conditions, _: conditions["dut"]["estimator"].pop(key))
+    assert f"dut: estimator: the key '{key}' is lacking" in judged(path, capsys)
+
+
 def test_alarms_out_of_order_are_refused(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def change(_: object, arrays: dict[str, Any]) -> None:
         arrays |= {"alarm_index": np.array([200, 100])}

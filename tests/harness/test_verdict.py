@@ -52,7 +52,7 @@ def test_change_that_could_be_seen_and_was_not_is_missed() -> None:
     verdict = judge(made_run(LOADED, CHANGE))
     assert verdict.tweaks[0].missed
     assert verdict.outcome == "failed"
-    assert verdict.reasons == ("missed 1 of 1 changes (K at 400), at most 0 expected",)
+    assert verdict.reasons == ("missed 1 of 1 change (K at 400), at most 0 expected",)
 
 
 def test_change_without_information_is_not_held_against_the_device() -> None:

@@ -68,7 +68,7 @@ class CanLink:
     def trouble(self) -> str:
         said = [f"the bus is {self._state}"] if self._state else []
         if errors := self._counted["error_frames"]:
-            said.append(f"{errors} error frames (the last: {self._last_error})")
+            said.append(f"{number_of(errors, 'error frame')} (the last: {self._last_error})")
         if foreign := self._counted["frames_foreign"]:
             said.append(number_of(foreign, "frame of others", "frames of others"))
         return ", ".join(said)
