@@ -13,7 +13,7 @@ from typing import Any
 from analogrig import config
 from analogrig.protocol.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.scenario import Expectations
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 _MOST = 2**31
 
