@@ -3,10 +3,21 @@
 README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
-from .acquisition import acquired, probes_per_sample
-from .bump_stop import BumpStop
-from .circuit import Capacitor, Circuit, CurrentSource, DiodeLimiter, OpAmp, Pot, Resistor, Switch, VoltageSource
-from .components import (
+from analogrig_emulator.card.acquisition import acquired, probes_per_sample
+from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges, Excitation
+from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
+from analogrig_emulator.circuit.circuit import (
+    Capacitor,
+    Circuit,
+    CurrentSource,
+    DiodeLimiter,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
+from analogrig_emulator.circuit.components import (
     COMPONENTS,
     DIELECTRICS,
     NOMINAL,
@@ -17,22 +28,29 @@ from .components import (
     OpAmpGrade,
     PotGrade,
 )
-from .deck import Deck
-from .engine import Engine
-from .errors import CircuitError, EmulatorError, EngineError, ExcitationError, ModeError, PotError, SamplerError
-from .excitation import TICKS_PER_SAMPLE, Edges, Excitation
-from .machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
-from .nodal import PiecewiseLinear, piecewise_linear
-from .noise import CircuitNoise, NoisySuspension
-from .opamp import IDEAL, OpAmpModel
-from .pot import PotModel
-from .program import CHANNELS, ForceLaw, Mass, Parameter, Program, Quantity, Scales
-from .quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts, SuspensionProgram
-from .repeated import Repeat, RepeatedPlay, is_repeatable
-from .sampler import CARDS, Card, Sampler, drawn_levels
-from .spice import to_spice
-from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, drawn_offsets_v
-from .two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
+from analogrig_emulator.circuit.deck import Deck
+from analogrig_emulator.circuit.nodal import PiecewiseLinear, piecewise_linear
+from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
+from analogrig_emulator.circuit.pot import PotModel
+from analogrig_emulator.circuit.spice import to_spice
+from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.errors import (
+    CircuitError,
+    EmulatorError,
+    EngineError,
+    ExcitationError,
+    ModeError,
+    PotError,
+    SamplerError,
+)
+from analogrig_emulator.machine.bump_stop import BumpStop
+from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
+from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
+from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts, SuspensionProgram
+from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
+from analogrig_emulator.machine.suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, drawn_offsets_v
+from analogrig_emulator.machine.two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
     "BUMP_STOP",
@@ -48,6 +66,7 @@ __all__ = [
     "PROGRAMS",
     "REFERENCE_V",
     "SHOCK",
+    "SOURCE",
     "TICKS_PER_SAMPLE",
     "TWO_MASS",
     "AnalogComputer",
@@ -106,6 +125,7 @@ __all__ = [
     "drawn_offsets_v",
     "is_repeatable",
     "piecewise_linear",
+    "preset",
     "probes_per_sample",
     "to_spice",
 ]

@@ -15,15 +15,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .acquisition import acquired, probes_per_sample
-from .components import DIELECTRICS, NOMINAL, OP_AMP_GRADES, Components, Dielectric, Grade, OpAmpGrade, PotGrade
-from .excitation import Excitation
-from .noise import NoisySuspension
-from .opamp import IDEAL, PRESETS, OpAmpModel
-from .program import CHANNELS, Program
-from .quarter_car import FRONT, SHOCK
-from .sampler import Card, Sampler, drawn_levels
-from .suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, in_full
+from analogrig_emulator.card.acquisition import acquired, probes_per_sample
+from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.card.sampler import Card, Sampler, drawn_levels
+from analogrig_emulator.circuit.components import (
+    DIELECTRICS,
+    NOMINAL,
+    OP_AMP_GRADES,
+    Components,
+    Dielectric,
+    Grade,
+    OpAmpGrade,
+    PotGrade,
+)
+from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
+from analogrig_emulator.machine.noise import NoisySuspension
+from analogrig_emulator.machine.program import CHANNELS, Program
+from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
+from analogrig_emulator.machine.suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, in_full
 
 __all__ = ["DRAWS", "SAMPLES", "Effect", "measured_effects"]
 

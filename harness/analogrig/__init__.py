@@ -59,8 +59,7 @@ if TYPE_CHECKING:
     from analogrig.testing.played import Played, rate_below
     from analogrig.testing.properties import with_some_seed
     from analogrig.testing.statement import Finding
-    from analogrig_emulator.errors import EmulatorError
-    from analogrig_emulator.excitation import Excitation
+    from analogrig_emulator import EmulatorError, Excitation
 
     __version__: str
     """Version of the installed package."""
@@ -84,8 +83,7 @@ else:
         "analogrig.testing.played": "Played rate_below",
         "analogrig.testing.properties": "with_some_seed",
         "analogrig.testing.statement": "Finding",
-        "analogrig_emulator.errors": "EmulatorError",
-        "analogrig_emulator.excitation": "Excitation",
+        "analogrig_emulator": "EmulatorError Excitation",
     }
 
     def __getattr__(name: str) -> object:

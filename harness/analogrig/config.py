@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from analogrig.errors import ConfigurationError
-from analogrig_emulator.errors import EmulatorError
+from analogrig_emulator import EmulatorError
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.protocol.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.scenario import Expectations
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 _MOST = 2**31
 

@@ -133,7 +133,7 @@ class OutputFolder:
 
     def reason(self, error: BaseException | None) -> str:
         """One line that says what ended a command."""
-        from analogrig_emulator.errors import EmulatorError
+        from analogrig_emulator import EmulatorError
 
         if error is None:
             return "the command ended without a result"

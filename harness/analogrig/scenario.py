@@ -15,8 +15,7 @@ from analogrig.plant import LEAST_PARAMETER, MOST_PARAMETER, Plant
 from analogrig.run import MAX_CHANGES, MAX_SAMPLES, Segment
 from analogrig.trust import FiledName, beside
 from analogrig.wording import number_of
-from analogrig_emulator.excitation import Excitation
-from analogrig_emulator.suspension import PROGRAMS
+from analogrig_emulator import PROGRAMS, Excitation
 
 MAX_RAMP_N = 100_000
 

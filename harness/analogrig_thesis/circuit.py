@@ -15,7 +15,7 @@ from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run, Segment
 from analogrig.scenario import PlantChoice, Scenario, Tweak
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 from analogrig_thesis.chapter4 import ERROR_CEILING, UNITS_PER_M, WARM_UP_N
 from analogrig_thesis.document import Signal
 from analogrig_thesis.model import PROFILE

@@ -34,11 +34,12 @@ from analogrig_emulator import (
     Resistor,
     Sampler,
     SuspensionComputer,
+    Tweak,
     piecewise_linear,
     to_spice,
 )
-from analogrig_emulator.spice import Accuracy
-from analogrig_emulator.suspension import BLOCK_SAMPLES, Tweak
+from analogrig_emulator.circuit.spice import Accuracy
+from analogrig_emulator.machine.suspension import BLOCK_SAMPLES
 from tests.emulator.conftest import _read_raw
 
 from .figure import Figure

@@ -23,9 +23,9 @@ from analogrig_emulator import (
     Resistor,
     Switch,
     VoltageSource,
+    preset,
 )
-from analogrig_emulator.circuit import Element
-from analogrig_emulator.opamp import preset
+from analogrig_emulator.circuit.circuit import Element
 
 SOURCE = VoltageSource("V1", "in")
 

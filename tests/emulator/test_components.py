@@ -36,10 +36,10 @@ from analogrig_emulator import (
     SuspensionComputer,
     VoltageSource,
     piecewise_linear,
+    preset,
     to_spice,
 )
-from analogrig_emulator.circuit import Element
-from analogrig_emulator.opamp import preset
+from analogrig_emulator.circuit.circuit import Element
 
 from .conftest import NgSpice
 

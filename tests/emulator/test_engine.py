@@ -25,7 +25,7 @@ from analogrig_emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from analogrig_emulator.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.opamp import CLAMP_RATE
 
 Volts = NDArray[np.float64]
 Slope = Callable[[float, Volts, float], tuple[float, ...]]

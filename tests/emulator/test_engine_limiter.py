@@ -26,10 +26,10 @@ from analogrig_emulator import (
     Switch,
     VoltageSource,
     piecewise_linear,
+    preset,
     to_spice,
 )
-from analogrig_emulator.nodal import Nodal
-from analogrig_emulator.opamp import preset
+from analogrig_emulator.circuit.nodal import Nodal
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 

@@ -29,14 +29,14 @@ from analogrig_emulator import (
     Sampler,
     SuspensionComputer,
     SuspensionProgram,
+    Tweak,
     VoltageSource,
     piecewise_linear,
+    preset,
     to_spice,
 )
-from analogrig_emulator.nodal import Nodal
-from analogrig_emulator.opamp import preset
-from analogrig_emulator.pot import dial_for
-from analogrig_emulator.suspension import Tweak
+from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.pot import dial_for
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]

@@ -27,7 +27,7 @@ from analogrig_emulator import (
     VoltageSource,
     piecewise_linear,
 )
-from analogrig_emulator.nodal import Nodal
+from analogrig_emulator.circuit.nodal import Nodal
 
 Volts = NDArray[np.float64]
 

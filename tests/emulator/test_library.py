@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from analogrig_emulator import TICKS_PER_SAMPLE, EngineError, library
+from analogrig_emulator import TICKS_PER_SAMPLE, EngineError
+from analogrig_emulator.engine import library
 
 
 def test_an_engine_that_is_not_built_is_reported_with_the_line_that_builds_it(
@@ -28,7 +29,7 @@ def test_an_engine_that_does_not_load_is_reported_with_its_path(
 
 
 def test_the_limits_and_the_structures_are_those_of_the_header() -> None:
-    header = Path(library.__file__).with_name("engine").joinpath("engine.h").read_text(encoding="utf-8")
+    header = Path(library.__file__).with_name("engine.h").read_text(encoding="utf-8")
     limits = {name: int(value) for name, value in re.findall(r"#define ENGINE_(MAX_\w+|LEVELS) (\d+)", header)}
     assert limits.pop("LEVELS") == TICKS_PER_SAMPLE.bit_length()
     assert limits == {name: getattr(library, name) for name in limits}

@@ -40,12 +40,12 @@ from analogrig_emulator import (
     SuspensionComputer,
     Switch,
     VoltageSource,
+    preset,
     to_spice,
 )
-from analogrig_emulator.circuit import Element
-from analogrig_emulator.machine import RelaySwitch
-from analogrig_emulator.opamp import preset
-from analogrig_emulator.pot import coefficient_under_load
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.pot import coefficient_under_load
+from analogrig_emulator.machine.machine import RelaySwitch
 
 NgSpice = Callable[[str, Sequence[str], int], NDArray[np.float64]]
 Volts = NDArray[np.float64]

@@ -18,14 +18,15 @@ from analogrig_emulator import (
     DiodeLimiter,
     OpAmp,
     OpAmpModel,
+    PiecewiseLinear,
     Pot,
     Resistor,
     VoltageSource,
     piecewise_linear,
 )
-from analogrig_emulator.circuit import _TwoEnded
-from analogrig_emulator.nodal import Kink, Nodal, PiecewiseLinear
-from analogrig_emulator.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.circuit import _TwoEnded
+from analogrig_emulator.circuit.nodal import Kink, Nodal
+from analogrig_emulator.circuit.opamp import CLAMP_RATE
 
 SOURCE = VoltageSource("V1", "in")
 

@@ -25,8 +25,8 @@ from analogrig_emulator import (
     SuspensionComputer,
     VoltageSource,
 )
-from analogrig_emulator.circuit import Element
-from analogrig_emulator.noise import BOLTZMANN_J_PER_K
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.machine.noise import BOLTZMANN_J_PER_K
 
 KT_J = BOLTZMANN_J_PER_K * (25.0 + 273.15)
 LSB_V = 10.0 / 4096

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analogrig_emulator import PROGRAMS, Excitation, PotError, Resistor, SuspensionComputer
-from analogrig_emulator.circuit import Capacitor, OpAmp, Pot
+from analogrig_emulator import PROGRAMS, Capacitor, Excitation, OpAmp, Pot, PotError, Resistor, SuspensionComputer
 
 QUIET: dict[str, float] = {}
 

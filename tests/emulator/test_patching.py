@@ -19,10 +19,10 @@ from analogrig_emulator import (
     Resistor,
     SuspensionComputer,
     VoltageSource,
+    preset,
 )
-from analogrig_emulator.circuit import Element
-from analogrig_emulator.opamp import preset
-from analogrig_emulator.patching import Patch, patches
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.machine.patching import Patch, patches
 
 Change = Callable[[list[Element]], Iterable[Element]]
 

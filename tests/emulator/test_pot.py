@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from analogrig_emulator import PotError
-from analogrig_emulator.pot import coefficient_under_load, dial_for
+from analogrig_emulator.circuit.pot import coefficient_under_load, dial_for
 
 DIALS = (0.0, 0.01, 0.25, 0.5, 0.8358, 0.99, 1.0)
 

@@ -17,8 +17,9 @@ from analogrig_emulator import (
     SuspensionComputer,
     drawn_offsets_v,
     is_repeatable,
+    preset,
 )
-from analogrig_emulator.opamp import PRESETS, preset
+from analogrig_emulator.circuit.opamp import PRESETS
 
 OFFSET_V, SAMPLES = 3e-3, 400
 JUMPS = [(150, {"K_n_per_m": 18000.0}), (151, {"B_n_s_per_m": 3453.0}), (SAMPLES - 1, {"K_n_per_m": 24500.0})]

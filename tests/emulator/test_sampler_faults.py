@@ -16,14 +16,15 @@ from analogrig_emulator import (
     CARDS,
     Card,
     Excitation,
+    RampedTweak,
     Sampler,
     SamplerError,
     SuspensionComputer,
+    Tweak,
     acquired,
     drawn_levels,
     probes_per_sample,
 )
-from analogrig_emulator.suspension import RampedTweak, Tweak
 
 Volts = NDArray[np.float64]
 

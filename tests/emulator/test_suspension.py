@@ -22,8 +22,8 @@ from analogrig_emulator import (
     PotError,
     Program,
     SuspensionComputer,
+    Tweak,
 )
-from analogrig_emulator.suspension import Tweak
 
 Volts = NDArray[np.float64]
 

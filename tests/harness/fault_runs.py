@@ -42,7 +42,7 @@ from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.rigs.rig import Block, Hindsight, Performance
 from analogrig.run import CHANNELS, Channel, Run
 from analogrig.scenario import Scenario
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 N = 60
 MOST_N = 480

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.hardware.ni_daqmx import LEVELS_PER_SAMPLE
-from analogrig_emulator import Excitation, SuspensionComputer
-from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
-from analogrig_emulator.opamp import preset
+from analogrig_emulator import TICKS_PER_SAMPLE, Edges, Excitation, SuspensionComputer, preset
 
 
 class Error(Exception):

@@ -16,7 +16,7 @@ from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Expectations, PlantChoice, Scenario, Statement, Tweak
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 SCENARIO = """
 samples = 100

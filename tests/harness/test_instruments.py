@@ -22,8 +22,7 @@ from analogrig.hardware.simulator.inputs import InputFaults
 from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
 from analogrig.hardware.simulator.scpi import Interpreter
 from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
-from analogrig_emulator import Excitation, SuspensionComputer
-from analogrig_emulator.opamp import preset
+from analogrig_emulator import Excitation, SuspensionComputer, preset
 from tests.harness.ni_stand_in import Card, library
 
 SAMPLES = 400

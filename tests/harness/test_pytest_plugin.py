@@ -25,7 +25,7 @@ from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
 from analogrig.testing.experiment import Play, judged
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
 

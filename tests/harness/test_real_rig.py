@@ -32,7 +32,7 @@ from analogrig.rigs.rig import Performance
 from analogrig.run import Run
 from analogrig.scenario import PlantChoice, Scenario, Tweak
 from analogrig.signals import ENDING
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 from tests.harness.allowed import open_allowed
 from tests.harness.processes import LONG_S
 from tests.harness.served import RIG, ROOT, Served, served

@@ -21,7 +21,7 @@ from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.scenario import PLANTS, PlantChoice, Scenario, Tweak
 from analogrig.testing.played import Played
 from analogrig.testing.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 from tests.harness.runs import made_run
 
 quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])

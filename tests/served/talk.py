@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from analogrig.hardware.simulator.description import InstrumentDescription
 from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
 from analogrig.hardware.simulator.scpi import Interpreter
-from analogrig_emulator.suspension import SuspensionComputer
+from analogrig_emulator import SuspensionComputer
 
 SEQUENCE = (
     "GEN:RST",

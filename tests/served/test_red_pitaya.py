@@ -15,8 +15,7 @@ from analogrig.hardware.simulator.inputs import InputFaults
 from analogrig.hardware.simulator.red_pitaya import MOST_SCHEDULED, ServedRedPitaya
 from analogrig.hardware.simulator.scpi import DropOut, Interpreter
 from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
-from analogrig_emulator.excitation import Excitation
-from analogrig_emulator.suspension import SuspensionComputer
+from analogrig_emulator import Excitation, SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14

@@ -20,7 +20,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
 from analogrig.signals import ENDING
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 from tests.harness.processes import LONG_S
 from tests.served.serving import Served, ended, serving
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analogrig.hardware.simulator.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
-from analogrig_emulator.errors import EmulatorError
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import EmulatorError, Excitation
 from tests.served.talk import front
 
 RATE_HZ = 20e3

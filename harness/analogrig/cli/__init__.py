@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _explain(error: Exception) -> int:
     """Print in one line the error that ended a command; return the exit status."""
     from analogrig.errors import AnalogrigError
-    from analogrig_emulator.errors import EmulatorError
+    from analogrig_emulator import EmulatorError
 
     if isinstance(error, AnalogrigError | EmulatorError):
         return complain(str(error), USAGE)

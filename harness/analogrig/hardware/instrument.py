@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RigError
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 _ROUNDING_V = 1e-9
 _REMEMBERED = 64

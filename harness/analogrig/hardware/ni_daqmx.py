@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigClosed, RigRefused, RigTimeout
 from analogrig.hardware.instrument import Datasheet, Instrument, Taken
-from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Excitation
+from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
 RATE_HZ = 20e3
 LEVELS_PER_SAMPLE = 32

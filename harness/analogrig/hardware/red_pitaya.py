@@ -18,7 +18,7 @@ from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, 
 from analogrig.hardware.instrument import Datasheet, Instrument, Taken, Turn
 from analogrig.hardware.scpi_connection import ScpiConnection
 from analogrig.links.wire import Clock
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 PORT = 5000
 CLOCK_HZ = 125e6

@@ -11,7 +11,7 @@ from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.judging.verdict import Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
-from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Excitation
+from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
 NOISE_MARGIN = 1.05
 """The device may be set for this much less noise than there is before it matters."""

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, sampled
 from analogrig.run import CHUNK_SAMPLES, Run
-from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges
-from analogrig_emulator.suspension import PROGRAMS
+from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges
 
 if TYPE_CHECKING:
     from analogrig.scenario import Scenario

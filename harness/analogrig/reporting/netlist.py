@@ -6,8 +6,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import EmulatorRig, SetUp
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
-from analogrig_emulator import TICKS_PER_SAMPLE, Deck
-from analogrig_emulator.suspension import SOURCE
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck
 
 
 def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:

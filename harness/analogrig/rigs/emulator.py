@@ -43,9 +43,9 @@ from analogrig_emulator import (
     acquired,
     drawn_offsets_v,
     is_repeatable,
+    preset,
     probes_per_sample,
 )
-from analogrig_emulator.opamp import preset
 
 MOST_VOLTS, LEAST_SPAN_V, MOST_OFFSET_V = 1000.0, 1e-3, 1.0
 MOST_RATE_HZ, MOST_NOISE_LSB = 1e9, 1e5

@@ -22,8 +22,7 @@ from analogrig.plant import PARAMETERS, Plant
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.scenario import PLANTS, Expectations, PlantChoice, Scenario, Tweak
 from analogrig.testing import profiles
-from analogrig_emulator.excitation import Excitation
-from analogrig_emulator.suspension import PROGRAMS
+from analogrig_emulator import PROGRAMS, Excitation
 
 FIELDS = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}

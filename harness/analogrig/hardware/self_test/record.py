@@ -13,7 +13,7 @@ from analogrig.plant import Plant
 from analogrig.rigs.rig import Rig
 from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.scenario import PLANTS, PlantChoice, Scenario
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 SAMPLES = 16_384
 """As many as an instrument of the class of a Red Pitaya takes without a gap."""

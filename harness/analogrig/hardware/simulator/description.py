@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from analogrig.hardware.simulator.acquisition import AcquisitionFaults
 from analogrig.hardware.simulator.inputs import InputFaults
 from analogrig.hardware.simulator.table import SEEN, Wiring
-from analogrig_emulator.sampler import Card
+from analogrig_emulator import Card
 
 _ON_BOTH = {"noise_lsb", "gain_error", "offset_lsb", "skew_s", "clock_drift_ppm"}
 _OF_THE_CARD = {"bits", "rate_hz", "ranges_v", "throughput_hz"}

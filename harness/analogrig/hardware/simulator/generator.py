@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from analogrig.hardware.simulator.scpi import ScpiError
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 MOST_VOLTS = 1.0
 """Of its output, either way."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.sampler import Card, Sampler
+from analogrig_emulator import Card, Sampler
 
 BITS = 14
 RANGES_V = {"LV": 1.0, "HV": 20.0}

@@ -46,8 +46,7 @@ from analogrig.hardware.simulator.inputs import RANGES_V, Codes
 from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
 from analogrig.hardware.simulator.table import DueTurn, Table
 from analogrig.links.wire import Clock
-from analogrig_emulator.errors import EmulatorError
-from analogrig_emulator.suspension import SuspensionComputer
+from analogrig_emulator import EmulatorError, SuspensionComputer
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4

@@ -16,10 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.run import MEASURED
-from analogrig_emulator.excitation import TICKS_PER_SAMPLE, Edges, Excitation
-from analogrig_emulator.machine import Mode
-from analogrig_emulator.program import CHANNELS, SOURCE
-from analogrig_emulator.suspension import SuspensionComputer
+from analogrig_emulator import CHANNELS, SOURCE, TICKS_PER_SAMPLE, Edges, Excitation, Mode, SuspensionComputer
 
 SEEN = tuple(CHANNELS.index(name) for name in MEASURED)
 

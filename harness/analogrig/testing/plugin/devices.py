@@ -179,7 +179,7 @@ def _single(rig: str, dut: str) -> str:
     from analogrig.devices.devices import describe
     from analogrig.errors import AnalogrigError
     from analogrig.rigs.description import described
-    from analogrig_emulator.errors import EmulatorError
+    from analogrig_emulator import EmulatorError
 
     with contextlib.suppress(AnalogrigError, EmulatorError):
         if dut and describe(dut).only_one:

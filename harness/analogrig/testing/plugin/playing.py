@@ -33,7 +33,7 @@ def in_one_line(by: str = "") -> Iterator[None]:
     """What went wrong with rig, link or device is told without the way through our code; what cannot be configured
     together with who wanted it."""
     from analogrig.errors import AnalogrigError, ConfigurationError
-    from analogrig_emulator.errors import EmulatorError
+    from analogrig_emulator import EmulatorError
 
     try:
         yield

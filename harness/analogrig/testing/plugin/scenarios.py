@@ -167,7 +167,7 @@ class ScenarioItem(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         from analogrig.errors import AnalogrigError
-        from analogrig_emulator.errors import EmulatorError
+        from analogrig_emulator import EmulatorError
 
         if isinstance(excinfo.value, ScenarioFailed | AnalogrigError | EmulatorError):
             return f"{self.path}: {str(excinfo.value).removeprefix(f'{self.path}: ')}"

@@ -22,7 +22,7 @@ from analogrig.testing.properties.experiments import (
 )
 from analogrig.testing.properties.test_detection import SURELY
 from analogrig.testing.strategies import link_faults, profile, seeds
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 SHORT = Scenario(samples=300, excitation=Excitation(low_v=0.1, high_v=9.9), name="short")
 FAULTS_EACH, LEAST_VALID_KINDS = 4, 4

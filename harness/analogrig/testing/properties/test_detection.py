@@ -21,7 +21,7 @@ from analogrig.testing.properties.experiments import (
     single_changes_are_rightly_named,
 )
 from analogrig.testing.strategies import WARM_UP_N, profile, scenarios, seeds
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 ARL0 = 1e5
 MOST_INFORMATION = 6.0

@@ -17,7 +17,7 @@ from analogrig.testing.properties.experiments import (
 )
 from analogrig.testing.statement import Finding
 from analogrig.testing.strategies import profile, rigs, scenarios, seeds
-from analogrig_emulator.excitation import Excitation
+from analogrig_emulator import Excitation
 
 WITHIN = 0.1
 """Of M, B and K each: six times the rms error of the worst plant drawn."""

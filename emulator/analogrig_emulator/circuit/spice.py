@@ -18,7 +18,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import (
+from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.circuit.circuit import (
     Capacitor,
     Circuit,
     CurrentSource,
@@ -30,10 +31,9 @@ from .circuit import (
     Switch,
     VoltageSource,
 )
-from .errors import CircuitError
-from .excitation import TICKS_PER_SAMPLE, Edges
-from .opamp import CLAMP_RATE
-from .pot import END_FRACTION
+from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.pot import END_FRACTION
+from analogrig_emulator.errors import CircuitError
 
 __all__ = ["STEP_S", "Accuracy", "to_spice"]
 

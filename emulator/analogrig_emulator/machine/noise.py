@@ -22,14 +22,14 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from . import library
-from .circuit import GROUND, Circuit, OpAmp, Pot, Resistor
-from .components import REFERENCE_C, OpAmpGrade
-from .errors import CircuitError
-from .excitation import Excitation
-from .nodal import Nodal, PiecewiseLinear
-from .pot import legs_ohm
-from .suspension import BLOCK_SAMPLES, RampedTweak, SuspensionComputer, Tweak
+from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
+from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
+from analogrig_emulator.circuit.nodal import Nodal, PiecewiseLinear
+from analogrig_emulator.circuit.pot import legs_ohm
+from analogrig_emulator.engine import library
+from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, RampedTweak, SuspensionComputer, Tweak
 
 __all__ = ["BOLTZMANN_J_PER_K", "CircuitNoise", "NoisySuspension"]
 

@@ -14,9 +14,9 @@ from itertools import pairwise
 from numbers import Real
 from typing import ClassVar, Never, TypeAlias, TypeVar
 
-from .errors import CircuitError
-from .opamp import OpAmpModel
-from .pot import checked_dial
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.pot import checked_dial
+from analogrig_emulator.errors import CircuitError
 
 __all__ = [
     "GROUND",

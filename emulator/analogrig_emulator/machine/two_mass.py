@@ -13,9 +13,9 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from .circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
-from .opamp import OpAmpModel
-from .program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.circuit.circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
 
 __all__ = ["TWO_MASS", "TwoMassParts", "TwoMassPlant", "TwoMassProgram"]
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from . import library
-from .errors import EngineError
-from .excitation import TICKS_PER_SAMPLE, Edges
-from .nodal import Kink, PiecewiseLinear
+from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.circuit.nodal import Kink, PiecewiseLinear
+from analogrig_emulator.engine import library
+from analogrig_emulator.errors import EngineError
 
 __all__ = ["Engine", "EngineCounts", "Turns"]
 

@@ -25,8 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import library
-from .circuit import (
+from analogrig_emulator.circuit.circuit import (
     GROUND,
     Capacitor,
     Circuit,
@@ -41,9 +40,10 @@ from .circuit import (
     refused,
     unknown,
 )
-from .errors import CircuitError
-from .opamp import CLAMP_RATE
-from .pot import checked_dial, legs_ohm
+from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.circuit.pot import checked_dial, legs_ohm
+from analogrig_emulator.engine import library
+from analogrig_emulator.errors import CircuitError
 
 __all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "Trim", "piecewise_linear"]
 

@@ -1,4 +1,4 @@
-"""The compiled half of the emulator (engine/), found beside this file and loaded on first use."""
+"""The compiled half of the emulator (engine/), found beside the packages and loaded on first use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 from ctypes import POINTER, c_double, c_int, c_int64, c_void_p
 from pathlib import Path
 
-from .errors import EngineError
+from analogrig_emulator.errors import EngineError
 
 __all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "System", "load"]
 
@@ -18,7 +18,7 @@ MAX_KINKS = 64
 MAX_OUTPUTS = 256
 MAX_UNKNOWNS = 256
 
-_HERE = Path(__file__).parent
+_HERE = Path(__file__).parents[1]
 _BUILD = "make setup"
 
 

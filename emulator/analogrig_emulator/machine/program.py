@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import Element
-from .errors import PotError
-from .opamp import OpAmpModel
+from analogrig_emulator.circuit.circuit import Element
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.errors import PotError
 
 __all__ = ["CHANNELS", "SOURCE", "ForceLaw", "Mass", "Parameter", "Program", "Quantity", "Scales"]
 

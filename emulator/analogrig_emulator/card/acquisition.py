@@ -16,10 +16,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SamplerError
-from .excitation import Edges, Excitation
-from .sampler import Card
-from .suspension import RampedTweak, Tweak, in_full
+from analogrig_emulator.card.excitation import Edges, Excitation
+from analogrig_emulator.card.sampler import Card
+from analogrig_emulator.errors import SamplerError
+from analogrig_emulator.machine.suspension import RampedTweak, Tweak, in_full
 
 __all__ = ["PROBE_S", "Playable", "acquired", "probes_per_sample"]
 

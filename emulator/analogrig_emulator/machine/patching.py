@@ -11,9 +11,19 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from .circuit import GROUND, Capacitor, Circuit, CurrentSource, Element, OpAmp, Pot, VoltageSource, label
-from .components import is_part_of
-from .errors import CircuitError
+from analogrig_emulator.circuit.circuit import (
+    GROUND,
+    Capacitor,
+    Circuit,
+    CurrentSource,
+    Element,
+    OpAmp,
+    Pot,
+    VoltageSource,
+    label,
+)
+from analogrig_emulator.circuit.components import is_part_of
+from analogrig_emulator.errors import CircuitError
 
 __all__ = ["Patch", "patches"]
 

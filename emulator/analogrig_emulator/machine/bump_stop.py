@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .circuit import DiodeLimiter
-from .errors import CircuitError
-from .program import Scales
+from analogrig_emulator.circuit.circuit import DiodeLimiter
+from analogrig_emulator.errors import CircuitError
+from analogrig_emulator.machine.program import Scales
 
 __all__ = ["BumpStop"]
 

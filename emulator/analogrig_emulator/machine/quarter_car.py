@@ -16,10 +16,10 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from .bump_stop import BumpStop
-from .circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
-from .opamp import OpAmpModel
-from .program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.circuit.circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.machine.bump_stop import BumpStop
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
 
 __all__ = ["BUMP_STOP", "FRONT", "SHOCK", "SuspensionParts", "SuspensionProgram"]
 

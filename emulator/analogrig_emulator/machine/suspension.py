@@ -11,17 +11,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import Circuit, Pot, Resistor
-from .components import NOMINAL, Components
-from .errors import CircuitError, EngineError, PotError
-from .excitation import Edges, Excitation
-from .machine import AnalogComputer, Mode
-from .opamp import OpAmpModel, preset
-from .pot import PotModel, checked_dial, checked_ramp
-from .program import CHANNELS, SOURCE, Program, Scales
-from .quarter_car import BUMP_STOP, FRONT, SHOCK
-from .two_mass import TWO_MASS
-from .whole import is_whole
+from analogrig_emulator.card.excitation import Edges, Excitation
+from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
+from analogrig_emulator.circuit.components import NOMINAL, Components
+from analogrig_emulator.circuit.opamp import OpAmpModel, preset
+from analogrig_emulator.circuit.pot import PotModel, checked_dial, checked_ramp
+from analogrig_emulator.errors import CircuitError, EngineError, PotError
+from analogrig_emulator.machine.machine import AnalogComputer, Mode
+from analogrig_emulator.machine.program import CHANNELS, SOURCE, Program, Scales
+from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
+from analogrig_emulator.machine.two_mass import TWO_MASS
+from analogrig_emulator.whole import is_whole
 
 __all__ = [
     "CHANNELS",

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from .errors import CircuitError
+from analogrig_emulator.errors import CircuitError
 
 __all__ = ["CLAMP_RATE", "IDEAL", "PRESETS", "OpAmpModel", "preset"]
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CircuitError, PotError
-from .whole import is_whole
+from analogrig_emulator.errors import CircuitError, PotError
+from analogrig_emulator.whole import is_whole
 
 __all__ = ["END_FRACTION", "PotModel", "checked_dial", "checked_ramp", "coefficient_under_load", "dial_for", "legs_ohm"]
 

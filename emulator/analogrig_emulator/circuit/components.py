@@ -23,7 +23,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import (
+from analogrig_emulator.circuit.circuit import (
     GROUND,
     Capacitor,
     CurrentSource,
@@ -36,9 +36,9 @@ from .circuit import (
     VoltageSource,
     unknown,
 )
-from .errors import CircuitError
-from .opamp import OpAmpModel
-from .pot import PotModel
+from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.pot import PotModel
+from analogrig_emulator.errors import CircuitError
 
 __all__ = [
     "COMPONENTS",

@@ -19,8 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import SamplerError
-from .whole import is_whole
+from analogrig_emulator.errors import SamplerError
+from analogrig_emulator.whole import is_whole
 
 __all__ = ["CARDS", "RANGES_V", "Card", "Sampler", "drawn_levels"]
 

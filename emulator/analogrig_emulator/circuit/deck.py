@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import Circuit
-from .engine import Engine
-from .excitation import Edges
-from .nodal import Nodal
-from .spice import Accuracy, to_spice
+from analogrig_emulator.card.excitation import Edges
+from analogrig_emulator.circuit.circuit import Circuit
+from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.spice import Accuracy, to_spice
+from analogrig_emulator.engine.engine import Engine
 
 __all__ = ["Deck"]
 

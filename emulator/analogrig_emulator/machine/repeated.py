@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import OpAmp
-from .engine import Engine, Turns
-from .excitation import Excitation
-from .machine import lit
-from .nodal import Nodal
-from .program import SOURCE
-from .suspension import RampedTweak, SuspensionComputer, Tweak, in_full
+from analogrig_emulator.card.excitation import Excitation
+from analogrig_emulator.circuit.circuit import OpAmp
+from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.engine.engine import Engine, Turns
+from analogrig_emulator.machine.machine import lit
+from analogrig_emulator.machine.program import SOURCE
+from analogrig_emulator.machine.suspension import RampedTweak, SuspensionComputer, Tweak, in_full
 
 __all__ = ["Repeat", "RepeatedPlay", "is_repeatable"]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ExcitationError
+from analogrig_emulator.errors import ExcitationError
 
 __all__ = ["TICKS_PER_SAMPLE", "Edges", "Excitation"]
 

@@ -25,14 +25,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .circuit import GROUND, Capacitor, Circuit, Element, OpAmp, Pot, Resistor, Switch, VoltageSource, label
-from .components import NOMINAL, Components, contact_of, is_part_of
-from .engine import Engine
-from .errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
-from .excitation import TICKS_PER_SAMPLE, Edges
-from .nodal import Kink, Nodal, PiecewiseLinear
-from .patching import Patch, patches
-from .pot import END_FRACTION, checked_dial, checked_ramp
+from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
+from analogrig_emulator.circuit.circuit import (
+    GROUND,
+    Capacitor,
+    Circuit,
+    Element,
+    OpAmp,
+    Pot,
+    Resistor,
+    Switch,
+    VoltageSource,
+    label,
+)
+from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
+from analogrig_emulator.circuit.nodal import Kink, Nodal, PiecewiseLinear
+from analogrig_emulator.circuit.pot import END_FRACTION, checked_dial, checked_ramp
+from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
+from analogrig_emulator.machine.patching import Patch, patches
 
 __all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch", "lit"]
 

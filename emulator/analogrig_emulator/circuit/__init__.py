@@ -1,0 +1,1 @@
+"""Netlists: elements, real components, nodal analysis, and the deck for ngspice."""

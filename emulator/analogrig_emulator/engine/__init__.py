@@ -1,0 +1,1 @@
+"""The compiled engine: piecewise linear state spaces, played exactly."""
