@@ -1,5 +1,5 @@
 """How well the instant of a turn is learned from the samples: coverage of its interval, and its width beside the least
-that any could have. Trials of tests.harness.onsets; fixed seeds.
+that any could have. Trials of tests.harness.dating_trials; fixed seeds.
 
 python -m tests.benchmarks.bench_onset [jump] [ramp] [still] [several]
 """
@@ -18,12 +18,12 @@ from typing import TypeVar
 import numpy as np
 
 from analogrig.hardware.by_hand import Tweak, doubts
-from analogrig.hardware.onset.jump import NoOnset, Onset, onset
-from analogrig.hardware.onset.turn import SlowTurn
+from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
+from analogrig.hardware.dating.turn import TurnInstants
 from analogrig.judging.statistics import lower_rate
 from analogrig.rigs.rig import Rig
 from tests.harness.allowed import open_allowed
-from tests.harness.onsets import Clock, Several, Trial, still
+from tests.harness.dating_trials import Clock, Several, Trial, still
 from tests.harness.served import served
 
 from .figure import Figure
@@ -37,14 +37,14 @@ SIZES = {"below 10 %": 0.1, "below 20 %": 0.2, "below 40 %": 0.4, "more": 1.0}
 WRONG_N = 25
 """Records, of which every turn is told wrong."""
 
-Found = TypeVar("Found", Onset, SlowTurn)
+Found = TypeVar("Found", Instant, TurnInstants)
 
 
 def jumps(trials: int = JUMPS_N) -> Iterator[Figure]:
     """Changes of 5 to 50 % of one or two parameters; at 99 % confidence the coverage is above its first bound."""
     for clock in CLOCKS:
         name = f"jump, clock {clock}"
-        pairs, each_ms = _searched(Trial.jump, Trial.found, Onset, clock, trials)
+        pairs, each_ms = _searched(Trial.jump, Trial.found, Instant, clock, trials)
         yield _coverage(
             f"{name}: instants within the interval", [_holds(found, of.sample) for of, found in pairs], trials
         )
@@ -58,7 +58,7 @@ def ramps(trials: int = RAMPS_N) -> Iterator[Figure]:
     """Even turns of 10 to 50 % of one parameter in 20 to 600 samples."""
     for clock in CLOCKS:
         name = f"ramp, clock {clock}"
-        pairs, each_ms = _searched(Trial.ramp, Trial.turned, SlowTurn, clock, trials)
+        pairs, each_ms = _searched(Trial.ramp, Trial.turned, TurnInstants, clock, trials)
         begins = [_holds(found.begin, of.sample) for of, found in pairs]
         ends = [_holds(found.end, of.sample + of.ramp_n) for of, found in pairs]
         yield _coverage(f"{name}: begins within the interval", begins, trials)
@@ -69,7 +69,7 @@ def ramps(trials: int = RAMPS_N) -> Iterator[Figure]:
 
 def _searched(
     play: Callable[[int, Clock], Trial],
-    search: Callable[[Trial], Found | NoOnset],
+    search: Callable[[Trial], Found | NoInstant],
     kind: type[Found],
     clock: Clock,
     trials: int,
@@ -82,11 +82,11 @@ def _searched(
     return [(trial, each) for trial, each in zip(played, found, strict=True) if isinstance(each, kind)], each_ms
 
 
-def _holds(interval: Onset, sample: int) -> bool:
+def _holds(interval: Instant, sample: int) -> bool:
     return interval.low <= sample <= interval.high
 
 
-def _width(name: str, intervals: Sequence[Onset], remark: str) -> Figure:
+def _width(name: str, intervals: Sequence[Instant], remark: str) -> Figure:
     widths = np.array([each.high - each.low + 1 for each in intervals])
     return Figure(name, float(widths.mean()), f"samples; median {np.median(widths):.0f}; {remark}")
 
@@ -94,7 +94,7 @@ def _width(name: str, intervals: Sequence[Onset], remark: str) -> Figure:
 def quiet(trials: int = STILL_N) -> Iterator[Figure]:
     """Pots that were to be turned, and were not."""
     for clock in CLOCKS:
-        said = [isinstance(still(seed, clock).found(), NoOnset) for seed in range(trials)]
+        said = [isinstance(still(seed, clock).found(), NoInstant) for seed in range(trials)]
         yield _coverage(f"no turn, clock {clock}: said so", said, trials)
 
 
@@ -123,9 +123,9 @@ def _told(name: str, every: Sequence[Several]) -> Iterator[Figure]:
     for record in every:
         for tweak, alone in record.stretches():
             search = range(alone.start + 1, alone.stop - 1)
-            found = onset(record.signals, tweak.before, tweak.after, search, within=alone)
-            held.append(isinstance(found, Onset) and _holds(found, tweak.sample))
-            unseen += isinstance(found, NoOnset)
+            found = date_jump(record.signals, tweak.before, tweak.after, search, within=alone)
+            held.append(isinstance(found, Instant) and _holds(found, tweak.sample))
+            unseen += isinstance(found, NoInstant)
             silent.append(not _doubted(record, tweak, alone, 0))
     yield _coverage(f"{name}: instants within the interval", held, len(held))
     yield Figure(f"{name}: nothing found", unseen, f"of {len(held)}")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from analogrig.hardware.by_hand import ByHand, Tweak, doubts
-from analogrig.hardware.onset.two_filter import Signals
+from analogrig.hardware.dating.two_filter import Signals
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
 from analogrig.scenario import Tweak as PlayedTweak
-from tests.harness.onsets import FRONT, Clock, Several, played, scenario_of
+from tests.harness.dating_trials import FRONT, Clock, Several, played, scenario_of
 
 RATE_HZ = 20e3
 

@@ -19,12 +19,12 @@ from analogrig.cli import main
 from analogrig.cli.calibrate import _said
 from analogrig.errors import ConfigurationError, RigError
 from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
-from analogrig.hardware.calibration.model import Model, _taken_late
+from analogrig.hardware.calibration.model import EmulatorModel, _taken_late
 from analogrig.hardware.calibration.plan import check_scenario, scenarios
 from analogrig.hardware.calibration.recordings import (
     DISPLACEMENT,
     FORCE,
-    Recording,
+    SquareWaveRecording,
     averaged,
     noise_of,
     record,
@@ -77,12 +77,12 @@ def test_pots_that_are_set_by_their_dials_are_found_out_with_the_tracks_they_hav
 # ---- noise and rounding
 
 
-def made(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: int = 0) -> Recording:
+def made(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: int = 0) -> SquareWaveRecording:
     """A recording of a scenario of the plan (half a period: 50 samples), of these codes on both channels."""
     channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in MEASURED}
     both = np.stack([codes, codes], axis=1)
     hidden = np.zeros(both.shape, np.bool_) if clipped is None else np.stack([clipped, clipped], axis=1)
-    return Recording(scenarios("front")[scenario_n], 50e-6, channels, both.astype(np.uint16), hidden)
+    return SquareWaveRecording(scenarios("front")[scenario_n], 50e-6, channels, both.astype(np.uint16), hidden)
 
 
 @pytest.mark.parametrize("noise_lsb", [0.0, 0.2, 0.35, 0.6, 1.0, 3.0])
@@ -137,7 +137,7 @@ def test_a_pot_that_misses_its_setting_is_a_pot_set_elsewhere(pot: int, elsewher
     """By a thousandth of its coefficient, which is 1 / M, B and K; seen, and told to a hundredth of that."""
     there = made(np.zeros(1400))
     other = dataclasses.replace(there, scenario=dataclasses.replace(there.scenario, plant=elsewhere))
-    model = Model([there, other], ComputerDescription(), 1.0)
+    model = EmulatorModel([there, other], ComputerDescription(), 1.0)
     at_rest = np.zeros(len(model.known_to))
     missed = at_rest.copy()
     missed[len(model.unknowns) + pot] = 1e-3
@@ -151,13 +151,13 @@ def test_a_pot_that_misses_its_setting_is_a_pot_set_elsewhere(pot: int, elsewher
 
 
 @pytest.fixture(scope="module")
-def recordings() -> list[Recording]:
+def recordings() -> list[SquareWaveRecording]:
     """Of the nominal computer and a card without fault but noise."""
     with open_rig("emulator") as rig:
         return [record(rig, each, 1) for each in scenarios("front")]
 
 
-def otherwise(recordings: list[Recording], **changes: Any) -> list[Recording]:
+def otherwise(recordings: list[SquareWaveRecording], **changes: Any) -> list[SquareWaveRecording]:
     return [
         dataclasses.replace(each, **{name: change(each) for name, change in changes.items()}) for each in recordings
     ]
@@ -173,18 +173,18 @@ def otherwise(recordings: list[Recording], **changes: Any) -> list[Recording]:
     ids=["swapped leads", "silence", "edges a sample late"],
 )
 def test_recordings_that_no_computer_makes_end_in_one_line(
-    recordings: list[Recording], codes: Any, message: str
+    recordings: list[SquareWaveRecording], codes: Any, message: str
 ) -> None:
     with pytest.raises(RigError, match=message):
         calibrate(otherwise(recordings, codes=codes), stocks=("nominal",), pots=("coefficient",))
 
 
-def test_too_few_recordings_are_told_apart_from_enough(recordings: list[Recording]) -> None:
+def test_too_few_recordings_are_told_apart_from_enough(recordings: list[SquareWaveRecording]) -> None:
     with pytest.raises(RigError, match="do not tell what is to be fitted|does not settle"):
         calibrate(recordings[:1], stocks=("nominal",), pots=("coefficient",))
 
 
-def test_a_card_whose_samples_do_not_fit_the_periods_is_refused(recordings: list[Recording]) -> None:
+def test_a_card_whose_samples_do_not_fit_the_periods_is_refused(recordings: list[SquareWaveRecording]) -> None:
     with pytest.raises(ConfigurationError, match=r"scenario calibration-1: half a period .* at 12345 Hz; .* 20000 Hz"):
         calibrate(otherwise(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
 

@@ -20,7 +20,7 @@ from analogrig.errors import ConfigurationError, RigError, SelfTestError
 from analogrig.hardware.self_test.conduct import self_test
 from analogrig.hardware.self_test.findings import Check, Findings
 from analogrig.hardware.self_test.response import SecondOrder
-from analogrig.hardware.self_test.timing import Levels, Line, SeenEdges, averaged_n, lateness
+from analogrig.hardware.self_test.timing import EdgeTimes, Levels, SeenEdges, averaged_n, lateness
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
@@ -320,7 +320,7 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
     """The truth is always among the instants that are left: half a width is sqrt(3) standard errors."""
     rng = np.random.default_rng(5)
     for _ in range(100):
-        line = Line(*(rng.uniform(190.0, 210.0) + np.array([0.0, *rng.uniform(0, 1, 1), 100.0])))
+        line = EdgeTimes(*(rng.uniform(190.0, 210.0) + np.array([0.0, *rng.uniform(0, 1, 1), 100.0])))
         late_n = float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
@@ -332,7 +332,7 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
 def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
     rng = np.random.default_rng(6)
     for averaged in (0.3, 1.0):
-        line, late_n = Line(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
+        line, late_n = EdgeTimes(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
         codes = square_wave(line, late_n, averaged)
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
@@ -341,7 +341,7 @@ def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
         assert found_n == pytest.approx(late_n, abs=5e-3)
 
 
-def square_wave(line: Line, late_n: float, averaged: float) -> Codes:
+def square_wave(line: EdgeTimes, late_n: float, averaged: float) -> Codes:
     """16,384 codes of a wave that is high from rising to falling edges, each that much later than the line."""
     parts = []
     for window in (0.5, -0.5) if averaged else (0.0,):
@@ -355,12 +355,12 @@ def square_wave(line: Line, late_n: float, averaged: float) -> Codes:
     return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
 
 
-def numbered(line: Line, edges: SeenEdges) -> Line:
+def numbered(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
     """The same line, its instants those next to the middle edge as the edges have them."""
     turns = np.rint((edges.line().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
     turns = np.rint((edges.line().falling_n - line.falling_n) / line.period_n)
-    return Line(line.period_n, rising, line.falling_n + turns * line.period_n)
+    return EdgeTimes(line.period_n, rising, line.falling_n + turns * line.period_n)
 
 
 @pytest.mark.parametrize(("mass", "damping"), [(46.0, 12.3), (0.0163, 0.0735), (4.0, 4.0)])

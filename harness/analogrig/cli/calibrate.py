@@ -10,8 +10,8 @@ from analogrig.cli.options import add_command, add_json, add_rig, add_seed, file
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 
 if TYPE_CHECKING:
-    from analogrig.hardware.calibration.fit import Calibration, Estimate
-    from analogrig.hardware.calibration.recordings import Recording
+    from analogrig.hardware.calibration.fit import Calibration, FittedValue
+    from analogrig.hardware.calibration.recordings import SquareWaveRecording
     from analogrig.rigs.rig import Rig
 
 MOST_LSB = 1.0
@@ -98,7 +98,7 @@ def _run(arguments: argparse.Namespace) -> int:
     return PASSED if check_lsb <= MOST_LSB else FAILED
 
 
-def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[Recording]:
+def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[SquareWaveRecording]:
     """Those to be fitted, and one more to compare rig and twin on.
 
     :raises RigError: the rig failed, or is not well.
@@ -122,7 +122,7 @@ def _table(found: Calibration, check_lsb: float, arguments: argparse.Namespace) 
     return "\n".join([*lines, "", *_said(found, check_lsb), kept])
 
 
-def _value(estimate: Estimate) -> str:
+def _value(estimate: FittedValue) -> str:
     factor, unit = _SHOWN_AS[estimate.unit]
     return f"{factor * estimate.value:10.4f} +- {factor * estimate.standard_error:9.4f} {unit:3}"
 

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from analogrig.hardware.onset.jump import NoOnset, onset
-from analogrig.hardware.onset.turn import SlowTurn, turn
-from analogrig.hardware.onset.two_filter import Signals
+from analogrig.hardware.dating.jump import NoInstant, date_jump
+from analogrig.hardware.dating.turn import TurnInstants, date_turn
+from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.pots import Pots
 from analogrig.links.wire import Clock
 from analogrig.plant import AT_REST, Plant, SampledPlant
@@ -112,8 +112,8 @@ def _dated(signals: Signals, tweak: Tweak, search: range, within: range, *, slow
         return Segment(start, tweak.after, unseen="the pot was turned when the record was over, or nearly so")
     if slow or len(tweak.before.changes_to(tweak.after)) > 1:
         middle = None if slow else tweak.middle
-        turned = turn(signals, tweak.before, tweak.after, search, middle=middle, within=within)
-        if isinstance(turned, SlowTurn):
+        turned = date_turn(signals, tweak.before, tweak.after, search, middle=middle, within=within)
+        if isinstance(turned, TurnInstants):
             begin, end = turned.begin, turned.end
             return Segment(
                 begin.sample,
@@ -125,8 +125,8 @@ def _dated(signals: Signals, tweak: Tweak, search: range, within: range, *, slow
                 end_high=end.high,
             )
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=turned.reason)
-    found = onset(signals, tweak.before, tweak.after, search, within=within)
-    if isinstance(found, NoOnset):
+    found = date_jump(signals, tweak.before, tweak.after, search, within=within)
+    if isinstance(found, NoInstant):
         return Segment(search.start, tweak.after, ramp_n=len(search), unseen=found.reason)
     return Segment(found.sample, tweak.after, start_low=found.low, start_high=found.high)
 
@@ -144,9 +144,9 @@ def doubts(signals: Signals, tweaks: Sequence[Tweak], first: int) -> list[str]:
         if len(search) < LEAST_SEARCH_N:
             continue
         alone = range(before + 1, after)
-        found = onset(signals, tweak.before, tweak.after, search, within=alone, confidence=_BEYOND_DOUBT)
+        found = date_jump(signals, tweak.before, tweak.after, search, within=alone, confidence=_BEYOND_DOUBT)
         where = f"the pot that was to be turned at sample {first + tweak.sample} ({tweak.words})"
-        if isinstance(found, NoOnset):
+        if isinstance(found, NoInstant):
             if found.unchanged and _is_plain(signals, tweak, range(tweak.sample, after)):
                 out.append(f"{where}: {found.reason}")
         elif not found.low - _GRACE_N <= tweak.sample <= found.high + _GRACE_N:

@@ -1,7 +1,7 @@
 """Who turns the pots of a real rig where its instrument cannot: a command, a box at a serial line, or the operator.
 
 None of them knows the sample at which a pot got there: that is learned from the samples afterwards
-(``analogrig.hardware.onset``).
+(``analogrig.hardware.dating``).
 Dials go from 0 to 1; how far each pot may be turned is for the caller to check, before anything moves.
 """
 

@@ -17,9 +17,9 @@ from typing import Any, Self
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from analogrig.hardware.by_hand import ByHand, Tweak, doubts
+from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import Instrument, PotBox, Record, Turn, located
 from analogrig.hardware.lock import Lock
-from analogrig.hardware.onset.two_filter import Signals
 from analogrig.hardware.plan import Plan, Wired, records
 from analogrig.hardware.pots import NoPots, Pots
 from analogrig.hardware.self_test.conduct import self_test

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from analogrig.hardware.calibration.recordings import DISPLACEMENT, Recording, Vector, averaged, periods
+from analogrig.hardware.calibration.recordings import DISPLACEMENT, SquareWaveRecording, Vector, averaged, periods
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.run import CHANNELS, MEASURED
 from analogrig.scenario import Scenario
@@ -27,7 +27,7 @@ def seen_lsb(description: EmulatorDescription, scenario: Scenario, seed: int) ->
     return Sampler(silent, np.random.default_rng(0)).seen_lsb(volts)[:, columns]
 
 
-def difference_lsb(recording: Recording, twin: EmulatorDescription, noise_lsb: float) -> float:
+def difference_lsb(recording: SquareWaveRecording, twin: EmulatorDescription, noise_lsb: float) -> float:
     """Within how many LSB rms the displacements of rig and twin are: two standard errors above what is found.
 
     The averages of the recording are compared; what noise and rounding make of the squares is taken out.

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 
 from analogrig.errors import RigError
-from analogrig.hardware.calibration.model import OFFSET, SKEW, Model
+from analogrig.hardware.calibration.model import OFFSET, SKEW, EmulatorModel
 from analogrig.hardware.calibration.recordings import (
     DISPLACEMENT,
     FORCE,
-    Recording,
+    SquareWaveRecording,
     Vector,
     averaged,
     noise_of,
@@ -45,7 +45,7 @@ _FINE_SKEW = 1e-3
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedValue:
     """A fitted value with its standard error."""
 
     name: str
@@ -63,7 +63,7 @@ class Calibration:
     """A rig's twin, and how well it is known."""
 
     twin: EmulatorDescription
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedValue, ...]
     covariance: Vector
     """Of those of the estimates that were fitted to the displacement together, which come first."""
     residual_lsb: float
@@ -73,7 +73,7 @@ class Calibration:
     freedom: int
     """Its expectation."""
 
-    def estimate(self, name: str) -> Estimate:
+    def estimate(self, name: str) -> FittedValue:
         """:raises KeyError: none is called so."""
         return {each.name: each for each in self.estimates}[name]
 
@@ -107,7 +107,7 @@ class Calibration:
 
 
 def calibrate(
-    recordings: Sequence[Recording],
+    recordings: Sequence[SquareWaveRecording],
     *,
     op_amp: str = "tl07x",
     stocks: Sequence[Stock] = STOCKS,
@@ -126,9 +126,9 @@ def calibrate(
     """
     noise_lsb, noise_error = noise_of(recordings, DISPLACEMENT)
     kinds = [[ComputerDescription(op_amp=op_amp, components=stock, pots=set_by) for stock in stocks] for set_by in pots]
-    fits = _fits([[Model(recordings, machine, noise_lsb) for machine in alike] for alike in kinds], progress)
+    fits = _fits([[EmulatorModel(recordings, machine, noise_lsb) for machine in alike] for alike in kinds], progress)
     best = _likeliest(fits)
-    noise = Estimate("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
+    noise = FittedValue("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
     estimates = (*best.estimates(), noise, *_force_channel(recordings))
     computer = best.model.computer(best.model.by_name(best.x))
     return Calibration(
@@ -142,13 +142,13 @@ def calibrate(
 
 
 def _fits(
-    models: Sequence[Sequence[Model]], progress: Callable[[int, int], None] | None
-) -> dict[tuple[Stock, Pots], _Fit]:
+    models: Sequence[Sequence[EmulatorModel]], progress: Callable[[int, int], None] | None
+) -> dict[tuple[Stock, Pots], _EmulatorFit]:
     """Of every kind that can be fitted at all; those that have the same unknowns are in one row.
 
     :raises RigError: none can; that of the first.
     """
-    fits: dict[tuple[Stock, Pots], _Fit] = {}
+    fits: dict[tuple[Stock, Pots], _EmulatorFit] = {}
     problems: list[RigError] = []
     for alike in models:
         start: Vector | None = None
@@ -166,7 +166,7 @@ def _fits(
     return fits
 
 
-def _likeliest(fits: Mapping[tuple[Stock, Pots], _Fit]) -> _Fit:
+def _likeliest(fits: Mapping[tuple[Stock, Pots], _EmulatorFit]) -> _EmulatorFit:
     """The one with the least chi-square; but pots are set by coefficients unless that is out of the question, for
     tracks that are unknowns too explain a bit more of anything."""
     kinds = sorted(fits, key=lambda kind: fits[kind].chi_square)
@@ -192,10 +192,10 @@ _SETTLED, _FAR = 0.02, 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _EmulatorFit:
     """Where the squares are least."""
 
-    model: Model
+    model: EmulatorModel
     x: Vector
     residuals: Vector
     covariance_of_all: Vector
@@ -214,15 +214,15 @@ class _Fit:
         n = len(self.model.unknowns)
         return self.covariance_of_all[:n, :n] * max(1.0, self.chi_square / self.freedom)
 
-    def estimates(self) -> list[Estimate]:
+    def estimates(self) -> list[FittedValue]:
         errors = np.sqrt(np.diag(self.covariance)).tolist()
         return [
-            Estimate(unknown.name, value, error, unknown.unit, unknown.stands_for, unknown.known_to)
+            FittedValue(unknown.name, value, error, unknown.unit, unknown.stands_for, unknown.known_to)
             for unknown, value, error in zip(self.model.unknowns, self.x.tolist(), errors, strict=False)
         ]
 
 
-def _fitted(model: Model, x: Vector | None) -> _Fit:
+def _fitted(model: EmulatorModel, x: Vector | None) -> _EmulatorFit:
     """From x, or from nominal. The last slopes are kept while steps are short.
 
     :raises RigError: it does not settle.
@@ -234,14 +234,14 @@ def _fitted(model: Model, x: Vector | None) -> _Fit:
         step = covariance @ slopes.T @ residuals
         length = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
         if length <= _SETTLED:
-            return _Fit(model, x, residuals, covariance)
+            return _EmulatorFit(model, x, residuals, covariance)
         x = x - step
         if length > _FAR:
             slopes, covariance = _linear(model, x)
     raise RigError("the emulator does not become like the recordings: the fit does not settle")
 
 
-def _approached(model: Model) -> Vector:
+def _approached(model: EmulatorModel) -> Vector:
     x = np.zeros(len(model.known_to))
     for doubt_lsb in _DOUBTS_LSB:
         slopes, covariance = _linear(model, x, doubt_lsb)
@@ -249,7 +249,7 @@ def _approached(model: Model) -> Vector:
     return x
 
 
-def _linear(model: Model, x: Vector, doubt_lsb: float = 0.0) -> tuple[Vector, Vector]:
+def _linear(model: EmulatorModel, x: Vector, doubt_lsb: float = 0.0) -> tuple[Vector, Vector]:
     """The slopes of the residuals, and the covariance that they give."""
     slopes = model.jacobian(x, doubt_lsb)
     return slopes, _inverse(slopes.T @ slopes)
@@ -276,7 +276,7 @@ def _inverse(normal: Vector) -> Vector:
 # ---- the card
 
 
-def _force_channel(recordings: Sequence[Recording]) -> list[Estimate]:
+def _force_channel(recordings: Sequence[SquareWaveRecording]) -> list[FittedValue]:
     """Offset, gain error and noise of the channel of the force, whose levels are known: a weighted line."""
     noise_lsb, noise_error = noise_of(recordings, FORCE)
     levels = [level for recording in recordings for level in _levels(recording, noise_lsb)]
@@ -286,13 +286,13 @@ def _force_channel(recordings: Sequence[Recording]) -> list[Estimate]:
     offset, gain = (covariance @ design.T @ (errors_lsb / np.sqrt(variances))).tolist()
     offset_error, gain_error = np.sqrt(np.diag(covariance)).tolist()
     return [
-        Estimate("force offset", offset, offset_error, "LSB", "offset of the force's channel"),
-        Estimate("force gain", gain, gain_error, "", "gain of the force's channel, and of the generator"),
-        Estimate("force noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding"),
+        FittedValue("force offset", offset, offset_error, "LSB", "offset of the force's channel"),
+        FittedValue("force gain", gain, gain_error, "", "gain of the force's channel, and of the generator"),
+        FittedValue("force noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding"),
     ]
 
 
-def _levels(recording: Recording, noise_lsb: float) -> list[tuple[float, float, float]]:
+def _levels(recording: SquareWaveRecording, noise_lsb: float) -> list[tuple[float, float, float]]:
     """Of both levels of the force: the level and by how much its mean code is off, both in LSB, and the variance."""
     average = averaged(recording, FORCE, noise_lsb)
     channel, wave, half_n = recording.channels["force"], recording.scenario.excitation, recording.period_n // 2
@@ -307,7 +307,7 @@ def _levels(recording: Recording, noise_lsb: float) -> list[tuple[float, float, 
     return levels
 
 
-def _card(recordings: Sequence[Recording], estimates: Sequence[Estimate]) -> CardDescription:
+def _card(recordings: Sequence[SquareWaveRecording], estimates: Sequence[FittedValue]) -> CardDescription:
     by_name = {each.name: each for each in estimates}
     value = {name: each.value for name, each in by_name.items()}
     period_s, skew = recordings[0].sample_period_s, by_name[SKEW]
@@ -338,14 +338,14 @@ def _coarse(late_n: float) -> float:
     )
 
 
-def _bits(recordings: Sequence[Recording]) -> int:
+def _bits(recordings: Sequence[SquareWaveRecording]) -> int:
     """The least even number of bits, from 12 on, that has the code of 0 V and all that came."""
     zeros = [channel.zero for recording in recordings for channel in recording.channels.values()]
     most = max([*zeros, *(float(recording.codes.max()) for recording in recordings)])
     return next(bits for bits in (12, 14, 16) if most < 1 << bits or bits == 16)
 
 
-def _ranges(recordings: Sequence[Recording]) -> dict[str, tuple[float, float]]:
+def _ranges(recordings: Sequence[SquareWaveRecording]) -> dict[str, tuple[float, float]]:
     channels, codes = recordings[0].channels, 1 << _bits(recordings)
     measured = {name: (channel.low_v, channel.low_v + codes * channel.lsb_v) for name, channel in channels.items()}
     return {name: measured.get(name, _UNMEASURED_RANGE_V) for name in CHANNELS}

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analogrig.errors import RigError
-from analogrig.hardware.calibration.recordings import DISPLACEMENT, Recording, Vector, averaged, periods
+from analogrig.hardware.calibration.recordings import DISPLACEMENT, SquareWaveRecording, Vector, averaged, periods
 from analogrig.rigs.emulator import (
     CardDescription,
     ComputerDescription,
@@ -127,10 +127,12 @@ class _Late(Excitation):
         return Edges(early.ticks + self.ticks, early.levels_v)
 
 
-class Model:
+class EmulatorModel:
     """What the emulator says the averages of the displacement are, for any values of the unknowns."""
 
-    def __init__(self, recordings: Sequence[Recording], computer: ComputerDescription, noise_lsb: float) -> None:
+    def __init__(
+        self, recordings: Sequence[SquareWaveRecording], computer: ComputerDescription, noise_lsb: float
+    ) -> None:
         self.recordings = recordings
         self.unknowns = _unknowns(computer)
         self.nominal = computer
@@ -159,7 +161,7 @@ class Model:
         each = [np.full(len(average.phases), average.variance) for average in self._averages]
         return np.sqrt(np.concatenate(each) + doubt_lsb**2)
 
-    def codes(self, x: Vector, recording: Recording) -> Vector:
+    def codes(self, x: Vector, recording: SquareWaveRecording) -> Vector:
         """The mean code of each phase of the period, not rounded: (phases,)."""
         values = self.by_name(x)
         channel = recording.channels["displacement"]
@@ -194,13 +196,13 @@ class Model:
         except ValueError as error:
             raise RigError(f"the emulator does not become like the recordings: {error}") from error
 
-    def _missed(self, x: Vector, recording: Recording) -> dict[str, float]:
+    def _missed(self, x: Vector, recording: SquareWaveRecording) -> dict[str, float]:
         factors = np.ones(len(_GAINS))
         for column, setting in self._columns_of(recording):
             factors *= (1.0 + x[column]) ** setting.powers
         return dict(zip(_GAINS, factors.tolist(), strict=True))
 
-    def _slopes(self, x: Vector, recording: Recording) -> Vector:
+    def _slopes(self, x: Vector, recording: SquareWaveRecording) -> Vector:
         """Of ``codes``: (phases, unknowns)."""
         here = self.codes(x, recording)
         slopes = np.zeros((len(here), len(x)))
@@ -216,11 +218,11 @@ class Model:
             slopes[:, column] = slopes[:, gains] @ ((1.0 + x[gains]) * setting.powers)
         return slopes
 
-    def _columns_of(self, recording: Recording) -> list[tuple[int, _Setting]]:
+    def _columns_of(self, recording: SquareWaveRecording) -> list[tuple[int, _Setting]]:
         first = len(self.unknowns)
         return [(first + self._settings.index(setting), setting) for setting in self._settings_of(recording)]
 
-    def _settings_of(self, recording: Recording) -> list[_Setting]:
+    def _settings_of(self, recording: SquareWaveRecording) -> list[_Setting]:
         plant = recording.scenario.plant.plant()
         errors = _pot_errors(recording.scenario.plant)
         values = zip(plant.parameters().values(), errors, strict=True)

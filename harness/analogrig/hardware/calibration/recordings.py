@@ -25,7 +25,7 @@ FORCE, DISPLACEMENT = range(2)
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class SquareWaveRecording:
     """What a rig gave for one scenario: square wave, pots at rest."""
 
     scenario: Scenario
@@ -52,7 +52,7 @@ class Recording:
         return round(period_n)
 
 
-def record(rig: Rig, scenario: Scenario, seed: int) -> Recording:
+def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     """Plays the scenario on the rig.
 
     :raises ConfigurationError: the rig cannot play it.
@@ -68,7 +68,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> Recording:
     if len({block.record for block in blocks}) != 1:
         raise RigError(f"scenario {scenario.name}: was not recorded without a gap: nothing can be fitted")
     columns = [CHANNELS.index(name) for name in MEASURED]
-    return Recording(
+    return SquareWaveRecording(
         scenario,
         performance.sample_period_s,
         {name: performance.channels[name] for name in MEASURED},
@@ -89,7 +89,7 @@ class Averages:
     """Of each mean, LSB^2."""
 
 
-def periods(recording: Recording, values: NDArray[np.generic]) -> NDArray[np.generic]:
+def periods(recording: SquareWaveRecording, values: NDArray[np.generic]) -> NDArray[np.generic]:
     """The settled part of (n,) as (periods, samples of a period)."""
     period_n = recording.period_n
     first = -(-SETTLING_N // period_n) * period_n
@@ -97,7 +97,7 @@ def periods(recording: Recording, values: NDArray[np.generic]) -> NDArray[np.gen
     return values[first:last].reshape(-1, period_n)
 
 
-def averaged(recording: Recording, channel: int, noise_lsb: float) -> Averages:
+def averaged(recording: SquareWaveRecording, channel: int, noise_lsb: float) -> Averages:
     """The variance is that of the noise and that of rounding, which averaging does not remove."""
     codes = periods(recording, recording.codes[:, channel]).astype(np.float64)
     clipped = periods(recording, recording.clipped[:, channel]).any(axis=0)
@@ -116,7 +116,7 @@ def rounding(noise_lsb: float) -> float:
     return float((np.exp(-((2.0 * math.pi * k * noise_lsb) ** 2)) / (2.0 * (math.pi * k) ** 2)).sum())
 
 
-def noise_of(recordings: Sequence[Recording], channel: int) -> tuple[float, float]:
+def noise_of(recordings: Sequence[SquareWaveRecording], channel: int) -> tuple[float, float]:
     """The noise of a channel before rounding and its standard error, LSB rms, from samples a period apart.
 
     :raises RigError: every sample is clipped.

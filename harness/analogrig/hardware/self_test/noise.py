@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.self_test.timing import Levels, Line, SeenEdges
+from analogrig.hardware.self_test.timing import EdgeTimes, Levels, SeenEdges
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 
 _UNSETTLED_N = 3
@@ -41,7 +41,7 @@ def of_levels(codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges) -> tu
 
 
 def of_answer(
-    residual: NDArray[np.float64], samples: NDArray[np.int64], line: Line, half_period_n: float
+    residual: NDArray[np.float64], samples: NDArray[np.int64], line: EdgeTimes, half_period_n: float
 ) -> tuple[float, float]:
     """The noise (rms) of the displacement while it moves, quantisation included, and its standard error.
 
@@ -66,7 +66,7 @@ def of_answer(
 
 
 def unexplained(
-    residual: NDArray[np.float64], samples: NDArray[np.int64], line: Line, noise_rms: float
+    residual: NDArray[np.float64], samples: NDArray[np.int64], line: EdgeTimes, noise_rms: float
 ) -> tuple[float, float]:
     """What the fit leaves alike in every period (rms), and its standard error; arguments as ``of_answer``.
 
@@ -84,7 +84,7 @@ def unexplained(
 
 
 def _in_equivalent_time(
-    residual: NDArray[np.float64], samples: NDArray[np.int64], line: Line
+    residual: NDArray[np.float64], samples: NDArray[np.int64], line: EdgeTimes
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Time since the last rising edge, and the residual less its mean over that period."""
     turn, since = np.divmod(samples - line.rising_n, line.period_n)

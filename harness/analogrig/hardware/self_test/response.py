@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import SelfTestError
-from analogrig.hardware.self_test.timing import Line, SeenEdges
+from analogrig.hardware.self_test.timing import EdgeTimes, SeenEdges
 
 _EDGES_FELT = 2
 """So many edges back is the response settled: the rest is below 1e-5 for a half period of 100 samples."""
@@ -71,7 +71,7 @@ class Response:
     gain: float
     """Displacement per force at rest."""
     second_order: SecondOrder
-    line: Line
+    line: EdgeTimes
     """The edges' instants by the displacement."""
     offset_error: float
     gain_error: float
@@ -128,7 +128,7 @@ class Answer:
     def _design(self, q: NDArray[np.float64], samples: NDArray[np.int64]) -> NDArray[np.float64]:
         """(samples, 2): what the offset and the gain are multiplied with."""
         second_order = SecondOrder(float(np.exp(q[_MASS])), float(np.exp(q[_DAMPING])))
-        instants = Line(q[_PERIOD], q[_RISING], q[_FALLING]).instants(self.edges)
+        instants = EdgeTimes(q[_PERIOD], q[_RISING], q[_FALLING]).instants(self.edges)
         sign = np.where(self.edges.rising, 1.0, -1.0)
         last = np.searchsorted(instants, samples + 0.5 * self.averaged_n) - 1
         before = last - _EDGES_FELT
@@ -160,7 +160,7 @@ class Answer:
             offset=float(linear[0]),
             gain=float(linear[1]),
             second_order=SecondOrder(mass, damping),
-            line=Line(*map(float, q[_PERIOD:])),
+            line=EdgeTimes(*map(float, q[_PERIOD:])),
             offset_error=float(errors[0]),
             gain_error=float(errors[1]),
             mass_error_n2=float(errors[2]) * mass,

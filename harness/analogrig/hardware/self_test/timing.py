@@ -85,12 +85,12 @@ class SeenEdges:
         first = 0 if self.rising[0] else 1
         return np.asarray((np.arange(len(self.rising)) + first) // 2 - len(self.rising) // 4, dtype=np.float64)
 
-    def line(self) -> Line:
+    def line(self) -> EdgeTimes:
         """That on which their middles lie best; it is off by part of a sample."""
         design = np.stack([self.turn, self.rising, ~self.rising], axis=1).astype(np.float64)
         middles = 0.5 * (self.before + self.after)
         period, rising, falling = np.linalg.lstsq(design, middles, rcond=None)[0]
-        return Line(float(period), float(rising), float(falling))
+        return EdgeTimes(float(period), float(rising), float(falling))
 
     def on_the_way(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The samples between the levels, and the edge of each."""
@@ -101,7 +101,7 @@ class SeenEdges:
 
 
 @dataclass(frozen=True)
-class Line:
+class EdgeTimes:
     """When the edges of a square wave come, in samples: one instant near the middle of the record, and the period."""
 
     period_n: float
@@ -121,7 +121,7 @@ def averaged_n(edges: SeenEdges) -> float:
 
 
 def lateness(
-    codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges, line: Line, room_n: float
+    codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges, line: EdgeTimes, room_n: float
 ) -> tuple[float, float]:
     """By how many samples the edges of these codes are later than the line says, and its standard error.
 

@@ -99,7 +99,7 @@ ANYWHERE = EdgePlace(0.5, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class PlantModel:
     """One plant from sample to sample. Displacement in the rms of its noise, velocity in that per sample.
 
     Derivatives are by the logarithms of M, B, K.
@@ -179,7 +179,7 @@ class Columns:
     """(n, c): the displacement."""
 
     @classmethod
-    def of(cls, model: Model, signals: Signals, course: Array, offsets: tuple[float, float]) -> Self:
+    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: tuple[float, float]) -> Self:
         """About a course of the state (n, 2) and offsets of displacement and force, in the rms of their noise."""
         n = len(signals)
         force = (signals.force_n + offsets[1] * signals.noise_n)[:, None]
@@ -213,7 +213,7 @@ class Forwards:
     """(n, c): in their standard deviation; 0 for a sample that is none."""
 
     @classmethod
-    def of(cls, model: Model, signals: Signals, columns: Columns) -> Self:
+    def of(cls, model: PlantModel, signals: Signals, columns: Columns) -> Self:
         """A Kalman filter that begins with any state."""
         weight = signals.valid.astype(np.float64)
         gain, size, covariance = _gains(model, weight, model.disturbances(signals))
@@ -243,7 +243,7 @@ class Backwards:
     """(n,)"""
 
     @classmethod
-    def of(cls, model: Model, signals: Signals, columns: Columns) -> Self:
+    def of(cls, model: PlantModel, signals: Signals, columns: Columns) -> Self:
         """An information filter that begins, at the end, knowing nothing."""
         weight = signals.valid.astype(np.float64)
         disturbances = model.disturbances(signals)[:-1]
@@ -294,7 +294,7 @@ def scan(factors: Array, terms: Array) -> Array:
     return sums
 
 
-def _gains(model: Model, weight: Array, disturbances: Array) -> tuple[Array, Array, Array]:
+def _gains(model: PlantModel, weight: Array, disturbances: Array) -> tuple[Array, Array, Array]:
     """Of each sample the gain (n, 2), the innovation's variance (n,), and the covariance with it taken in (n, 2, 2).
 
     In plain floats, since a 2 x 2 product takes numpy ten times as long.
@@ -316,7 +316,7 @@ def _gains(model: Model, weight: Array, disturbances: Array) -> tuple[Array, Arr
     return table[:, :2], table[:, 2], table[:, 3:].reshape(-1, 2, 2)
 
 
-def _informations(model: Model, weight: Array, disturbances: Array) -> Array:
+def _informations(model: PlantModel, weight: Array, disturbances: Array) -> Array:
     """(n - 1, 2, 2): what the samples from the next one on say of the state at that next one."""
     (a, b), (c, d) = model.transition.tolist()
     p = q = r = 0.0

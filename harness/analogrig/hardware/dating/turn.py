@@ -15,8 +15,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.onset.jump import CONFIDENCE, Guess, NoOnset, Onset, Problem, beside, doubt, interval
-from analogrig.hardware.onset.two_filter import Array, Backwards, EdgePlace, Forwards, Model, Signals, joined
+from analogrig.hardware.dating.jump import CONFIDENCE, Guess, Instant, NoInstant, Problem, beside, doubt, interval
+from analogrig.hardware.dating.two_filter import Array, Backwards, EdgePlace, Forwards, PlantModel, Signals, joined
 from analogrig.plant import PARAMETERS, Plant
 
 Indices = NDArray[np.int64]
@@ -36,27 +36,27 @@ _FINE_N = 8
 
 
 @dataclass(frozen=True)
-class SlowTurn:
+class TurnInstants:
     """From the last sample that cannot tell of it to the first at which the plant has become another one."""
 
-    begin: Onset
-    end: Onset
+    begin: Instant
+    end: Instant
 
-    def wider(self, search: range, part: float) -> SlowTurn:
+    def wider(self, search: range, part: float) -> TurnInstants:
         """By a part of the time that it takes, within the range."""
         more = round(part * (self.end.sample - self.begin.sample))
         begin, end = (
-            Onset(each.sample, max(each.low - more, search.start), min(each.high + more, search.stop - 1))
+            Instant(each.sample, max(each.low - more, search.start), min(each.high + more, search.stop - 1))
             for each in (self.begin, self.end)
         )
-        return SlowTurn(begin, end)
+        return TurnInstants(begin, end)
 
 
 Shape = Callable[[Array], Array]
 """Of a way: the part of it that is gone after a part of the time."""
 
 
-def turn(
+def date_turn(
     signals: Signals,
     before: Plant,
     after: Plant | None,
@@ -65,9 +65,9 @@ def turn(
     middle: Plant | None = None,
     within: range | None = None,
     confidence: float = CONFIDENCE,
-) -> SlowTurn | NoOnset:
+) -> TurnInstants | NoInstant:
     """When a pot began to turn and when it stood, both in ``search``; other arguments as of
-    ``analogrig.hardware.onset.onset``.
+    ``analogrig.hardware.dating.onset``.
 
     :param middle: two pots jumped, one after the other, and between the two the plant was this one.
     :raises ValueError: the range is empty, or leaves the record or ``within``.
@@ -83,11 +83,11 @@ def turn(
     if objection := problem.objection(float(best.cost[at]), unexplained, guess):
         return objection
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
-        return NoOnset(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
+        return NoInstant(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
     doubted = doubt(guess, max(unexplained, float(best.on_the_way[at])))
     likely = [tried for tried in every if tried.cost.min() - best.cost[at] <= _LIKELY * doubted]
     shift = search.start - problem.candidates.start
-    found = SlowTurn(
+    found = TurnInstants(
         _over([_instant(tried.begin, tried.cost / doubted, confidence) for tried in likely], shift),
         _over([_instant(tried.end, tried.cost / doubted, confidence) for tried in likely], shift),
     )
@@ -153,16 +153,16 @@ def _fine(instants: Indices, cost: Array, confidence: float) -> bool:
     return int(((once >= found.low) & (once <= found.high)).sum()) >= _FINE_N
 
 
-def _instant(instants: Indices, cost: Array, confidence: float) -> Onset:
+def _instant(instants: Indices, cost: Array, confidence: float) -> Instant:
     """With an interval that reaches to the next instants that were tried and refused."""
     once, marginal = _marginal(instants, cost)
     found, between = interval(marginal, once, confidence), _step(once) - 1
-    return Onset(int(instants[cost.argmin()]), found.low - between, found.high + between)
+    return Instant(int(instants[cost.argmin()]), found.low - between, found.high + between)
 
 
-def _over(found: Sequence[Onset], shift: int) -> Onset:
+def _over(found: Sequence[Instant], shift: int) -> Instant:
     """Over all shapes, the likeliest one first."""
-    return Onset(
+    return Instant(
         found[0].sample + shift, min(each.low for each in found) + shift, max(each.high for each in found) + shift
     )
 
@@ -250,7 +250,7 @@ class _Ways:
 
 def _row(signals: Signals, plant: Plant, edges: EdgePlace, offset: float) -> Array:
     """(12,) of ``_Ways.parts``."""
-    model = Model.of(plant, edges, signals)
+    model = PlantModel.of(plant, edges, signals)
     covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
     return np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]])
 

@@ -2,7 +2,7 @@
 
 Where an operator sets the pots, or a command that takes its time, nobody knows the sample at which the plant changed.
 The samples tell: the plant as it was explains those up to the instant, the plant as it then is those after it
-(``analogrig.hardware.onset.two_filter``). What else is not known is estimated with it: M, B, K before and after, since
+(``analogrig.hardware.dating.two_filter``). What else is not known is estimated with it: M, B, K before and after, since
 a real rig
 is some per cent beside its nominal values, the offsets of both channels, and where in a sample period the edges of the
 force come.
@@ -24,14 +24,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.onset.two_filter import (
+from analogrig.hardware.dating.two_filter import (
     ANYWHERE,
     Array,
     Backwards,
     Columns,
     EdgePlace,
     Forwards,
-    Model,
+    PlantModel,
     Signals,
     joined,
     scan,
@@ -94,7 +94,7 @@ _MOST_UNEXPLAINED = 25.0
 
 
 @dataclass(frozen=True)
-class Onset:
+class Instant:
     """The instant of a change as a sample, which is the last one that cannot tell."""
 
     sample: int
@@ -106,7 +106,7 @@ class Onset:
 
 
 @dataclass(frozen=True)
-class NoOnset:
+class NoInstant:
     """Nothing in the samples can be called the instant of the change."""
 
     reason: str
@@ -114,7 +114,7 @@ class NoOnset:
     """The plant does not seem to have changed at all."""
 
 
-def onset(
+def date_jump(
     signals: Signals,
     before: Plant,
     after: Plant | None,
@@ -122,7 +122,7 @@ def onset(
     *,
     within: range | None = None,
     confidence: float = CONFIDENCE,
-) -> Onset | NoOnset:
+) -> Instant | NoInstant:
     """The instant at which the plant jumped.
 
     :param before: as it was asked for; what it really is may be some per cent beside it.
@@ -142,7 +142,7 @@ def onset(
     return objection or interval(cost, np.arange(search.start, search.stop), confidence)
 
 
-def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Onset:
+def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Instant:
     """The instant, from twice the negative logarithms of the likelihoods of ``samples``, which ascend."""
     likelihood = np.exp(-0.5 * (cost - cost.min()))
     best_first = np.argsort(cost, kind="stable")
@@ -150,7 +150,7 @@ def interval(cost: Array, samples: NDArray[np.int64], confidence: float) -> Onse
     inside = cost - cost.min() <= NormalDist().inv_cdf(0.5 + 0.5 * confidence) ** 2
     inside[best_first[: int(np.searchsorted(held, confidence)) + 1]] = True
     low, high = samples[np.flatnonzero(inside)[[0, -1]]].tolist()
-    return Onset(int(samples[best_first[0]]), low, high)
+    return Instant(int(samples[best_first[0]]), low, high)
 
 
 def doubt(guess: Guess, unexplained: float) -> float:
@@ -313,11 +313,11 @@ class Problem:
             Backwards.of(new, self.signals, Columns.of(new, self.signals, course, (guess.offset, guess.new[0]))),
         )
 
-    def models(self, guess: Guess) -> tuple[Model, Model]:
+    def models(self, guess: Guess) -> tuple[PlantModel, PlantModel]:
         """Of the plant as it was, and as it then is."""
         return (
-            Model.of(beside(self.before, guess.old), guess.edges, self.signals),
-            Model.of(beside(self.after, guess.new), guess.edges, self.signals),
+            PlantModel.of(beside(self.before, guess.old), guess.edges, self.signals),
+            PlantModel.of(beside(self.after, guess.new), guess.edges, self.signals),
         )
 
     def profile(self, guess: Guess) -> Profile:
@@ -346,10 +346,10 @@ class Problem:
                 break
         return guess, profile
 
-    def objection(self, cost: float, unexplained: float, guess: Guess) -> NoOnset | None:
+    def objection(self, cost: float, unexplained: float, guess: Guess) -> NoInstant | None:
         """Why the likeliest instant, of that cost, is none; None if it is one."""
         if unexplained > _MOST_UNEXPLAINED or self.left > _MOST_LEFT:
-            return NoOnset(
+            return NoInstant(
                 f"what a plant that changes once leaves of the samples has {unexplained * self.left:.3g} times the"
                 " variance of their noise"
             )
@@ -357,15 +357,17 @@ class Problem:
         none = _settled(self.signals, self.before, guess, known, rounds=1).cost
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if none - cost < chance * doubt(guess, unexplained):
-            return NoOnset(f"nothing in the samples {self._searched} shows that the plant has changed", unchanged=True)
+            return NoInstant(
+                f"nothing in the samples {self._searched} shows that the plant has changed", unchanged=True
+            )
         return None
 
-    def beyond(self, cost: Array) -> NoOnset | None:
+    def beyond(self, cost: Array) -> NoInstant | None:
         """Why the likeliest of the instants that have these costs is none: towards an end of the range they fall."""
         best = int(cost.argmin())
         inwards = {0: 1, len(cost) - 1: len(cost) - 2}.get(best)
         if inwards is not None and len(cost) > 1 and cost[inwards] - cost[best] > _RISING:
-            return NoOnset(f"the plant seems to have changed before or after the samples {self._searched}")
+            return NoInstant(f"the plant seems to have changed before or after the samples {self._searched}")
         return None
 
     @property
@@ -410,7 +412,7 @@ def colour(innovations: Sequence[Array]) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _PlantFit:
     """What samples of one plant say."""
 
     guess: Guess
@@ -422,16 +424,16 @@ class _Fit:
     innovation: Array = field(default_factory=lambda: np.zeros(0))
 
 
-def _settled(signals: Signals, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS) -> _Fit:
+def _settled(signals: Signals, plant: Plant, guess: Guess, known: Array, rounds: int = _ROUNDS) -> _PlantFit:
     """From a guess; too few samples say nothing.
 
     :param known: (6,) standard deviations of what is known beforehand: the guess.
     """
-    fit = _Fit(guess, float(known[1]))
+    fit = _PlantFit(guess, float(known[1]))
     first = guess
     for _ in range(rounds if len(signals) >= _LEAST_FIT_N else 0):
         last = fit.guess
-        model = Model.of(beside(plant, last.old), last.edges, signals)
+        model = PlantModel.of(beside(plant, last.old), last.edges, signals)
         transitions = np.broadcast_to(model.transition, (len(signals), 2, 2))
         course = _course(transitions, model.inputs(signals, last.old[0]), signals, last.offset)
         filtered = Forwards.of(model, signals, Columns.of(model, signals, course, (last.offset, last.old[0])))
@@ -441,7 +443,7 @@ def _settled(signals: Signals, plant: Plant, guess: Guess, known: Array, rounds:
         rows /= known[:, None]
         form = filtered.misfit[-1] + rows.T @ rows
         unknowns, left = _minimum(form[None])
-        fit = _Fit(
+        fit = _PlantFit(
             last.moved(Move(np.append(unknowns[0], np.zeros(_OWN)), last.sample)),
             float(np.linalg.inv(form[1:, 1:])[1, 1] ** 0.5),
             float(left[0] + filtered.log[-1]),

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.hardware.by_hand import Tweak as Told
-from analogrig.hardware.onset.jump import NoOnset, Onset, onset
-from analogrig.hardware.onset.turn import SlowTurn, turn
-from analogrig.hardware.onset.two_filter import Signals
+from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
+from analogrig.hardware.dating.turn import TurnInstants, date_turn
+from analogrig.hardware.dating.two_filter import Signals
 from analogrig.judging import information
 from analogrig.plant import PARAMETERS, Plant, SampledPlant
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
@@ -114,11 +114,11 @@ class Trial:
         scenario = scenario_of(3000, clock, 200.0, after, sample, ramp_n)
         return cls(played(scenario, seed), after, sample, ramp_n, search, known=True)
 
-    def found(self) -> Onset | NoOnset:
-        return onset(self.signals, FRONT, self.after if self.known else None, self.search)
+    def found(self) -> Instant | NoInstant:
+        return date_jump(self.signals, FRONT, self.after if self.known else None, self.search)
 
-    def turned(self) -> SlowTurn | NoOnset:
-        return turn(self.signals, FRONT, self.after if self.known else None, self.search)
+    def turned(self) -> TurnInstants | NoInstant:
+        return date_turn(self.signals, FRONT, self.after if self.known else None, self.search)
 
     def width_bound(self) -> int:
         """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the

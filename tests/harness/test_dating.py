@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.hardware.onset.jump import NoOnset, Onset, Problem, colour, interval, onset
-from analogrig.hardware.onset.turn import SlowTurn, turn
-from analogrig.hardware.onset.two_filter import (
+from analogrig.hardware.dating.jump import Instant, NoInstant, Problem, colour, date_jump, interval
+from analogrig.hardware.dating.turn import TurnInstants, date_turn
+from analogrig.hardware.dating.two_filter import (
     ANYWHERE,
     Backwards,
     Columns,
     EdgePlace,
     Forwards,
-    Model,
+    PlantModel,
     Signals,
     joined,
 )
 from analogrig.plant import Plant, SampledPlant
 from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
-from tests.harness.onsets import FRONT, Trial, played, scenario_of, still
+from tests.harness.dating_trials import FRONT, Trial, played, scenario_of, still
 
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01
 NOISE_LSB = (1.0 + 1.0 / 12.0) ** 0.5
@@ -60,15 +60,15 @@ def simulated(
     )
 
 
-def found(signals: Signals, after: Plant | None, search: range, before: Plant = FRONT) -> Onset:
-    out = onset(signals, before, after, search)
-    assert isinstance(out, Onset), out
+def found(signals: Signals, after: Plant | None, search: range, before: Plant = FRONT) -> Instant:
+    out = date_jump(signals, before, after, search)
+    assert isinstance(out, Instant), out
     return out
 
 
 def reason(signals: Signals, after: Plant | None, search: range) -> str:
-    out = onset(signals, FRONT, after, search)
-    assert isinstance(out, NoOnset), out
+    out = date_jump(signals, FRONT, after, search)
+    assert isinstance(out, NoInstant), out
     return out.reason
 
 
@@ -80,10 +80,10 @@ def test_interval_holds_the_instant_on_machines_of_real_components(clock: str) -
     """One that held it in only 95 % of all cases would miss it more than 4 times in 20 once in 400 sets of seeds."""
     trials = [Trial.jump(seed, clock) for seed in range(20)]  # type: ignore[arg-type]
     every = [trial.found() for trial in trials]
-    held = [isinstance(each, Onset) and each.low <= trial.sample <= each.high for trial, each in
+    held = [isinstance(each, Instant) and each.low <= trial.sample <= each.high for trial, each in
             zip(trials, every, strict=True)]  # fmt: skip
     assert held.count(False) <= 4
-    widths = [each.high - each.low + 1 for each in every if isinstance(each, Onset)]
+    widths = [each.high - each.low + 1 for each in every if isinstance(each, Instant)]
     assert np.mean(widths) <= 2.25 * np.mean([trial.width_bound() for trial in trials])
 
 
@@ -93,7 +93,7 @@ def test_large_change_just_after_an_edge_is_found_to_the_sample(after: Plant, pl
     quiet = simulated([(0, FRONT)], 1200, seed=3, place=place)
     edge = 600 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[600:])) > 1000.0)[0])
     signals = simulated([(0, FRONT), (edge + 4, after)], 1200, seed=3, place=place)
-    assert found(signals, after, range(400, 800)) == Onset(edge + 4, edge + 4, edge + 4)
+    assert found(signals, after, range(400, 800)) == Instant(edge + 4, edge + 4, edge + 4)
 
 
 def test_change_while_nothing_moves_may_have_come_at_any_time_until_the_next_edge() -> None:
@@ -159,8 +159,8 @@ def test_finer_card_is_not_believed_more_than_real_components_deserve() -> None:
         valid = np.ones(3500, bool)
         signals = Signals(force_n, displacement_m, valid, PERIOD_S, 294.0 * noise_v, 0.01996 * noise_v)
         middle = FRONT.scaled("B", 2123.0 / 3021.0)
-        out = turn(signals, FRONT, middle.scaled("K", 20000.0 / 24500.0), range(1200, 2200), middle=middle)
-        assert isinstance(out, SlowTurn), out
+        out = date_turn(signals, FRONT, middle.scaled("K", 20000.0 / 24500.0), range(1200, 2200), middle=middle)
+        assert isinstance(out, TurnInstants), out
         assert out.begin.low - 1 <= sample <= out.begin.high + 1
         assert out.end.low - 1 <= sample + 112 <= out.end.high + 1
 
@@ -178,8 +178,8 @@ def test_samples_that_are_none_are_not_looked_at() -> None:
 def test_twice_the_confidence_is_a_wider_interval() -> None:
     trial = Trial.jump(36, "card")  # K that falls by a third while the force is low
     usual = found(trial.signals, trial.after, trial.search)
-    sure = onset(trial.signals, FRONT, trial.after, trial.search, confidence=0.999)
-    assert isinstance(sure, Onset)
+    sure = date_jump(trial.signals, FRONT, trial.after, trial.search, confidence=0.999)
+    assert isinstance(sure, Instant)
     assert sure.low < usual.low and usual.high <= sure.high
 
 
@@ -190,7 +190,7 @@ def test_twice_the_confidence_is_a_wider_interval() -> None:
 def test_pot_that_was_not_turned_is_said_to_be_so(clock: str) -> None:
     for seed in range(8):
         trial = still(seed, clock)  # type: ignore[arg-type]
-        assert isinstance(trial.found(), NoOnset), seed
+        assert isinstance(trial.found(), NoInstant), seed
 
 
 def test_change_that_cannot_be_seen_is_not_made_up() -> None:
@@ -226,28 +226,28 @@ def test_change_just_behind_the_range_is_not_taken_for_one_in_it() -> None:
 )
 def test_change_far_outside_of_the_range_is_not_taken_for_one_in_it(search: range, said: str) -> None:
     signals = simulated([(0, FRONT), (600, SOFT)], 1200, seed=17)
-    found = onset(signals, FRONT, SOFT, search)
-    assert isinstance(found, NoOnset)
+    found = date_jump(signals, FRONT, SOFT, search)
+    assert isinstance(found, NoInstant)
     assert not found.unchanged
     assert found.reason.startswith(said)
 
 
 def test_another_change_nearby_is_kept_out() -> None:
     signals = simulated([(0, FRONT), (600, SOFT), (700, FRONT.scaled("M", 0.5).scaled("K", 0.7))], 1200, seed=35)
-    crowded = onset(signals, FRONT, SOFT, range(500, 650))
-    assert isinstance(crowded, Onset)
+    crowded = date_jump(signals, FRONT, SOFT, range(500, 650))
+    assert isinstance(crowded, Instant)
     assert crowded.high - crowded.low > 5
-    assert onset(signals, FRONT, SOFT, range(500, 650), within=range(700)) == Onset(600, 600, 600)
+    assert date_jump(signals, FRONT, SOFT, range(500, 650), within=range(700)) == Instant(600, 600, 600)
     with pytest.raises(ValueError, match=r"leaves range\(550, 700\), in which the plant changes no other time"):
-        onset(signals, FRONT, SOFT, range(500, 650), within=range(550, 700))
+        date_jump(signals, FRONT, SOFT, range(500, 650), within=range(550, 700))
 
 
 def test_change_between_two_others_is_found_from_the_few_samples_about_its_range() -> None:
     """49 samples before the range and 50 after it, which begin while the mass is on its way from the change before."""
     for seed in range(20):
         signals = simulated([(0, SOFT), (300, FRONT), (550, SOFT)], 800, seed)
-        out = onset(signals, FRONT, SOFT, range(350, 750), within=range(301, 800), confidence=0.999)
-        assert isinstance(out, Onset), (seed, out)
+        out = date_jump(signals, FRONT, SOFT, range(350, 750), within=range(301, 800), confidence=0.999)
+        assert isinstance(out, Instant), (seed, out)
         assert out.low <= 550 <= out.high, (seed, out)
         assert out.high - out.low < 50, (seed, out)  # it is at the latest edge, or at the next
 
@@ -273,7 +273,7 @@ def test_samples_of_something_else_are_refused() -> None:
 def test_range_that_leaves_the_record_is_a_mistake_of_the_caller(search: range) -> None:
     signals = simulated([(0, FRONT)], 1200, seed=21)
     with pytest.raises(ValueError, match="leaves the 1200 samples of the record"):
-        onset(signals, FRONT, SOFT, search)
+        date_jump(signals, FRONT, SOFT, search)
 
 
 # ---- turns by hand
@@ -286,7 +286,7 @@ def test_begin_and_end_of_an_even_turn_are_within_their_intervals() -> None:
     for seed in range(5):
         trial = Trial.ramp(seed, "free" if seed % 2 else "card")
         out = trial.turned()
-        assert isinstance(out, SlowTurn), out
+        assert isinstance(out, TurnInstants), out
         beside += not out.begin.low <= trial.sample <= out.begin.high
         beside += not out.end.low <= trial.sample + trial.ramp_n <= out.end.high
         widths += [each.high - each.low + 1 for each in (out.begin, out.end)]
@@ -300,8 +300,8 @@ def test_gentle_turn_of_a_hand_is_found_from_its_begin_to_its_end() -> None:
     gone = times**3 * (10.0 - 15.0 * times + 6.0 * times**2)
     way = [(600 + k, FRONT.on_the_way(SOFT, part)) for k, part in enumerate(gone.tolist())]
     signals = simulated_way([(0, FRONT), *way, (900, SOFT)], 1600)
-    out = turn(signals, FRONT, SOFT, range(450, 1050))
-    assert isinstance(out, SlowTurn), out
+    out = date_turn(signals, FRONT, SOFT, range(450, 1050))
+    assert isinstance(out, TurnInstants), out
     assert out.begin.low <= 600 <= out.begin.high
     assert out.end.low <= 900 <= out.end.high
     assert out.begin.high < 700 and out.end.low > 800
@@ -319,8 +319,8 @@ def test_two_pots_that_jump_one_after_the_other_are_both_found() -> None:
         (tweak,) = scenario.tweaks
         (later,) = scenario_of(2200, "card", 200.0, after, tweak.sample + gap).tweaks
         signals = played(dataclasses.replace(scenario, tweaks=(tweak, later)), seed)
-        out = turn(signals, FRONT, after, range(800, 1400), middle=middle)
-        assert isinstance(out, SlowTurn), out
+        out = date_turn(signals, FRONT, after, range(800, 1400), middle=middle)
+        assert isinstance(out, TurnInstants), out
         for each, sample in ((out.begin, tweak.sample), (out.end, later.sample)):
             beside_n.append(max(0, each.low - sample, sample - each.high))
         assert out.end.high - out.begin.low <= gap + 60
@@ -346,14 +346,14 @@ def simulated_way(plants: Sequence[tuple[int, Plant]], samples: int) -> Signals:
 def test_pot_that_no_hand_turned_is_said_to_be_so() -> None:
     trial = still(1, "card")
     out = trial.turned()
-    assert isinstance(out, NoOnset)
+    assert isinstance(out, NoInstant)
     assert "shows that the plant has changed" in out.reason
 
 
 def test_turn_that_goes_on_beyond_the_range_is_not_taken_for_one_in_it() -> None:
     trial = Trial.ramp(4, "card")
     cut = range(trial.sample - 60, trial.sample + trial.ramp_n // 3)
-    assert isinstance(turn(trial.signals, FRONT, trial.after, cut), NoOnset)
+    assert isinstance(date_turn(trial.signals, FRONT, trial.after, cut), NoInstant)
 
 
 # ---- the likelihood itself
@@ -363,13 +363,13 @@ def test_two_filters_give_the_likelihood_of_all_samples_at_once() -> None:
     """Against the normal density of all displacements together, their covariance written out, for each instant."""
     signals = simulated([(0, FRONT), (70, SOFT)], 140, seed=25, place=0.4)
     edges = EdgePlace(0.4, 0.2)
-    old, new = (Model.of(plant, edges, signals) for plant in (FRONT, SOFT))
+    old, new = (PlantModel.of(plant, edges, signals) for plant in (FRONT, SOFT))
     costs = cost_of_each_instant(signals, old, new)
     dense = [minus_twice_log_density(signals, old, new, sample) for sample in range(12, 139, 9)]
     assert np.diff(costs[12:139:9]) == pytest.approx(np.diff(dense), rel=1e-7, abs=2e-3)
 
 
-def cost_of_each_instant(signals: Signals, old: Model, new: Model) -> NDArray[np.float64]:
+def cost_of_each_instant(signals: Signals, old: PlantModel, new: PlantModel) -> NDArray[np.float64]:
     still = np.zeros((len(signals), 2))
     before = Forwards.of(old, signals, Columns.of(old, signals, still, (0.0, 0.0)))
     after = Backwards.of(new, signals, Columns.of(new, signals, still, (0.0, 0.0)))
@@ -377,7 +377,7 @@ def cost_of_each_instant(signals: Signals, old: Model, new: Model) -> NDArray[np
     return np.asarray((form + before.misfit + after.misfit)[:, 0, 0] + log + before.log + after.log)
 
 
-def minus_twice_log_density(signals: Signals, old: Model, new: Model, sample: int) -> float:
+def minus_twice_log_density(signals: Signals, old: PlantModel, new: PlantModel, sample: int) -> float:
     """Of the displacements in units of their noise, but for a constant."""
     n = len(signals)
     mean, covariance = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
@@ -398,7 +398,7 @@ def minus_twice_log_density(signals: Signals, old: Model, new: Model, sample: in
 
 def test_plant_that_does_not_change_is_as_likely_to_do_so_at_any_instant() -> None:
     signals = simulated([(0, FRONT)], 300, seed=27)
-    model = Model.of(FRONT, ANYWHERE, signals)
+    model = PlantModel.of(FRONT, ANYWHERE, signals)
     costs = cost_of_each_instant(signals, model, model)
     assert np.ptp(costs) < 1e-6 * costs.max()
 
@@ -406,7 +406,7 @@ def test_plant_that_does_not_change_is_as_likely_to_do_so_at_any_instant() -> No
 def test_edge_that_may_come_anywhere_disturbs_by_what_it_does_on_average() -> None:
     """Against 200,000 places drawn at random."""
     signals = simulated([(0, FRONT)], 10, seed=29)
-    model = Model.of(FRONT, ANYWHERE, signals)
+    model = PlantModel.of(FRONT, ANYWHERE, signals)
     rng = np.random.default_rng(30)
     m, b, k = FRONT.parameters().values()
     decay, swing = b / (2.0 * m), np.emath.sqrt(k / m - (b / (2.0 * m)) ** 2)
@@ -425,7 +425,7 @@ def test_edge_that_may_come_anywhere_disturbs_by_what_it_does_on_average() -> No
 def test_interval_holds_what_the_likelihood_ratio_allows_and_the_asked_part_of_the_likelihood() -> None:
     """3.84 is the 95 % point of chi squared with one degree of freedom."""
     samples = np.arange(10, 18)
-    assert interval(np.array([50.0, 9.0, 3.83, 0.0, 3.85, 40.0, 50.0, 60.0]), samples, 0.95) == Onset(13, 12, 14)
+    assert interval(np.array([50.0, 9.0, 3.83, 0.0, 3.85, 40.0, 50.0, 60.0]), samples, 0.95) == Instant(13, 12, 14)
     flat = np.zeros(100)
     out = interval(flat, np.arange(100), 0.95)
     assert (out.low, out.high) == (0, 99)
