@@ -80,7 +80,8 @@ def check_tables(
     _known(_Rig, rig, f"{where}: rig")
     _known(_Line, line, f"{where}: line")
     settings = dut.get("estimator")
-    for key in _NEEDED if isinstance(settings, Mapping) else ():
+    settings = settings if isinstance(settings, Mapping) else dict.fromkeys(_NEEDED)
+    for key in _NEEDED:
         if key not in settings and not (key == "ceiling" and settings.get("trigger") == "none"):
             raise ConfigurationError(f"{where}: dut: estimator: the key {key!r} is lacking")
     estimator: EstimatorConfig = _known(_Device, dut, f"{where}: dut").estimator
