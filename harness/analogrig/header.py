@@ -18,8 +18,8 @@ from analogrig_emulator import Excitation
 
 _MOST = 2**31
 
-_NEEDED = ("na", "nb", "offset", "trigger", "ceiling")
-"""Settings without a default: another value would be another verdict."""
+_NEEDED = ("na", "nb", "offset", "trigger")
+"""Settings without a default, and the ceiling of a trigger: another value would be another verdict."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,11 @@ def check_tables(
     _known(_Rig, rig, f"{where}: rig")
     _known(_Line, line, f"{where}: line")
     settings = dut.get("estimator")
-    settings = settings if isinstance(settings, Mapping) else dict.fromkeys(_NEEDED)
-    for key in _NEEDED:
-        if key not in settings and not (key == "ceiling" and settings.get("trigger") == "none"):
-            raise ConfigurationError(f"{where}: dut: estimator: the key {key!r} is lacking")
+    if isinstance(settings, Mapping):  # which is checked below
+        needed = _NEEDED if settings.get("trigger") == "none" else (*_NEEDED, "ceiling")
+        lacking = [key for key in needed if key not in settings]
+        if lacking:
+            raise ConfigurationError(f"{where}: dut: estimator: the key {lacking[0]!r} is lacking")
     estimator: EstimatorConfig = _known(_Device, dut, f"{where}: dut").estimator
     return estimator
 

@@ -162,5 +162,5 @@ def physical_parameters(
         damping_over_mass = -(logs[0] + logs[1]).real
         mass = stiffness / stiffness_over_mass
         out = np.stack([mass, damping_over_mass * mass, stiffness], axis=1)
-    out[~(np.isfinite(out) & (out > 0.0)).all(axis=1)] = np.nan
+        out[~((out > LEAST_PARAMETER) & (out < MOST_PARAMETER)).all(axis=1)] = np.nan
     return out

@@ -24,6 +24,7 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.trial import play_chunk
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.protocol.catalogue import Change
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, number_named, number_of, one_line
 
@@ -55,11 +56,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run.npz"
 
 
-Change = Callable[[dict[str, Any], dict[str, Any]], object]
+Rewrite = Callable[[dict[str, Any], dict[str, Any]], object]
 """Of the conditions in the header, and of the arrays."""
 
 
-def rewritten(recording: Path, path: Path, change: Change) -> Path:
+def rewritten(recording: Path, path: Path, change: Rewrite) -> Path:
     with np.load(recording) as file:
         members = {name: file[name] for name in file.files}
     header = json.loads(str(members.pop("header")))
@@ -152,7 +153,7 @@ def cpu_s() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def extended(samples: int) -> Change:
+def extended(samples: int) -> Rewrite:
     def change(conditions: dict[str, Any], arrays: dict[str, Any]) -> None:
         conditions["samples_asked"] = samples
         for name, array in arrays.items():
@@ -160,6 +161,36 @@ def extended(samples: int) -> Change:
                 arrays[name] = np.resize(array, (samples, *array.shape[1:]))
 
     return change
+
+
+@pytest.mark.parametrize("extent", [np.inf, -np.inf, np.nan])
+def test_diagnosis_of_a_non_finite_extent_is_judged_and_reported(
+    recording: Path, tmp_path: Path, extent: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def change(conditions: dict[str, Any], arrays: dict[str, Any]) -> None:
+        first = conditions["segments"][0]
+        conditions["segments"].append({**first, "start": 200, "plant": {**first["plant"], "mass_kg": 60.0}})
+        arrays |= {"alarm_index": np.array([210]), "alarm_kind": np.full(1, 3, np.uint8)}
+        arrays |= {"alarm_statistic": np.full(1, 12.0, np.float32), "diagnosis_index": np.array([220])}
+        arrays |= {"diagnosis_change": np.full(1, Change.MASS, np.uint8), "diagnosis_onset": np.array([200])}
+        arrays |= {"diagnosis_extent": np.full(1, extent, np.float32)}
+
+    path = rewritten(recording, tmp_path / "run.npz", change)
+    assert main(["judge", str(path), "--json", "--out", str(tmp_path / "judged")]) in (0, 1)
+    diagnosis = json.loads(capsys.readouterr().out)["tweaks"][0]["diagnosis"]
+    assert diagnosis["named"] == "M"
+    assert diagnosis["extent"] is None
+
+
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e38, -1e38, 1e-45])
+@pytest.mark.filterwarnings("error")
+def test_absurd_estimates_are_reported_without_warnings(recording: Path, tmp_path: Path, value: float) -> None:
+    def change(_: object, arrays: dict[str, Any]) -> None:
+        arrays["theta"][::2] = value
+        arrays["theta"][1::3, 2:] = 1e-30
+
+    path = rewritten(recording, tmp_path / "run.npz", change)
+    assert main(["judge", str(path), "--out", str(tmp_path / "judged")]) in (0, 1, 3)
 
 
 def test_a_record_a_sample_takes_no_time(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,7 +103,7 @@ def test_alarm_that_is_late_for_one_instant_and_false_for_another_may_be_in_time
 def test_of_two_alarms_after_the_earliest_instant_one_is_false_whichever() -> None:
     verdict = judge(learned(between(380, 400, 402), alarms=[390, 404]))
     assert verdict.outcome == "failed"
-    assert verdict.reasons == ("1 false alarms, at most 0 expected",)
+    assert verdict.reasons == ("1 false alarm, at most 0 expected",)
     assert judge(learned(between(380, 400, 402), alarms=[390, 404], expect={"false_alarms": 1})).outcome == "passed"
 
 

@@ -58,7 +58,7 @@ class DiagnosisVerdict:
     onset_error_n: int
     """Of the sample that was named, in samples."""
     extent: float | None
-    """New over old, as it was said; None if several."""
+    """New over old, as it was said; None if several, or non-finite."""
     extent_error: float | None
     """Relative; None unless one parameter has changed and was named."""
 
@@ -374,7 +374,8 @@ def _diagnosis(
         return None
     first = said[0]
     named = NAMES[Change(run.diagnosis_change[first])]
-    extent = float(run.diagnosis_extent[first]) if named in PARAMETERS else None
+    reported = float(run.diagnosis_extent[first])
+    extent = reported if named in PARAMETERS and math.isfinite(reported) else None
     right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(
