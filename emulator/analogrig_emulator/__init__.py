@@ -4,7 +4,7 @@ README.md explains the circuit; SuspensionComputer and Sampler are the way in.
 """
 
 from analogrig_emulator.card.acquisition import acquired, probes_per_sample
-from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges, Excitation
+from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import CARDS, Card, Sampler, drawn_levels
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
@@ -28,12 +28,12 @@ from analogrig_emulator.circuit.components import (
     OpAmpGrade,
     PotGrade,
 )
-from analogrig_emulator.circuit.deck import Deck
-from analogrig_emulator.circuit.nodal import PiecewiseLinear, piecewise_linear
+from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
-from analogrig_emulator.circuit.pot import PotModel
-from analogrig_emulator.circuit.spice import to_spice
+from analogrig_emulator.circuit.pot import PotChange, PotModel
+from analogrig_emulator.circuit.spice import Deck, to_spice
 from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
 from analogrig_emulator.errors import (
     CircuitError,
     EmulatorError,
@@ -43,13 +43,12 @@ from analogrig_emulator.errors import (
     PotError,
     SamplerError,
 )
-from analogrig_emulator.machine.bump_stop import BumpStop
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
-from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, SuspensionParts, SuspensionProgram
+from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
-from analogrig_emulator.machine.suspension import PROGRAMS, RampedTweak, SuspensionComputer, Tweak, drawn_offsets_v
+from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
 from analogrig_emulator.machine.two_mass import TWO_MASS, TwoMassParts, TwoMassPlant, TwoMassProgram
 
 __all__ = [
@@ -99,12 +98,12 @@ __all__ = [
     "Parameter",
     "PiecewiseLinear",
     "Pot",
+    "PotChange",
     "PotError",
     "PotGrade",
     "PotModel",
     "Program",
     "Quantity",
-    "RampedTweak",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
@@ -115,7 +114,6 @@ __all__ = [
     "SuspensionParts",
     "SuspensionProgram",
     "Switch",
-    "Tweak",
     "TwoMassParts",
     "TwoMassPlant",
     "TwoMassProgram",

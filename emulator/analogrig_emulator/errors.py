@@ -11,8 +11,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CircuitError", "EmulatorError", "EngineError", "ExcitationError", "ModeError", "PotError", "SamplerError"]
-
 
 class EmulatorError(Exception):
     """Base of everything that the emulator raises on purpose; element: the name of the one at fault, if any."""

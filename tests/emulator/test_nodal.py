@@ -25,8 +25,9 @@ from analogrig_emulator import (
     piecewise_linear,
 )
 from analogrig_emulator.circuit.circuit import _TwoEnded
-from analogrig_emulator.circuit.nodal import Kink, Nodal
+from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
+from analogrig_emulator.engine.system import Kink
 
 SOURCE = VoltageSource("V1", "in")
 

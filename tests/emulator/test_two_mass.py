@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from analogrig_emulator import (
     Excitation,
     OpAmp,
     OpAmpModel,
+    PotChange,
     PotError,
     SuspensionComputer,
     TwoMassParts,
@@ -44,29 +45,29 @@ QUANTITIES = (
     "tyre_velocity",
     "tyre_displacement",
 )
-TWEAKS: tuple[tuple[int, Mapping[str, float]], ...] = (
-    (120, {"K2_n_per_m": 18000.0}),
-    (200, {"M1_kg": 14.0, "B2_n_s_per_m": 3453.0}),
-    (280, {"K1_n_per_m": 150e3, "M2_kg": 90.0}),
+TWEAKS: tuple[PotChange, ...] = (
+    PotChange(120, {"K2_n_per_m": 18000.0}),
+    PotChange(200, {"M1_kg": 14.0, "B2_n_s_per_m": 3453.0}),
+    PotChange(280, {"K1_n_per_m": 150e3, "M2_kg": 90.0}),
 )
 
 
 def deck_of(
     computer: SuspensionComputer,
-    tweaks: Sequence[tuple[int, Mapping[str, float]]] = TWEAKS,
+    tweaks: Sequence[PotChange] = TWEAKS,
     excitation: Excitation | None = None,
 ) -> Deck:
     edges = (excitation or Excitation()).edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [(sample, computer.dials_for(**settings)) for sample, settings in tweaks]
+    turns = [PotChange(change.sample, computer.dials_for(**change.values)) for change in tweaks]
     return Deck(computer.circuit, SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
 
 
-def by_equations(program: TwoMassProgram, tweaks: Sequence[tuple[int, Mapping[str, float]]]) -> Volts:
+def by_equations(program: TwoMassProgram, tweaks: Sequence[PotChange]) -> Volts:
     """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
     plant, scales = program.plant, program.scales
     edges = Excitation().edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
     force_v = edges.levels_v[np.searchsorted(edges.ticks, np.arange(SAMPLES) * TICKS_PER_SAMPLE, side="right") - 1]
-    settings = dict(tweaks)
+    settings = {change.sample: change.values for change in tweaks}
     state, rows = np.zeros(4), []
     for k in range(SAMPLES):
         force_n = force_v[k] * scales.full("force") / 10.0

@@ -15,7 +15,7 @@ from analogrig.hardware.simulator.inputs import InputFaults
 from analogrig.hardware.simulator.red_pitaya import MOST_SCHEDULED, ServedRedPitaya
 from analogrig.hardware.simulator.scpi import DropOut, Interpreter
 from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
-from analogrig_emulator import Excitation, SuspensionComputer
+from analogrig_emulator import Excitation, PotChange, SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14
@@ -29,7 +29,7 @@ RATE_HZ = 20e3
 
 def played(
     samples: int = BUFFER_N,
-    tweaks: tuple[tuple[int, dict[str, float]], ...] = (),
+    tweaks: tuple[PotChange, ...] = (),
     *,
     per_sample: int = 1,
     excitation: Excitation = EXCITATION,
@@ -299,7 +299,7 @@ def test_turns_that_are_scheduled_come_so_long_after_each_trigger_of_the_generat
     say(ask, ["POT:SCHedule 3,0.638,0.1", "POT:SCH 2,0.8152,0.3"])
     say(ask, POINT_SAMPLES)
     assert ask("POT:SCH:COUN?") == "2"
-    tweaks = ((2000, {"K_dial": 0.638}), (6000, {"B_dial": 0.8152}))
+    tweaks = (PotChange(2000, {"K_dial": 0.638}), PotChange(6000, {"B_dial": 0.8152}))
     assert np.abs(record(ask) - played(tweaks=tweaks)).max() < ROUNDED_V
     say(ask, ["POT:SCHedule:CLEar"])
     assert ask("POT:SCH:COUN?") == "0"
@@ -442,5 +442,5 @@ def test_record_in_real_time_is_full_when_its_time_is_over_and_a_pot_turns_where
     assert ask("ACQ:TRig:FILL?") == "0"
     hands.now_s = (BUFFER_N + 0.5) / RATE_HZ
     assert ask("ACQ:TRig:FILL?") == "1"
-    looks = played(tweaks=((8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
+    looks = played(tweaks=(PotChange(8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
     assert np.abs(record(ask) - looks[::8]).max() < ROUNDED_V

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analogrig.hardware.simulator.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
-from analogrig_emulator import EmulatorError, Excitation
+from analogrig_emulator import EmulatorError, Excitation, PotChange
 from tests.served.talk import front
 
 RATE_HZ = 20e3
@@ -15,7 +15,7 @@ AMPLIFIED = Excitation("square", 0.1, 9.9, 100.0, clock="free")
 ROUNDING_V = 1e-9
 
 
-def played(samples: int, tweaks: tuple[tuple[int, dict[str, float]], ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
+def played(samples: int, tweaks: tuple[PotChange, ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
     """Force and displacement of the emulator itself."""
     return np.concatenate(list(front(rate_hz).play(AMPLIFIED, samples, tweaks)))[:, :2]
 
@@ -41,7 +41,7 @@ def test_a_pot_turns_right_after_the_look_at_or_before_its_instant_and_in_order_
     laid = table()
     laid.generate(SQUARE)
     laid.schedule([DueTurn(900 / RATE_HZ, "B", 0.8), DueTurn(300 / RATE_HZ, "K", 0.6), DueTurn(1e3, "M", 0.1)])
-    tweaks = ((300, {"K_dial": 0.6}), (900, {"B_dial": 0.8}))
+    tweaks = (PotChange(300, {"K_dial": 0.6}), PotChange(900, {"B_dial": 0.8}))
     assert np.abs(laid.look(1500) - played(1500, tweaks)).max() < ROUNDING_V
 
 
@@ -51,7 +51,10 @@ def test_a_pot_that_is_turned_at_once_stays_there() -> None:
     first = laid.look(500)
     laid.turn("K", 0.6)
     assert laid.dials["K"] == pytest.approx(0.6, abs=1e-3)
-    assert np.abs(np.concatenate((first, laid.look(500))) - played(1000, ((499, {"K_dial": 0.6}),))).max() < ROUNDING_V
+    assert (
+        np.abs(np.concatenate((first, laid.look(500))) - played(1000, (PotChange(499, {"K_dial": 0.6}),))).max()
+        < ROUNDING_V
+    )
 
 
 def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest() -> None:
@@ -90,7 +93,7 @@ def test_another_rate_leaves_generator_pots_and_turns_as_they_are() -> None:
     laid.schedule([DueTurn(0.04, "K", 0.6)])
     laid.look(250)  # into the second period
     laid.look_at(2 * RATE_HZ)
-    tweaks = ((0, {"B_dial": 0.8}), (1600, {"K_dial": 0.6}))
+    tweaks = (PotChange(0, {"B_dial": 0.8}), PotChange(1600, {"K_dial": 0.6}))
     expected = played(4500, tweaks, 2 * RATE_HZ)[500:]
     seen = laid.look(4000)
     assert np.array_equal(seen[:, 0], expected[:, 0])

@@ -16,12 +16,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.excitation import Edges, Excitation
+from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
+from analogrig_emulator.circuit.pot import PotChange
+from analogrig_emulator.engine.system import Edges
 from analogrig_emulator.errors import SamplerError
-from analogrig_emulator.machine.suspension import RampedTweak, Tweak, in_full
-
-__all__ = ["PROBE_S", "Playable", "acquired", "probes_per_sample"]
 
 PROBE_S = 1e-6
 """Longest time between probes when there is an aperture delay or jitter."""
@@ -42,7 +41,7 @@ class Playable(Protocol):
         self,
         excitation: Excitation,
         samples: int,
-        tweaks: Sequence[Tweak | RampedTweak] = ...,
+        changes: Sequence[PotChange] = ...,
         block_samples: int = ...,
     ) -> Iterator[NDArray[np.float64]]: ...
 
@@ -66,7 +65,7 @@ def acquired(
     card: Card,
     excitation: Excitation,
     samples: int,
-    tweaks: Sequence[Tweak | RampedTweak] = (),
+    changes: Sequence[PotChange] = (),
     *,
     rng: np.random.Generator,
     block_samples: int = 256,
@@ -81,11 +80,11 @@ def acquired(
     count = probes_per_sample(card)
     _check_rate(machine, card, count)
     if count == 1 and card.clock_drift_ppm == 0:
-        return machine.play(excitation, samples, tweaks, block_samples)
+        return machine.play(excitation, samples, changes, block_samples)
     clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
     slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
-    turns = [(k * count, settings, ramp_n * count) for k, settings, ramp_n in map(in_full, tweaks)]
-    probed = machine.play(slow, samples * count, turns, block_samples * count)
+    slow_changes = [PotChange(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
+    probed = machine.play(slow, samples * count, slow_changes, block_samples * count)
     return _picked(probed, card, count, rng)
 
 

@@ -12,11 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.errors import ExcitationError
-
-__all__ = ["TICKS_PER_SAMPLE", "Edges", "Excitation"]
-
-TICKS_PER_SAMPLE = 1 << 22
 
 _MOST_TICKS = 2.0**53
 """Whole numbers of ticks up to here are exact in float64."""
@@ -46,22 +43,6 @@ _TAPS = {
     20: (20, 17),
 }
 """Feedback taps of maximal-length shift registers (Xilinx XAPP 052, table 3)."""
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Changes of one input: from tick ticks[i] on it is levels_v[i].
-
-    ticks: int64 (n,), not decreasing; levels_v: float64 (n,).
-    """
-
-    ticks: NDArray[np.int64]
-    levels_v: NDArray[np.float64]
-
-    @classmethod
-    def none(cls) -> Edges:
-        """No edges at all."""
-        return cls(np.empty(0, np.int64), np.empty(0))
 
 
 @dataclass(frozen=True)

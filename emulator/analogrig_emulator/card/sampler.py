@@ -19,10 +19,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.engine.system import is_integer
 from analogrig_emulator.errors import SamplerError
-from analogrig_emulator.whole import is_whole
-
-__all__ = ["CARDS", "RANGES_V", "Card", "Sampler", "drawn_levels"]
 
 _MAX_BITS = 16
 
@@ -72,7 +70,9 @@ class Card:
 
     def __post_init__(self) -> None:
         self._require(
-            "bits", is_whole(self.bits) and 1 <= self.bits <= _MAX_BITS, f"must be a whole number, 1 to {_MAX_BITS}"
+            "bits",
+            is_integer(self.bits) and 1 <= self.bits <= _MAX_BITS,
+            f"must be a whole number, 1 to {_MAX_BITS}",
         )
         self._require("rate_hz", math.isfinite(self.rate_hz) and self.rate_hz > 0, "must be positive and finite")
         for channel, (low, high) in enumerate(self.ranges_v):
@@ -159,11 +159,11 @@ class Card:
         count = len(self.levels_lsb)
         if count not in (0, codes - 1) or not all(map(math.isfinite, self.levels_lsb)):
             raise SamplerError(f"card: levels_lsb must be {codes - 1} finite numbers or none, got {count}")
-        given = all(is_whole(code) and 0 < code < codes - 1 for code in self.missing_codes)
+        given = all(is_integer(code) and 0 < code < codes - 1 for code in self.missing_codes)
         self._require("missing_codes", given, f"must be whole numbers, 1 to {codes - 2}")
         for field in ("stuck_high", "stuck_low"):
             mask = getattr(self, field)
-            self._require(field, is_whole(mask) and 0 <= mask < codes, f"must be a mask of {self.bits} bits")
+            self._require(field, is_integer(mask) and 0 <= mask < codes, f"must be a mask of {self.bits} bits")
         self._require("stuck_high", not self.stuck_high & self.stuck_low, "has a bit that stuck_low has too")
 
     def _require(self, field: str, holds: object, what: str) -> None:

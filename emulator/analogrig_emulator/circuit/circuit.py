@@ -18,23 +18,6 @@ from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.pot import checked_dial
 from analogrig_emulator.errors import CircuitError
 
-__all__ = [
-    "GROUND",
-    "Capacitor",
-    "Circuit",
-    "CurrentSource",
-    "DiodeLimiter",
-    "Element",
-    "OpAmp",
-    "Pot",
-    "Resistor",
-    "Switch",
-    "VoltageSource",
-    "label",
-    "refused",
-    "unknown",
-]
-
 GROUND = "0"
 
 _NAME = re.compile(r"[A-Za-z0-9_]+")

@@ -40,21 +40,6 @@ from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.pot import PotModel
 from analogrig_emulator.errors import CircuitError
 
-__all__ = [
-    "COMPONENTS",
-    "DIELECTRICS",
-    "NOMINAL",
-    "OP_AMP_GRADES",
-    "REFERENCE_C",
-    "Components",
-    "Dielectric",
-    "Grade",
-    "OpAmpGrade",
-    "PotGrade",
-    "contact_of",
-    "is_part_of",
-]
-
 REFERENCE_C = 25.0
 """Temperature in Celsius at which components have the values that they were made to."""
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,144 +42,8 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
 from analogrig_emulator.circuit.pot import checked_dial, legs_ohm
 from analogrig_emulator.engine import library
+from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place
 from analogrig_emulator.errors import CircuitError
-
-__all__ = ["Kink", "Nodal", "PiecewiseLinear", "Rest", "Trim", "piecewise_linear"]
-
-Matrix = NDArray[np.float64]
-
-_PIECE_SLACK = 1e-9
-"""Of a kink's bound: less than this beyond it may be rounding."""
-
-
-@dataclass(frozen=True)
-class Kink:
-    """A continuous function of three linear pieces, with slopes below lower, between, and above upper.
-
-    Between, phi(w) = slopes[1] w.
-    """
-
-    lower: float
-    upper: float
-    slopes: tuple[float, float, float]
-    element: str = ""
-    """The name of the element that it limits."""
-
-    @classmethod
-    def clip(cls, limit: float) -> Kink:
-        """clip(w, -limit, +limit)."""
-        return cls(-limit, limit, (0.0, 1.0, 0.0))
-
-    @classmethod
-    def deadzone(cls, lower: float, upper: float) -> Kink:
-        """What of w is beyond lower..upper, and 0 within."""
-        return cls(lower, upper, (1.0, 0.0, 1.0))
-
-    @property
-    def intercepts(self) -> tuple[float, float, float]:
-        """Constant terms of the pieces, such that they meet; 0 for a piece that an infinite bound removes."""
-        below, between, above = self.slopes
-        at_lower = (between - below) * self.lower if np.isfinite(self.lower) else 0.0
-        at_upper = (between - above) * self.upper if np.isfinite(self.upper) else 0.0
-        return at_lower, 0.0, at_upper
-
-    def piece(self, w: float, now: int) -> int:
-        """In which piece w lies: 0, 1 or 2; the present one where rounding may be all that puts it beyond."""
-        for piece, bound in ((0, self.lower), (1, self.upper)):
-            slack = _PIECE_SLACK * (1.0 + abs(bound))
-            if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
-                return piece
-        return 2 if math.isfinite(self.upper) else 1
-
-
-class Rest(NamedTuple):
-    """Where a circuit rests: its state, (n,) in V, and the voltage of every node."""
-
-    state: Matrix
-    volts: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class PiecewiseLinear:
-    """The state space of a circuit, in the form of the module's docstring.
-
-    Columns of abc, cde and lmn: states, inputs, constant.
-
-    abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); w_phi: P, (q, q); lmn: (nodes, n+m+1), dimensionless but
-    for its last column in V; v_phi: R, (nodes, q).
-    states, inputs, nodes: names; ground is not among the nodes.
-    """
-
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    nodes: tuple[str, ...]
-    kinks: tuple[Kink, ...]
-    abc: Matrix
-    g: Matrix
-    cde: Matrix
-    w_phi: Matrix
-    lmn: Matrix
-    v_phi: Matrix
-
-    def readings(self, nodes: Sequence[str]) -> Matrix:
-        """The rows of lmn for these nodes, in this order. Raises CircuitError for a node that is not there."""
-        return self.lmn[self.rows(nodes)]
-
-    def rows(self, nodes: Sequence[str]) -> list[int]:
-        """Which rows of lmn and v_phi belong to these nodes. Raises CircuitError for a node that is not there."""
-        try:
-            return [self.nodes.index(node) for node in nodes]
-        except ValueError:
-            missing = next(node for node in nodes if node not in self.nodes)
-            raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
-
-    def rest(self, levels_v: Matrix) -> Rest:
-        """Where nothing moves with the inputs held at levels_v (m,): the limits that are reached there count.
-
-        Pieces are tried from the middle ones on, each time those in which the rest of the last ones lies, until they
-        stand; so this needs not be the only rest, nor the one to which the circuit would come from its present state.
-        Raises CircuitError naming a state that nothing brings to rest, or what has no rest in any piece tried.
-        """
-        pieces = np.ones(len(self.kinks), np.intp)
-        for _ in range(2 * len(self.kinks) + 1):
-            rest, w = self._rest_within(pieces, levels_v)
-            reached = np.array([kink.piece(*at) for kink, *at in zip(self.kinks, w, pieces, strict=True)], np.intp)
-            if (reached == pieces).all():
-                return rest
-            unsettled, pieces = reached != pieces, reached
-        names = dict.fromkeys(kink.element for kink, moves in zip(self.kinks, unsettled, strict=True) if moves)
-        raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")
-
-    def _rest_within(self, pieces: NDArray[np.intp], levels_v: Matrix) -> tuple[Rest, Matrix]:
-        """The rest, and w there, were every kink the line of that piece everywhere."""
-        states, kinks = len(self.states), range(len(self.kinks))
-        slopes = np.array([self.kinks[k].slopes[pieces[k]] for k in kinks])
-        intercepts = np.array([self.kinks[k].intercepts[pieces[k]] for k in kinks])
-        w_of_z = self.cde.copy()
-        for k in kinks:
-            w_of_z[:, -1] += self.w_phi[:, k] * intercepts[k]
-        failed = _solve(np.eye(len(self.kinks)) - self.w_phi * slopes, w_of_z)
-        if failed >= 0:
-            raise CircuitError(f"the limits of {self.kinks[failed].element} leave no unique solution")
-        flow = self.abc.copy()
-        for k in kinks:
-            flow += np.outer(self.g[:, k] * slopes[k], w_of_z[k])
-            flow[:, -1] += self.g[:, k] * intercepts[k]
-        held = np.append(levels_v, 1.0)
-        right = -(flow[:, states:] * held).sum(axis=1, keepdims=True)
-        failed = _solve(flow[:, :states], right)
-        if failed >= 0:
-            raise CircuitError(f"nothing brings {self.states[failed]} to rest")
-        z = np.concatenate((right[:, 0], held))
-        w = np.asarray((w_of_z * z).sum(axis=1))
-        volts = (self.lmn * z).sum(axis=1) + (self.v_phi * (slopes * w + intercepts)).sum(axis=1)
-        return Rest(right[:, 0], dict(zip(self.nodes, volts.tolist(), strict=True))), w
-
-
-def _solve(left: Matrix, solution: Matrix) -> int:
-    """Solves left x = solution (contiguous, at least as many rows) in place; the unknown without a pivot, or -1."""
-    matrix = left.copy(order="C")
-    return int(library.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
@@ -393,7 +256,7 @@ class Nodal:
         size = len(self._unknowns)
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
-        failed = _solve(left[:size, :size], solution)
+        failed = solve_in_place(left[:size, :size], solution)
         if failed >= 0:
             raise self._singular(failed)
         return solution

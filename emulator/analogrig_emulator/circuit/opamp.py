@@ -19,8 +19,6 @@ from types import MappingProxyType
 
 from analogrig_emulator.errors import CircuitError
 
-__all__ = ["CLAMP_RATE", "IDEAL", "PRESETS", "OpAmpModel", "preset"]
-
 CLAMP_RATE = 1e9
 """Rate in 1/s at which an output beyond its swing is pulled back."""
 

@@ -11,22 +11,33 @@ which is less than its dial shows. An operator either sets the dial, or sets the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig_emulator.engine.system import is_integer
 from analogrig_emulator.errors import CircuitError, PotError
-from analogrig_emulator.whole import is_whole
-
-__all__ = ["END_FRACTION", "PotModel", "checked_dial", "checked_ramp", "coefficient_under_load", "dial_for", "legs_ohm"]
 
 _PLACES = 5000
 """Into which a continuous track is divided for its noise."""
 
 END_FRACTION = 1e-6
 """Part of the track that stays between wiper and terminal at an end stop, so that no leg is ever a short circuit."""
+
+
+class PotChange(NamedTuple):
+    """Values that pots take from a sample on: at once, or evenly over ramp_n samples.
+
+    sample: last sample before the change; sample + 1 is the first that can show it. values: by setting of
+    SuspensionComputer.set where a program is played, dials (0..1) by pot where a circuit is.
+    """
+
+    sample: int
+    values: Mapping[str, float]
+    ramp_n: int = 0
 
 
 def checked_dial(dial: float, name: str = "pot") -> float:
@@ -38,7 +49,7 @@ def checked_dial(dial: float, name: str = "pot") -> float:
 
 def checked_ramp(ramp_n: int, pots: Iterable[str]) -> int:
     """The samples of a ramp when they are a whole number and not negative, else PotError naming the pots."""
-    if not (is_whole(ramp_n) and ramp_n >= 0):
+    if not (is_integer(ramp_n) and ramp_n >= 0):
         raise PotError(f"pots {', '.join(pots)}: cannot turn in {ramp_n!r} samples")
     return ramp_n
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.circuit.circuit import (
     Capacitor,
     Circuit,
@@ -31,11 +31,12 @@ from analogrig_emulator.circuit.circuit import (
     Switch,
     VoltageSource,
 )
+from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
-from analogrig_emulator.circuit.pot import END_FRACTION
+from analogrig_emulator.circuit.pot import END_FRACTION, PotChange
+from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.errors import CircuitError
-
-__all__ = ["STEP_S", "Accuracy", "to_spice"]
 
 STEP_S = 1e-11
 """Rise time of every step in a deck, far below anything the circuits resolve."""
@@ -106,64 +107,88 @@ class Accuracy:
     max_step_s: float = 1e-5
 
 
-def to_spice(
-    circuit: Circuit,
-    *,
-    samples: int,
-    sample_rate_hz: float = 20e3,
-    edges: Mapping[str, Edges] | None = None,
-    turns: Sequence[tuple[int, Mapping[str, float]]] = (),
-    initial_v: Mapping[str, float] | None = None,
-    nodes: Sequence[str] | None = None,
-    accuracy: Accuracy | None = None,
-    title: str = "analogue computer",
-) -> str:
-    """The deck of a circuit played for that many samples; without .tran when there are none.
+@dataclass(frozen=True, eq=False)
+class Deck:
+    """A circuit, its excitation and its pot changes: the engine plays it, ngspice runs its text.
 
-    edges: by input, from tick 0 on (an input without any stays at 0 V). turns: (sample, dials by pot), effective right
-    after that sample. initial_v: volts of states (capacitors, op-amps with a pole) at sample 0, 0 V where not given.
-    nodes: which voltages are saved, all when None.
-    Raises CircuitError for an input, pot, state or node that is not there, or whose name SPICE does not allow.
+    samples: number of samples at ``sample_rate_hz``; edges: levels by input, from tick 0 on, 0 V without any; turns:
+    changes of dials, without ramps; initial_v: V at sample 0 by state (capacitor, op-amp with a pole), else 0 V.
     """
-    writer = _Writer(circuit, 1.0 / sample_rate_hz, edges or {}, turns, initial_v or {})
-    writer.check(nodes)
-    return "\n".join(writer.lines(samples, accuracy or Accuracy(), nodes, title)) + "\n"
+
+    circuit: Circuit
+    samples: int = 0
+    sample_rate_hz: float = 20e3
+    edges: Mapping[str, Edges] = field(default_factory=dict)
+    turns: Sequence[PotChange] = ()
+    initial_v: Mapping[str, float] = field(default_factory=dict)
+    title: str = "analogue computer"
+
+    def text(self, nodes: Sequence[str] | None = None, accuracy: Accuracy | None = None) -> str:
+        """Deck that ngspice runs, without .tran when there are no samples.
+
+        nodes: names of the voltages to save, all when None.
+        Raises CircuitError for an unknown input, pot, state or node, for a name that SPICE does not allow, and for a
+        ramp.
+        """
+        writer = _Writer(self)
+        writer.check(nodes)
+        return "\n".join(writer.lines(accuracy or Accuracy(), nodes)) + "\n"
+
+    def volts(self, nodes: Sequence[str] | None = None) -> NDArray[np.float64]:
+        """Solution of the engine: (samples, nodes) in V, for every node of the circuit when none are named.
+
+        Raises CircuitError, PotError, EngineError.
+        """
+        nodal = Nodal(self.circuit)
+        dials: dict[str, float] = {}
+        system = nodal.at(dials)
+        engine = Engine(system, self.circuit.nodes if nodes is None else nodes, self.sample_rate_hz)
+        engine.state = np.array([self.initial_v.get(state, 0.0) for state in system.states])
+        stretches = []
+        for change in [*sorted(self.turns, key=lambda change: change.sample), PotChange(self.samples - 1, {})]:
+            samples = change.sample + 1 - engine.recorded
+            if samples > 0:
+                window = engine.window(samples)
+                stretches.append(engine.run(samples, {name: e.within(*window) for name, e in self.edges.items()}))
+            dials |= change.values
+            engine.set_system(nodal.at(dials))
+        return np.concatenate(stretches)
+
+
+def to_spice(
+    circuit: Circuit, *, nodes: Sequence[str] | None = None, accuracy: Accuracy | None = None, **played: Any
+) -> str:
+    """Text of Deck(circuit, **played)."""
+    return Deck(circuit, **played).text(nodes, accuracy)
 
 
 class _Writer:
-    def __init__(
-        self,
-        circuit: Circuit,
-        period_s: float,
-        edges: Mapping[str, Edges],
-        turns: Sequence[tuple[int, Mapping[str, float]]],
-        initial_v: Mapping[str, float],
-    ) -> None:
-        self._circuit = circuit
-        self._period_s = period_s
-        self._edges = edges
-        self._turns = turns
-        self._initial_v = initial_v
-        self._taken = {name.lower() for name in circuit.nodes}
-        self._taken |= {_card(_LETTERS[type(element)], element.name).lower() for element in circuit.elements}
+    def __init__(self, deck: Deck) -> None:
+        self._deck = deck
+        self._circuit = deck.circuit
+        self._period_s = 1.0 / deck.sample_rate_hz
+        self._taken = {name.lower() for name in self._circuit.nodes}
+        self._taken |= {_card(_LETTERS[type(element)], element.name).lower() for element in self._circuit.elements}
         self._used: dict[str, None] = {}
 
     def check(self, nodes: Sequence[str] | None) -> None:
         circuit = self._circuit
-        _known("input", self._edges, [source.name for source in circuit.inputs])
-        for _, dials in self._turns:
-            circuit.with_dials(dials)
+        _known("input", self._deck.edges, [source.name for source in circuit.inputs])
+        for change in self._deck.turns:
+            circuit.with_dials(change.values)
+            if change.ramp_n:
+                raise CircuitError(f"pots {', '.join(change.values)}: a deck turns pots at once; ramp_n must be 0")
         amps = [amp.name for amp in circuit.of(OpAmp) if amp.model.has_state]
-        _known("state", self._initial_v, [*(capacitor.name for capacitor in circuit.of(Capacitor)), *amps])
+        _known("state", self._deck.initial_v, [*(capacitor.name for capacitor in circuit.of(Capacitor)), *amps])
         _known("node", nodes or (), circuit.nodes)
         for node in circuit.nodes:
             if node.lower() == "gnd":
                 raise CircuitError(f"node {node}: SPICE takes this name for ground; call it otherwise")
 
-    def lines(self, samples: int, accuracy: Accuracy, nodes: Sequence[str] | None, title: str) -> Iterator[str]:
+    def lines(self, accuracy: Accuracy, nodes: Sequence[str] | None) -> Iterator[str]:
         elements = [line for element in self._circuit.elements for line in self._element(element)]
         clock = self._instance("time_points", self._free("Xclock"), (self._free("clock"),), period=self._period_s)
-        yield f"* {' '.join(title.split())}".encode("ascii", "replace").decode()
+        yield f"* {' '.join(self._deck.title.split())}".encode("ascii", "replace").decode()
         for name in self._used:
             yield LIBRARY[name]
         yield from elements
@@ -173,8 +198,8 @@ class _Writer:
         yield ".save " + " ".join(f"v({node})" for node in (self._circuit.nodes if nodes is None else nodes))
         yield f".options reltol={accuracy.reltol:g} vntol={accuracy.vntol_v:g} abstol={accuracy.abstol_a:g}"
         yield f".options trtol={accuracy.trtol:g}"
-        if samples > 0:
-            stop_s = (samples - 1) * self._period_s
+        if self._deck.samples > 0:
+            stop_s = (self._deck.samples - 1) * self._period_s
             yield f".tran {_number(self._period_s)} {_number(stop_s)} 0 {_number(accuracy.max_step_s)} uic"
         yield ".end"
 
@@ -184,11 +209,11 @@ class _Writer:
             case Resistor(a=a, b=b, ohm=ohm):
                 yield f"{card} {a} {b} {_number(ohm)}"
             case Capacitor(name=name, a=a, b=b, farad=farad):
-                initial = f" IC={_number(self._initial_v[name])}" if name in self._initial_v else ""
+                initial = f" IC={_number(self._deck.initial_v[name])}" if name in self._deck.initial_v else ""
                 yield f"{card} {a} {b} {_number(farad)}{initial}"
             case VoltageSource() | CurrentSource():
                 yield from self._source(card, element)
-            case Pot() if turns := [(sample, d[element.name]) for sample, d in self._turns if element.name in d]:
+            case Pot(name=name) if turns := [turn for turn in self._deck.turns if name in turn.values]:
                 yield from self._turned_pot(card, element, turns)
             case _:
                 subcircuit, values = _instance_of(element)
@@ -197,14 +222,14 @@ class _Writer:
     def _source(self, card: str, source: VoltageSource | CurrentSource) -> Iterator[str]:
         head, level = f"{card} {source.plus} {source.minus}", source.constant
         if level is None:
-            yield from _stepped(head, *_levels(self._edges.get(source.name, Edges.none()), self._period_s))
+            yield from _stepped(head, *_levels(self._deck.edges.get(source.name, Edges.none()), self._period_s))
         else:
             yield f"{head} DC {_number(level)}"
 
-    def _turned_pot(self, card: str, pot: Pot, turns: Sequence[tuple[int, float]]) -> Iterator[str]:
+    def _turned_pot(self, card: str, pot: Pot, turns: Sequence[PotChange]) -> Iterator[str]:
         dial = self._free(f"dial_{pot.name}")
-        times_s = np.array([0.0] + [sample * self._period_s for sample, _ in turns])
-        dials = np.array([pot.dial] + [setting for _, setting in turns])
+        times_s = np.array([0.0] + [turn.sample * self._period_s for turn in turns])
+        dials = np.array([pot.dial] + [turn.values[pot.name] for turn in turns])
         yield from _stepped(f"{self._free(f'V_{dial}')} {dial} 0", times_s, dials)
         yield self._instance("turned_pot", card, (*pot.nodes, dial), track=pot.track_ohm)
 
@@ -214,8 +239,8 @@ class _Writer:
 
     def _initial_conditions(self) -> Iterator[str]:
         for amp in self._circuit.of(OpAmp):
-            if amp.name in self._initial_v:
-                yield f".ic v({_card('X', amp.name)}.state)={_number(self._initial_v[amp.name])}"
+            if amp.name in self._deck.initial_v:
+                yield f".ic v({_card('X', amp.name)}.state)={_number(self._deck.initial_v[amp.name])}"
 
     def _free(self, name: str) -> str:
         """The name itself, or with as many underscores as make it one that nothing else in the deck has."""

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
-from analogrig_emulator.circuit.nodal import Kink, PiecewiseLinear
 from analogrig_emulator.engine import library
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
 from analogrig_emulator.errors import EngineError
-
-__all__ = ["Engine", "EngineCounts", "Turns"]
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
 """Ticks, inputs and levels of all edges, in order of time."""
@@ -184,21 +181,21 @@ class Engine:
         self._note(samples)
         return volts
 
-    def play(self, turns: Turns, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        """A whole play from rest, as that of a new engine: float64 (turns.samples, outputs), V.
+    def play(self, schedule: CircuitSchedule, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
+        """A whole play from rest, as that of a new engine: float64 (schedule.samples, outputs), V.
 
         As set_system() and run() by turns, at a fraction of their cost; the clock and what watch() saw begin anew.
         Raises EngineError.
         """
         self._library.engine_restart(self._handle)
-        self._library.engine_watch(self._handle, turns.patience_ticks)
+        self._library.engine_watch(self._handle, schedule.patience_ticks)
         self._recorded, self._now_tick = 0, -1
-        volts = self._room(turns.samples)
+        volts = self._room(schedule.samples)
         trains = self._merge(edges)
         addresses = [array.ctypes.data for array in (*trains, volts)]
-        turned = (len(turns.circuits), turns.circuits, turns.until_ticks.ctypes.data)
+        turned = (len(schedule.circuits), schedule.circuits, schedule.until_ticks.ctypes.data)
         self._check(self._library.engine_play(self._handle, *turned, trains[0].size, *addresses))
-        self._note(turns.samples)
+        self._note(schedule.samples)
         return volts
 
     def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
@@ -254,7 +251,7 @@ class Engine:
             raise EngineError(f"after {self.counts.samples} samples: {_REASONS.get(status, f'status {status}')}")
 
 
-class Turns:
+class CircuitSchedule:
     """The circuits that a play goes through, laid out as the engine takes them, so that it can be played repeatedly.
 
     systems: of the same states, inputs and kinks; last_samples: for each the last sample that it shows, in order of

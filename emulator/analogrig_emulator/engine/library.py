@@ -9,8 +9,6 @@ from pathlib import Path
 
 from analogrig_emulator.errors import EngineError
 
-__all__ = ["MAX_INPUTS", "MAX_KINKS", "MAX_OUTPUTS", "MAX_STATES", "MAX_UNKNOWNS", "Counts", "System", "load"]
-
 # The limits of engine/engine.h.
 MAX_STATES = 32
 MAX_INPUTS = 8

@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.excitation import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.circuit.circuit import (
     GROUND,
     Capacitor,
@@ -39,13 +38,12 @@ from analogrig_emulator.circuit.circuit import (
     label,
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
-from analogrig_emulator.circuit.nodal import Kink, Nodal, PiecewiseLinear
+from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.pot import END_FRACTION, checked_dial, checked_ramp
 from analogrig_emulator.engine.engine import Engine
+from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from analogrig_emulator.machine.patching import Patch, patches
-
-__all__ = ["LAMP_DELAY_S", "REFERENCE_V", "AnalogComputer", "Mode", "RelaySwitch", "lit"]
 
 REFERENCE_V = 10.0
 """The machine's reference, on which a pot's top lies while its coefficient is read."""
@@ -136,7 +134,7 @@ class AnalogComputer:
         self._lamp_delay_ticks = round(lamp_delay_s * sample_rate_hz * TICKS_PER_SAMPLE)
         self._wipers = _Wipers(circuit, components)
         self._dials = {pot.name: pot.dial for pot in circuit.of(Pot)}
-        self._turns: dict[str, _Turn] = {}
+        self._turns: dict[str, _Ramp] = {}
         self._closed = {switch.name: switch.closed for switch in circuit.of(Switch)}
         self._check_integrators(self._initial_v)
         self.restart()
@@ -215,7 +213,7 @@ class AnalogComputer:
             if ramp_n:
                 first = max(self.recorded - 1, 0)
                 self._turns |= {
-                    pot: _Turn(self._dials[pot], dial, first, first + ramp_n)
+                    pot: _Ramp(self._dials[pot], dial, first, first + ramp_n)
                     for pot, dial in goals.items()
                     if dial != self._dials[pot]
                 }
@@ -352,7 +350,8 @@ class AnalogComputer:
         for cycle in range(cycles):
             start = (self.recorded - 1) * TICKS_PER_SAMPLE
             switches = [(start, Mode.INITIAL_CONDITION), (start + initial_ticks, Mode.OPERATE)]
-            volts[cycle] = self.run(samples, _shifted(edges or {}, start), switches)
+            shifted = {name: train.shifted(start) for name, train in (edges or {}).items()}
+            volts[cycle] = self.run(samples, shifted, switches)
         return volts
 
     # ---- time
@@ -573,7 +572,7 @@ def lit(amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray
 
 
 @dataclass(frozen=True)
-class _Turn:
+class _Ramp:
     """A pot on its way, evenly, from one dial at sample `first` to another at sample `last`."""
 
     start: float
@@ -601,7 +600,7 @@ class _Position(NamedTuple):
     nodals: dict[Mode, Nodal]
     initial_v: dict[str, float]
     dials: dict[str, float]
-    turns: dict[str, _Turn]
+    turns: dict[str, _Ramp]
     closed: dict[str, bool]
 
 
@@ -653,20 +652,8 @@ def _portions(edges: Mapping[str, Edges], ticks: Sequence[int]) -> Iterator[Mapp
 
 
 def _until(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
-    return {name: _part(train, slice(None, _split(train, tick))) for name, train in edges.items()}
+    return {name: train.until(tick) for name, train in edges.items()}
 
 
 def _after(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
-    return {name: _part(train, slice(_split(train, tick), None)) for name, train in edges.items()}
-
-
-def _shifted(edges: Mapping[str, Edges], ticks: int) -> dict[str, Edges]:
-    return {name: Edges(train.ticks + ticks, train.levels_v) for name, train in edges.items()}
-
-
-def _split(train: Edges, tick: int) -> int:
-    return int(np.searchsorted(train.ticks, tick, side="right"))
-
-
-def _part(train: Edges, part: slice) -> Edges:
-    return Edges(train.ticks[part], train.levels_v[part])
+    return {name: train.after(tick) for name, train in edges.items()}

@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
-from analogrig_emulator.circuit.nodal import Nodal, PiecewiseLinear
-from analogrig_emulator.circuit.pot import legs_ohm
+from analogrig_emulator.circuit.nodal import Nodal
+from analogrig_emulator.circuit.pot import PotChange, legs_ohm
 from analogrig_emulator.engine import library
+from analogrig_emulator.engine.system import PiecewiseLinear
 from analogrig_emulator.errors import CircuitError
-from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, RampedTweak, SuspensionComputer, Tweak
-
-__all__ = ["BOLTZMANN_J_PER_K", "CircuitNoise", "NoisySuspension"]
+from analogrig_emulator.machine.suspension import BLOCK_SAMPLES, SuspensionComputer
 
 BOLTZMANN_J_PER_K = 1.380649e-23
 _ZERO_C_K = 273.15
@@ -127,12 +126,12 @@ class NoisySuspension:
         self,
         excitation: Excitation,
         samples: int,
-        tweaks: Sequence[Tweak | RampedTweak] = (),
+        changes: Sequence[PotChange] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[Matrix]:
         """As SuspensionComputer.play; set() between two blocks does not reach the noise, a ramp when it has ended."""
         computer = self._computer
-        turns = [(turn.sample + 1 + turn.ramp_n, turn.dials) for turn in computer.planned(tweaks, samples)]
+        turns = [(turn.sample + 1 + turn.ramp_n, turn.values) for turn in computer.planned(changes, samples)]
         turns.sort(key=lambda turn: turn[0])
         noise = CircuitNoise(
             computer.circuit,
@@ -141,10 +140,10 @@ class NoisySuspension:
             temperature_c=self._temperature_c,
             sample_rate_hz=computer.sample_rate_hz,
         )
-        return self._blocks(computer.play(excitation, samples, tweaks, block_samples), noise, turns)
+        return self._blocks(computer.play(excitation, samples, changes, block_samples), noise, turns)
 
     def _blocks(
-        self, quiet: Iterator[Matrix], noise: CircuitNoise, turns: list[tuple[int, dict[str, float]]]
+        self, quiet: Iterator[Matrix], noise: CircuitNoise, turns: list[tuple[int, Mapping[str, float]]]
     ) -> Iterator[Matrix]:
         first = 0
         for block in quiet:

@@ -25,8 +25,6 @@ from analogrig_emulator.circuit.circuit import (
 from analogrig_emulator.circuit.components import is_part_of
 from analogrig_emulator.errors import CircuitError
 
-__all__ = ["Patch", "patches"]
-
 
 @dataclass(frozen=True)
 class Patch:

@@ -19,8 +19,6 @@ from analogrig_emulator.circuit.circuit import Element
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.errors import PotError
 
-__all__ = ["CHANNELS", "SOURCE", "ForceLaw", "Mass", "Parameter", "Program", "Quantity", "Scales"]
-
 CHANNELS = ("force", "displacement", "velocity", "net_force")
 """What the card's four channels read, in order; quantities that every program has."""
 

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import OpAmp
 from analogrig_emulator.circuit.nodal import Nodal
-from analogrig_emulator.engine.engine import Engine, Turns
+from analogrig_emulator.circuit.pot import PotChange
+from analogrig_emulator.engine.engine import CircuitSchedule, Engine
 from analogrig_emulator.machine.machine import lit
 from analogrig_emulator.machine.program import SOURCE
-from analogrig_emulator.machine.suspension import RampedTweak, SuspensionComputer, Tweak, in_full
-
-__all__ = ["Repeat", "RepeatedPlay", "is_repeatable"]
+from analogrig_emulator.machine.suspension import SuspensionComputer
 
 
 class Repeat(NamedTuple):
@@ -30,30 +29,29 @@ class Repeat(NamedTuple):
     lamps: Mapping[str, int | None]
 
 
-def is_repeatable(computer: SuspensionComputer, tweaks: Sequence[Tweak | RampedTweak]) -> bool:
-    """Whether RepeatedPlay takes it: pots that jump, and op-amps whose offsets enter nothing but their own drives."""
-    return all(amp.model.has_state for amp in computer.circuit.of(OpAmp)) and not any(
-        ramp_n for _, _, ramp_n in map(in_full, tweaks)
-    )
+def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotChange]) -> bool:
+    """True if RepeatedPlay accepts it: no ramps, and op-amps whose offsets enter nothing but their own drives."""
+    has_ramps = any(change.ramp_n for change in changes)
+    return not has_ramps and all(amp.model.has_state for amp in computer.circuit.of(OpAmp))
 
 
 class RepeatedPlay:
-    """A play of `samples` (at least 1) from rest, with the computer's pots as they stand and tweaks as of its play().
+    """A play of `samples` (at least 1) from rest, with the computer's pots as they stand and changes as of its play().
 
-    The computer itself is not touched. Raises PotError for tweaks that cannot be, CircuitError unless is_repeatable().
+    The computer itself is not touched. Raises PotError for impossible changes, CircuitError unless is_repeatable().
     """
 
-    def __init__(self, computer: SuspensionComputer, samples: int, tweaks: Sequence[Tweak | RampedTweak] = ()) -> None:
-        turns = computer.planned(tweaks, samples)
+    def __init__(self, computer: SuspensionComputer, samples: int, changes: Sequence[PotChange] = ()) -> None:
+        turns = computer.planned(changes, samples)
         nodal, dials = Nodal(computer.circuit), dict(computer.dials)
         solved = [nodal.trimmed(dials)]
         for turn in turns:
-            dials |= turn.dials
+            dials |= turn.values
             solved.append(nodal.trimmed(dials))
         systems = [system for system, _ in solved]
         nodes = computer.program.channel_nodes
         last_samples = [*(turn.sample for turn in turns), samples - 1]
-        self._turns = Turns(systems, nodes, last_samples, computer.machine.lamp_delay_ticks)
+        self._schedule = schedule = CircuitSchedule(systems, nodes, last_samples, computer.machine.lamp_delay_ticks)
         self._engine = Engine(systems[0], nodes, computer.sample_rate_hz)
         self._kinks = systems[0].kinks
         self._signs = computer.program.channel_signs
@@ -64,7 +62,7 @@ class RepeatedPlay:
         self._apart_v = np.stack([each.apart_v for _, each in solved])
         self._gain_rate = trim.gain_rate
         self._places = np.array(
-            [self._turns.abc_places[pole] if kink is None else self._turns.cde_places[kink] for pole, kink in trim.rows]
+            [schedule.abc_places[pole] if kink is None else schedule.cde_places[kink] for pole, kink in trim.rows]
         )
 
     def play(self, excitation: Excitation, offsets_v: NDArray[np.float64]) -> Repeat:
@@ -72,8 +70,8 @@ class RepeatedPlay:
 
         Raises ExcitationError and EngineError.
         """
-        self._turns.blocks[:, self._places] = (self._apart_v + offsets_v[self._numbers]) * self._gain_rate
-        edges = excitation.edges(0, int(self._turns.until_ticks[-1]) + 1, self._rate_hz)
-        volts = self._engine.play(self._turns, {SOURCE: edges})
+        self._schedule.blocks[:, self._places] = (self._apart_v + offsets_v[self._numbers]) * self._gain_rate
+        edges = excitation.edges(0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
+        volts = self._engine.play(self._schedule, {SOURCE: edges})
         volts *= self._signs
         return Repeat(volts, lit(self._amplifiers, self._kinks, self._engine.overdue_ticks))

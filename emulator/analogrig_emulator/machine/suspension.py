@@ -6,60 +6,28 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig_emulator.card.excitation import Edges, Excitation
+from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
-from analogrig_emulator.circuit.pot import PotModel, checked_dial, checked_ramp
+from analogrig_emulator.circuit.pot import PotChange, PotModel, checked_dial, checked_ramp
+from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
-from analogrig_emulator.machine.program import CHANNELS, SOURCE, Program, Scales
+from analogrig_emulator.machine.program import SOURCE, Program, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK
 from analogrig_emulator.machine.two_mass import TWO_MASS
-from analogrig_emulator.whole import is_whole
-
-__all__ = [
-    "CHANNELS",
-    "PROGRAMS",
-    "SOURCE",
-    "PlannedTurn",
-    "RampedTweak",
-    "SuspensionComputer",
-    "Tweak",
-    "drawn_offsets_v",
-    "in_full",
-]
 
 PROGRAMS: Mapping[str, Program] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
 )
 
-Tweak = tuple[int, Mapping[str, float]]
-"""(sample, settings): the settings of SuspensionComputer.set that apply after that sample is taken."""
-
-RampedTweak = tuple[int, Mapping[str, float], int]
-"""(sample, settings, ramp_n): the pots turn evenly from that sample on, and arrive ramp_n samples later."""
-
 BLOCK_SAMPLES = 32768
 """1 MB: in smaller blocks the calls cost more than a quiet stretch."""
-
-
-class PlannedTurn(NamedTuple):
-    """What the pots do at a tweak: from `sample` on, for ramp_n samples, to these dials."""
-
-    sample: int
-    dials: dict[str, float]
-    ramp_n: int
-
-
-def in_full(tweak: Tweak | RampedTweak) -> RampedTweak:
-    """A tweak as a ramp, of no length when none is given."""
-    return tweak if len(tweak) == 3 else (*tweak, 0)
 
 
 class SuspensionComputer:
@@ -134,34 +102,33 @@ class SuspensionComputer:
         """The dials to which set(**settings) would turn the pots."""
         return self.machine.resting(self._resolve(settings))
 
-    def planned(self, tweaks: Sequence[Tweak | RampedTweak], samples: int) -> list[PlannedTurn]:
-        """What play(..., samples, tweaks) would do to the pots, in order of time. Raises PotError."""
-        turns = []
-        for sample, settings, ramp_n in sorted(map(in_full, tweaks), key=lambda tweak: tweak[0]):
-            if not (is_whole(sample) and 0 <= sample < samples):
+    def planned(self, changes: Sequence[PotChange], samples: int) -> list[PotChange]:
+        """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
+        planned = []
+        for sample, settings, ramp_n in sorted(changes, key=lambda change: change.sample):
+            if not (is_integer(sample) and 0 <= sample < samples):
                 raise PotError(
-                    f"tweak of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
+                    f"change of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
                 )
-            turns.append(PlannedTurn(sample, self.dials_for(**settings), checked_ramp(ramp_n, settings)))
-        return turns
+            planned.append(PotChange(sample, self.dials_for(**settings), checked_ramp(ramp_n, settings)))
+        return planned
 
     def play(
         self,
         excitation: Excitation,
         samples: int,
-        tweaks: Sequence[Tweak | RampedTweak] = (),
+        changes: Sequence[PotChange] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[NDArray[np.float64]]:
         """Plays from rest; yields the volts of CHANNELS in blocks, float64 (block_samples or, last, fewer; 4).
 
-        The excitation's first level is applied at sample 0. A tweak (k, settings) takes effect right after sample k is
-        taken, so sample k + 1 is the first that can show it; one with a ramp begins there. Pots stay where the tweaks
-        leave them. set() between two blocks acts likewise.
+        The excitation's first level is applied at sample 0. A change takes effect right after its sample is
+        taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
         Raises PotError, ExcitationError and EngineError; for arguments that cannot be, before anything is played.
         """
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
-        turns = self.planned(tweaks, samples)
+        turns = self.planned(changes, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
         self.machine.restart(Mode.OPERATE)
         self._plays += 1
@@ -170,7 +137,7 @@ class SuspensionComputer:
     # ---- playing
 
     def _blocks(
-        self, play: int, excitation: Excitation, samples: int, turns: list[PlannedTurn], block_samples: int
+        self, play: int, excitation: Excitation, samples: int, turns: list[PotChange], block_samples: int
     ) -> Iterator[NDArray[np.float64]]:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)
@@ -181,15 +148,14 @@ class SuspensionComputer:
                 parts.append(self._advance(edges, until - self.machine.recorded))
                 while turns and turns[0].sample + 1 == self.machine.recorded:
                     turn = turns.pop(0)
-                    self.machine.turn(turn.dials, turn.ramp_n)
+                    self.machine.turn(turn.values, turn.ramp_n)
             if play != self._plays:
                 raise EngineError("this play was ended by a newer one on the same machine")
             yield parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _advance(self, edges: Edges, samples: int) -> NDArray[np.float64]:
-        """The next samples, with those of the edges that fall among them."""
-        now = slice(*np.searchsorted(edges.ticks, self.machine.window(samples)))
-        volts = self.machine.run(samples, {SOURCE: Edges(edges.ticks[now], edges.levels_v[now])})
+        """Volts of the next samples: (samples, channels)."""
+        volts = self.machine.run(samples, {SOURCE: edges.within(*self.machine.window(samples))})
         volts *= self._signs
         return volts
 

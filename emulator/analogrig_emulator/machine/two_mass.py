@@ -17,8 +17,6 @@ from analogrig_emulator.circuit.circuit import GROUND, Capacitor, Element, OpAmp
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
 
-__all__ = ["TWO_MASS", "TwoMassParts", "TwoMassPlant", "TwoMassProgram"]
-
 
 @dataclass(frozen=True)
 class TwoMassPlant:

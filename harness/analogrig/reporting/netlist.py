@@ -6,7 +6,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import EmulatorRig, SetUp
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
-from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotChange
 
 
 def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
@@ -28,16 +28,16 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
     )
 
 
-def _turns(setup: SetUp, samples: int) -> list[tuple[int, dict[str, float]]]:
+def _turns(setup: SetUp, samples: int) -> list[PotChange]:
     """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
     dials = setup.computer.dials
-    turns: list[tuple[int, dict[str, float]]] = []
-    for sample, goals, ramp_n in setup.computer.planned(setup.tweaks, samples):
+    turns: list[PotChange] = []
+    for sample, goals, ramp_n in setup.computer.planned(setup.changes, samples):
         for k in range(min(ramp_n, samples - sample)):
             part = (k + 0.5) / ramp_n
             between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}
-            turns.append((sample + k, setup.computer.machine.resting(between)))
+            turns.append(PotChange(sample + k, setup.computer.machine.resting(between)))
         if sample + ramp_n < samples:
-            turns.append((sample + ramp_n, goals))
+            turns.append(PotChange(sample + ramp_n, goals))
         dials |= goals
     return turns

@@ -35,7 +35,7 @@ from analogrig_emulator import (
     OpAmp,
     OpAmpGrade,
     Pot,
-    RampedTweak,
+    PotChange,
     RepeatedPlay,
     Resistor,
     Sampler,
@@ -251,7 +251,7 @@ class SetUp(NamedTuple):
 
     computer: SuspensionComputer
     excitation: Excitation
-    tweaks: tuple[RampedTweak, ...]
+    changes: tuple[PotChange, ...]
 
 
 class _Prepared(NamedTuple):
@@ -306,13 +306,13 @@ class EmulatorRig:
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
-        tweaks: list[RampedTweak] = []
+        changes: list[PotChange] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
                 settings = self._settings(computer, tweak.given())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
-            tweaks.append((tweak.sample, settings, tweak.ramp_n))
-        return SetUp(computer, excitation, tuple(tweaks))
+            changes.append(PotChange(tweak.sample, settings, tweak.ramp_n))
+        return SetUp(computer, excitation, tuple(changes))
 
     def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
         """As Rig.perform; the length of the blocks changes nothing but speed.
@@ -323,12 +323,12 @@ class EmulatorRig:
             prepared = self._prepared(scenario, seed)
             if prepared.play is not None:
                 return self._repeated(prepared, prepared.play, scenario, seed)
-        computer, excitation, tweaks = self.set_up(scenario, seed)
+        computer, excitation, changes = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
             machine = self._noisy(computer, seed) if self._description.computer.noise else computer
             jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
-                machine, self._card, excitation, scenario.samples, tweaks, rng=jitter, block_samples=block_samples
+                machine, self._card, excitation, scenario.samples, changes, rng=jitter, block_samples=block_samples
             )
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
@@ -343,11 +343,11 @@ class EmulatorRig:
     def _prepared(self, scenario: Scenario, seed: int) -> _Prepared:
         """The last one, if it serves."""
         if self._last_prepared is None or not self._last_prepared.serves(scenario):
-            computer, excitation, tweaks = self.set_up(scenario, seed)
+            computer, excitation, changes = self.set_up(scenario, seed)
             with emulator_errors(f"scenario {scenario.name}: "):
                 excitation.edges(0, 1, computer.sample_rate_hz)
-                able = self._draws_offsets_alone and is_repeatable(computer, tweaks)
-                play = RepeatedPlay(computer, scenario.samples, tweaks) if able else None
+                able = self._draws_offsets_alone and is_repeatable(computer, changes)
+                play = RepeatedPlay(computer, scenario.samples, changes) if able else None
             self._last_prepared = _Prepared(scenario, computer, play, self._channels(computer), scenario.segments())
         return self._last_prepared
 

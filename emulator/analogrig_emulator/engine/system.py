@@ -1,0 +1,201 @@
+"""Input of the engine: a piecewise-linear state space, and the edges of its inputs.
+
+    dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e + P phi(w),   v = L x + M u + n + R phi(w)
+
+x: states, u: inputs, v: node voltages, phi: one Kink per element of w.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Integral
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig_emulator.engine import library
+from analogrig_emulator.errors import CircuitError
+
+TICKS_PER_SAMPLE = 1 << 22
+"""Ticks per sample period: the unit of time of edges and relays, 12 ps at 20 kHz."""
+
+Matrix = NDArray[np.float64]
+
+_PIECE_SLACK = 1e-9
+"""Of a kink's bound: less than this beyond it may be rounding."""
+
+
+def is_integer(number: object) -> bool:
+    """True for an integer of Python or numpy; 5.0 is none."""
+    return isinstance(number, Integral)
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Level changes of one input: levels_v[i] applies from tick ticks[i] on.
+
+    ticks: int64 (n,), not decreasing; levels_v: float64 (n,), V.
+    """
+
+    ticks: NDArray[np.int64]
+    levels_v: NDArray[np.float64]
+
+    @classmethod
+    def none(cls) -> Edges:
+        """Empty train of edges."""
+        return cls(np.empty(0, np.int64), np.empty(0))
+
+    def within(self, start: int, stop: int) -> Edges:
+        """Edges at ticks start <= tick < stop."""
+        part = slice(*np.searchsorted(self.ticks, (start, stop)))
+        return Edges(self.ticks[part], self.levels_v[part])
+
+    def until(self, tick: int) -> Edges:
+        """Edges up to and including a tick."""
+        part = slice(None, np.searchsorted(self.ticks, tick, "right"))
+        return Edges(self.ticks[part], self.levels_v[part])
+
+    def after(self, tick: int) -> Edges:
+        """Edges later than a tick."""
+        part = slice(np.searchsorted(self.ticks, tick, "right"), None)
+        return Edges(self.ticks[part], self.levels_v[part])
+
+    def shifted(self, ticks: int) -> Edges:
+        """The same edges, later by so many ticks."""
+        return Edges(self.ticks + ticks, self.levels_v)
+
+
+@dataclass(frozen=True)
+class Kink:
+    """A continuous function of three linear pieces, with slopes below lower, between, and above upper.
+
+    Between, phi(w) = slopes[1] w.
+    """
+
+    lower: float
+    upper: float
+    slopes: tuple[float, float, float]
+    element: str = ""
+    """The name of the element that it limits."""
+
+    @classmethod
+    def clip(cls, limit: float) -> Kink:
+        """clip(w, -limit, +limit)."""
+        return cls(-limit, limit, (0.0, 1.0, 0.0))
+
+    @classmethod
+    def deadzone(cls, lower: float, upper: float) -> Kink:
+        """What of w is beyond lower..upper, and 0 within."""
+        return cls(lower, upper, (1.0, 0.0, 1.0))
+
+    @property
+    def intercepts(self) -> tuple[float, float, float]:
+        """Constant terms of the pieces, such that they meet; 0 for a piece that an infinite bound removes."""
+        below, between, above = self.slopes
+        at_lower = (between - below) * self.lower if np.isfinite(self.lower) else 0.0
+        at_upper = (between - above) * self.upper if np.isfinite(self.upper) else 0.0
+        return at_lower, 0.0, at_upper
+
+    def piece(self, w: float, now: int) -> int:
+        """In which piece w lies: 0, 1 or 2; the present one where rounding may be all that puts it beyond."""
+        for piece, bound in ((0, self.lower), (1, self.upper)):
+            slack = _PIECE_SLACK * (1.0 + abs(bound))
+            if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
+                return piece
+        return 2 if math.isfinite(self.upper) else 1
+
+
+class Rest(NamedTuple):
+    """Where a circuit rests: its state, (n,) in V, and the voltage of every node."""
+
+    state: Matrix
+    volts: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class PiecewiseLinear:
+    """The state space of a circuit, in the form of the module's docstring.
+
+    Columns of abc, cde and lmn: states, inputs, constant.
+
+    abc: (n, n+m+1) in 1/s and V/s; g: (n, q); cde: (q, n+m+1); w_phi: P, (q, q); lmn: (nodes, n+m+1), dimensionless but
+    for its last column in V; v_phi: R, (nodes, q).
+    states, inputs, nodes: names; ground is not among the nodes.
+    """
+
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    nodes: tuple[str, ...]
+    kinks: tuple[Kink, ...]
+    abc: Matrix
+    g: Matrix
+    cde: Matrix
+    w_phi: Matrix
+    lmn: Matrix
+    v_phi: Matrix
+
+    def readings(self, nodes: Sequence[str]) -> Matrix:
+        """The rows of lmn for these nodes, in this order. Raises CircuitError for a node that is not there."""
+        return self.lmn[self.rows(nodes)]
+
+    def rows(self, nodes: Sequence[str]) -> list[int]:
+        """Which rows of lmn and v_phi belong to these nodes. Raises CircuitError for a node that is not there."""
+        try:
+            return [self.nodes.index(node) for node in nodes]
+        except ValueError:
+            missing = next(node for node in nodes if node not in self.nodes)
+            raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
+
+    def rest(self, levels_v: Matrix) -> Rest:
+        """Where nothing moves with the inputs held at levels_v (m,): the limits that are reached there count.
+
+        Pieces are tried from the middle ones on, each time those in which the rest of the last ones lies, until they
+        stand; so this needs not be the only rest, nor the one to which the circuit would come from its present state.
+        Raises CircuitError naming a state that nothing brings to rest, or what has no rest in any piece tried.
+        """
+        pieces = np.ones(len(self.kinks), np.intp)
+        for _ in range(2 * len(self.kinks) + 1):
+            rest, w = self._rest_within(pieces, levels_v)
+            reached = np.array([kink.piece(*at) for kink, *at in zip(self.kinks, w, pieces, strict=True)], np.intp)
+            if (reached == pieces).all():
+                return rest
+            unsettled, pieces = reached != pieces, reached
+        names = dict.fromkeys(kink.element for kink, moves in zip(self.kinks, unsettled, strict=True) if moves)
+        raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")
+
+    def _rest_within(self, pieces: NDArray[np.intp], levels_v: Matrix) -> tuple[Rest, Matrix]:
+        """The rest, and w there, were every kink the line of that piece everywhere."""
+        states, kinks = len(self.states), range(len(self.kinks))
+        slopes = np.array([self.kinks[k].slopes[pieces[k]] for k in kinks])
+        intercepts = np.array([self.kinks[k].intercepts[pieces[k]] for k in kinks])
+        w_of_z = self.cde.copy()
+        for k in kinks:
+            w_of_z[:, -1] += self.w_phi[:, k] * intercepts[k]
+        failed = solve_in_place(np.eye(len(self.kinks)) - self.w_phi * slopes, w_of_z)
+        if failed >= 0:
+            raise CircuitError(f"the limits of {self.kinks[failed].element} leave no unique solution")
+        flow = self.abc.copy()
+        for k in kinks:
+            flow += np.outer(self.g[:, k] * slopes[k], w_of_z[k])
+            flow[:, -1] += self.g[:, k] * intercepts[k]
+        held = np.append(levels_v, 1.0)
+        right = -(flow[:, states:] * held).sum(axis=1, keepdims=True)
+        failed = solve_in_place(flow[:, :states], right)
+        if failed >= 0:
+            raise CircuitError(f"nothing brings {self.states[failed]} to rest")
+        z = np.concatenate((right[:, 0], held))
+        w = np.asarray((w_of_z * z).sum(axis=1))
+        volts = (self.lmn * z).sum(axis=1) + (self.v_phi * (slopes * w + intercepts)).sum(axis=1)
+        return Rest(right[:, 0], dict(zip(self.nodes, volts.tolist(), strict=True))), w
+
+
+def solve_in_place(left: Matrix, solution: Matrix) -> int:
+    """Solve left x = solution in place; return the unknown without a pivot, or -1.
+
+    solution: contiguous, with at least as many rows as left.
+    """
+    matrix = left.copy(order="C")
+    return int(library.load().engine_solve(len(left), solution.shape[1], matrix.ctypes.data, solution.ctypes.data))
