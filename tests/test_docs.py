@@ -14,7 +14,7 @@ import pytest
 
 from analogrig import cli, config
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.devices.devices import from_table
+from analogrig.devices.registry import from_table
 from analogrig.rigs.description import described
 from analogrig.scenario import Scenario
 

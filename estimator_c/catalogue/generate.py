@@ -335,11 +335,11 @@ def python_tables(database: Database) -> str:
     return f'''"""{NOTICE.format(catalogue=CATALOGUE.name)}"""
 
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 
 class Layout(NamedTuple):
-    """How a message lies in its payload."""
+    """Layout of a message in its payload."""
 
     id: int
     length: int
@@ -348,14 +348,28 @@ class Layout(NamedTuple):
     format: str
     fields: tuple[str, ...]
     bits: dict[str, tuple[int, int]]
-    """Of what shares the byte called flags: first bit, number of bits."""
+    """First bit and number of bits of each part of the byte called flags."""
 
 
 CATALOGUE_HASH = 0x{catalogue_hash(database):08X}
 
 LAYOUTS = {{
 {"".join(python_layout(message) for message in database.messages)}}}
-{"".join(python_enums(database))}'''
+{"".join(python_enums(database))}{"".join(map(python_message, database.messages))}
+
+Message: TypeAlias = {" | ".join(message.name for message in database.messages)}
+'''
+
+
+def python_message(message: Message) -> str:
+    """Source of the message's named tuple. Numbered signals become one field ``codes``, the last one."""
+    meaning = (message.comment or "").split(". ")[0].rstrip(".")
+    sender = "harness" if message.senders == ["HARNESS"] else "device"
+    out = f'\n\nclass {message.name}(NamedTuple):\n    """{meaning}. Sent by the {sender}."""\n\n'
+    for field in fields(message):
+        if not field.name[-1].isdigit():
+            out += f"    {field.name}: {'float' if field.code == 'f' else 'int'}\n"
+    return out + ("    codes: tuple[int, ...]\n" if arrays(message) else "")
 
 
 def python_layout(message: Message) -> str:

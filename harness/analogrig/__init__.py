@@ -35,6 +35,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
+    from analogrig.devices.dut import Dut, open_dut
+    from analogrig.devices.estimator_config import EstimatorConfig
     from analogrig.errors import (
         AnalogrigError,
         ConfigurationError,
@@ -47,8 +49,6 @@ if TYPE_CHECKING:
     from analogrig.judging.information import detectable
     from analogrig.judging.verdict import TweakVerdict, Verdict, judge
     from analogrig.plant import Plant
-    from analogrig.protocol.dut import Dut, open_dut
-    from analogrig.protocol.estimator_config import EstimatorConfig
     from analogrig.reporting.page import write_report
     from analogrig.rigs.description import open_rig
     from analogrig.rigs.rig import Rig
@@ -66,14 +66,14 @@ if TYPE_CHECKING:
 else:
     _MODULES = {
         "analogrig.bench": "Bench",
-        "analogrig.protocol.estimator_config": "EstimatorConfig",
+        "analogrig.devices.estimator_config": "EstimatorConfig",
         "analogrig.errors": (
             "AnalogrigError ConfigurationError DeviceError LinkError LinkTimeout RecordingError RigError"
         ),
         "analogrig.judging.information": "detectable",
         "analogrig.judging.verdict": "TweakVerdict Verdict judge",
         "analogrig.plant": "Plant",
-        "analogrig.protocol.dut": "Dut open_dut",
+        "analogrig.devices.dut": "Dut open_dut",
         "analogrig.reporting.page": "write_report",
         "analogrig.rigs.description": "open_rig",
         "analogrig.rigs.rig": "Rig",

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
+from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.identity import Identity
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import Change
 from analogrig.storage import replacing
 
 if TYPE_CHECKING:
-    from analogrig.protocol.estimator_config import EstimatorConfig
+    from analogrig.devices.estimator_config import EstimatorConfig
 
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1

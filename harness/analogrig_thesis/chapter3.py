@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig_thesis.document import Chapter, Claim, Curve, Erratum, Figure, Mark, Panel, Signal
 from analogrig_thesis.model import square
 from analogrig_thesis.schemes import FORGETTING, HOLD_N, PLAIN

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from analogrig.devices.reference import Twin
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.reference import ReferenceEstimator
 from analogrig_thesis.chapter3 import (
     PLAIN_3,
     SCHEMES,
@@ -121,7 +121,7 @@ SILENT = slice(200, 600)
 
 def _diagonals(config: EstimatorConfig, u: Signal, y: Signal) -> Signal:
     """Of P (N, 3), which only the estimator in Python shows."""
-    twin, out = Twin(config), []
+    twin, out = ReferenceEstimator(config), []
     for pair in zip(u.tolist(), y.tolist(), strict=True):
         twin.step(*pair)
         upper = np.array(twin.covariance.u)

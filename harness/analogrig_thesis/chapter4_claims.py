@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from analogrig.devices.reference import Twin
+from analogrig.devices.reference import ReferenceEstimator
 from analogrig.plant import Plant
 from analogrig.run import Segment
 from analogrig_thesis.chapter4 import (
@@ -313,7 +313,7 @@ def _extra_alarms(simulation: Simulation, key: str, ceiling: float) -> dict[str,
         for seed in NOISE_SEEDS if rms else (0,):
             y = simulation.y * UNITS_PER_M + np.random.default_rng(seed).normal(0.0, rms, PROFILE_N)
             each = track(config, simulation.u, y, UNITS_PER_M)
-            steps = Twin(config).run(simulation.u.tolist(), y.tolist())
+            steps = ReferenceEstimator(config).run(simulation.u.tolist(), y.tolist())
             alarms = np.flatnonzero([step.alarm for step in steps])
             extra.append(
                 [performance(dataclasses.replace(each, alarms=a), PROFILE).extra_alarms for a in (each.alarms, alarms)]

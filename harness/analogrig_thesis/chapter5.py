@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.run import Run
 from analogrig_thesis.chapter4 import CHANGE_LABELS, UNITS_PER_M, WARM_UP_N, zeta
 from analogrig_thesis.circuit import (

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from analogrig.bench import Bench, uninterrupted
-from analogrig.devices.devices import HostDevice
+from analogrig.devices.dut import connect
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.host import HostDevice
 from analogrig.plant import Plant, physical_parameters
-from analogrig.protocol.dut import connect
-from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run, Segment
 from analogrig.scenario import PlantChoice, Scenario, Tweak

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
 
 HOLD_N = 4
 """Section 4.4.3: "After four samples, calculate the mean as normal". Of the C they are four innovations: it begins its

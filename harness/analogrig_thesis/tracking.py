@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.devices.estimator import Estimator
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
 from analogrig.plant import physical_parameters
-from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.run import Run, Segment
 from analogrig_thesis.document import Mark, Signal
 from analogrig_thesis.model import PERIOD_S

@@ -20,7 +20,7 @@ import cantools
 import analogrig
 from analogrig import cli, errors
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.devices.devices import KINDS
+from analogrig.devices.registry import KINDS
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.emulator import EmulatorDescription
 from analogrig.scenario import Scenario

@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import FIRMWARE, CanDevice, DeviceDescription, HostDevice, InprocDevice, QemuM4
-from analogrig.protocol.dut import connect
+from analogrig.devices.can import CanDevice
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import connect
+from analogrig.devices.host import HostDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.qemu import FIRMWARE, QemuM4
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario

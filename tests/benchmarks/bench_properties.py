@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from numpy.typing import NDArray
 
 from analogrig.campaigns.trials import Trials
-from analogrig.devices.devices import describe
+from analogrig.devices.registry import describe
 from analogrig.judging.information import detectable
 from analogrig.judging.statistics import upper_rate
 from analogrig.rigs.description import open_rig

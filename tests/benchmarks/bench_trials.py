@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from analogrig.campaigns.trials import Trials
-from analogrig.devices.devices import describe
+from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario

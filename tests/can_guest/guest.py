@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-from analogrig.links.child import END_TIMEOUT_S, TETHER
+from analogrig.devices.child import END_TIMEOUT_S, TETHER
 from tests import tools
 
 from .linux import BUSYBOX, MODULES, VMLINUX

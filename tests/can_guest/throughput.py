@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from analogrig.devices.devices import CanDevice
+from analogrig.devices.can import CanDevice
 from tests.benchmarks.bench_link import WAYS, samples_per_s
 
 from .suite.interfaces import CONTROLLERS, VIRTUAL, device

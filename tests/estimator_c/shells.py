@@ -6,9 +6,7 @@ import ctypes
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from analogrig.links import frame
-from analogrig.links.wire import LIBRARY, MemoryWire
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     Command,
@@ -24,6 +22,8 @@ from analogrig.protocol.catalogue import (
     pack,
     unpack,
 )
+from analogrig.devices.library import LIBRARY, MemoryWire
+from analogrig.links import frame
 from tests.estimator_c.test_device import NONCE, blocks, codes
 
 EXTENDED, REMOTE, FD, ERROR = 1, 2, 4, 8

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from analogrig.protocol.catalogue import LAYOUTS, Alarm, Command, Control, Counter, Identify, Sample, unpack
+from analogrig.catalogue import LAYOUTS, Alarm, Command, Control, Counter, Identify, Sample, unpack
 from tests.estimator_c.shells import ERROR, EXTENDED, FD, REMOTE, CanDevice, Frame, conversation, frame_of, over_serial
 
 SAMPLE, BLOCK, STEPPED = (LAYOUTS[name].id for name in ("Sample", "SampleBlock", "Stepped"))

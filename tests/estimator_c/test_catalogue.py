@@ -20,8 +20,7 @@ from cantools.database.can import Database, Message
 from cantools.database.can.c_source import camel_to_snake_case
 from cantools.database.can.signal import Signal
 
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     CATALOGUE_HASH,
     LAYOUTS,
     Alarm,
@@ -38,6 +37,7 @@ from analogrig.protocol.catalogue import (
     pack,
     unpack,
 )
+from analogrig.devices.library import LIBRARY
 
 ESTIMATOR = Path(__file__).parents[2] / "estimator_c"
 DBC = ESTIMATOR / "catalogue" / "analogrig.dbc"

@@ -14,10 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.links import frame
-from analogrig.links.link import FramedLink
-from analogrig.links.wire import LIBRARY, MemoryWire
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     RUN_SHIFT,
@@ -48,6 +45,9 @@ from analogrig.protocol.catalogue import (
     Trigger,
     pack,
 )
+from analogrig.devices.library import LIBRARY, MemoryWire
+from analogrig.links import frame
+from analogrig.links.link import FramedLink
 from tests.estimator_c import isolation
 from tests.estimator_c.est_driver import Estimator
 from tests.estimator_c.performance import FULL

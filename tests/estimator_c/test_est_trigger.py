@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import analogrig.devices.estimator
-from analogrig.devices.reference import Twin
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.reference import ReferenceEstimator
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,
@@ -234,7 +234,7 @@ def test_gap_ends_the_doubt_in_favour_of_the_reading_that_explains_most(estimato
 def statistic_of_the_twin(
     config: EstimatorConfig, u: NDArray[np.float64], y: NDArray[np.float64], valid: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    return np.array([step.statistic for step in Twin(config).run(u.tolist(), y.tolist(), valid.tolist())])
+    return np.array([step.statistic for step in ReferenceEstimator(config).run(u.tolist(), y.tolist(), valid.tolist())])
 
 
 def statistics_in_doubt(

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from analogrig.catalogue import CATALOGUE_HASH, LAYOUTS
+from analogrig.devices.library import LIBRARY
 from analogrig.links import frame
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.catalogue import CATALOGUE_HASH, LAYOUTS
 
 
 class Decoder(ctypes.Structure):

@@ -18,9 +18,9 @@ import pytest
 from can.interfaces.slcan import slcanBus as SlcanBus
 from can.util import CAN_FD_DLC
 
-from analogrig.devices.devices import HOST_PROGRAM
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.catalogue import Alarm, unpack
+from analogrig.catalogue import Alarm, unpack
+from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.library import LIBRARY
 from tests.estimator_c.shells import (
     EXTENDED,
     FD,

@@ -25,20 +25,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import InprocDevice
+from analogrig.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
+from analogrig.devices.can_nodes import MemoryBus
+from analogrig.devices.dut import Dut
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import MemoryWire
 from analogrig.errors import AnalogrigError
 from analogrig.judging.verdict import judge
 from analogrig.links.can_bus import CanBus
-from analogrig.links.can_device import MemoryBus
 from analogrig.links.can_link import CanLink
 from analogrig.links.faulty_bus import FaultyBus
 from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.link import FramedLink, Link
-from analogrig.links.wire import MemoryWire, Wire
+from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
-from analogrig.protocol.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
-from analogrig.protocol.dut import Dut, Replies
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.protocol.exchange import Replies
 from analogrig.rigs.rig import Block, Hindsight, Performance
 from analogrig.run import CHANNELS, Channel, Run
 from analogrig.scenario import Scenario
@@ -51,7 +53,7 @@ RIG_BLOCK = 112
 """A whole number of messages."""
 TIMEOUT_S = 2.0
 LONGEST_RUN_S = 60.0
-"""Of virtual time, whatever happens: ten silences of two seconds each, delays, and the talk before and after."""
+"""Longest virtual time of a run [s]: ten silences of two seconds each, delays, and the talk before and after."""
 MOST_WAITING = 20_000
 """Messages, or bytes, that may be kept anywhere on the way."""
 
@@ -63,7 +65,7 @@ STEPS = ("handshake", "configuration", "start", "samples", "stop")
 ExchangeKind = Literal["sample", "block", "stream"]
 README = Path(__file__).parents[2] / "harness" / "README.md"
 TABLES = {"serial": "fault of a serial line", "can": "fault of a CAN bus", "can-fd": "fault of a CAN bus"}
-"""How the first column of its table is headed."""
+"""Heading of the first column of its table."""
 DOCUMENTED_AS = {"same": "as without", "LOST": "lost", "INCONCLUSIVE": "inconclusive"}
 
 EXCHANGES: tuple[ExchangeKind, ...] = ("sample", "block", "stream")
@@ -77,7 +79,7 @@ WAYS: tuple[tuple[LinkKind, ExchangeKind], ...] = (
     ("can-fd", "block"),
     ("can-fd", "stream"),
 )
-"""How samples travel; a classic frame carries no block."""
+"""Exchanges of the link; a classic frame carries no block."""
 
 
 def signals() -> NDArray[np.uint16]:
@@ -126,7 +128,7 @@ class SignalsRig:
 
 
 EXCITATION = Excitation(low_v=0.0, high_v=1.0, frequency_hz=200.0)
-"""Of no account: the rig plays CODES."""
+"""A placeholder: the rig plays CODES."""
 
 
 @dataclass(frozen=True)
@@ -137,14 +139,14 @@ class Case:
     exchange: ExchangeKind = "sample"
     link: LinkKind = "serial"
     first_seq: int = 0
-    """Of the harness's messages; the device's wrap around several times in any run."""
+    """First number of the harness's messages; the device's wrap around several times in any run."""
     samples: int = N
     most_lost_n: int = MOST_N
 
 
 @dataclass
 class Played:
-    """What came of it."""
+    """Outcome of a run."""
 
     outcome: str
     """``as without``: valid, nothing is lost. ``lost``: valid, some samples were lost. ``inconclusive``. Or the type of
@@ -219,7 +221,7 @@ def _play(link: Link, description: InprocDevice, case: Case) -> Played:
 
 @functools.lru_cache(maxsize=4096)
 def reference(samples: int, lost: tuple[int, ...]) -> Replies:
-    """What a device says without any fault, which is told that these samples are missing."""
+    """Replies without any fault, with these samples declared missing."""
     missing = np.zeros(samples, bool)
     missing[list(lost)] = True
     dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob", exchange="block", estimator=ESTIMATOR))
@@ -271,7 +273,7 @@ class _Tap:
 
 @functools.cache
 def steps(exchange: ExchangeKind, link: LinkKind = "serial") -> dict[Direction, list[str]]:
-    """Of a run without faults, to which of STEPS each frame belongs."""
+    """Step of each frame in a run without faults."""
     tap: Any = _Tap(_link(_in_memory(link)(), link))
     description = InprocDevice(name="bob", exchange=exchange, estimator=ESTIMATOR)
     played = _play(tap, description, Case(WireFaults(), exchange, link))
@@ -350,7 +352,7 @@ def by_chance(seed: int, links: Collection[LinkKind] = FAULTY) -> Case:
     """One to four faults anywhere, or a line that is bad all the time."""
     rng = Random(seed)
     link, exchange = rng.choice([way for way in WAYS if way[0] in links])
-    kinds, passing = tuple(FAULTY[link].HAPPENS), tuple(FAULTY[link].PASSES)
+    kinds, passing = tuple(FAULTY[link].KINDS), tuple(FAULTY[link].TRANSIENT)
     owners = steps(exchange, link)
     in_samples = {
         direction: [i for i, name in enumerate(names) if name == "samples"] for direction, names in owners.items()
@@ -376,7 +378,7 @@ def outcomes_by_chance(seeds: range) -> Counter[str]:
 
 
 def _all_played(pool: ProcessPoolExecutor, tasks: Mapping[str, Future[Counter[str]]]) -> Counter[str]:
-    """How often each outcome came; says what has been played, and goes on after what should not have come."""
+    """Count the outcomes. Prints progress, and goes on after failures."""
     total: Counter[str] = Counter()
     names = {future: name for name, future in tasks.items()}
     for done, future in enumerate(as_completed(names), 1):
@@ -397,7 +399,7 @@ def main() -> int:
     n, first = int(sys.argv[1]), int(sys.argv[2])
     started_s = time.monotonic()
     chunks = [range(start, min(start + 500, first + n)) for start in range(first, first + n, 500)]
-    ways = [(link, kind, exchange) for link, exchange in WAYS for kind in FAULTY[link].HAPPENS]
+    ways = [(link, kind, exchange) for link, exchange in WAYS for kind in FAULTY[link].KINDS]
     with ProcessPoolExecutor(2) as pool:
         at_every_frame = {" ".join(way): pool.submit(outcomes_everywhere, *way) for way in ways}
         total = _all_played(pool, at_every_frame)

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.catalogue import Change
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import Change
 from analogrig.run import CHANNELS, Channel, Conditions, Run, Segment
 
 N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096

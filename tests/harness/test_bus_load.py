@@ -10,16 +10,8 @@ import can
 import pytest
 from anycrc import Model
 
-from analogrig.links.bus_load import (
-    Stream,
-    exchange_load,
-    frame_bits,
-    frame_s,
-    latency_s,
-    longest_classic_bits,
-    longest_fd_bits,
-    message_s,
-)
+from analogrig.links.frame_bits import frame_bits, longest_classic_bits, longest_fd_bits, longest_frame_s
+from analogrig.protocol.bus_load import PeriodicFrames, exchange_load, latency_s
 
 FD_LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
 
@@ -79,7 +71,7 @@ def drawn_out_fd(frame: can.Message) -> tuple[int, int]:
 
 
 def ends_in_stuff(stream: str) -> bool:
-    """Whether a stuff bit comes after the last one."""
+    """True if a stuff bit follows the last one."""
     return len(stuffed(stream)) - len(stuffed(stream[:-1])) == 2
 
 
@@ -133,21 +125,22 @@ def test_longest_frames_are_those_of_davis_and_others() -> None:
     for n in range(9):
         assert longest_classic_bits(n).nominal == 55 + 10 * n
         assert longest_classic_bits(n, extended=True).nominal == 80 + 10 * n
-    assert frame_s(7, fd=False, bitrate=125_000) == pytest.approx(1e-3)
+    assert longest_frame_s(7, fd=False, bitrate=125_000) == pytest.approx(1e-3)
 
 
 def test_data_of_an_fd_frame_takes_less_time_at_a_higher_rate() -> None:
     bits = longest_fd_bits(64)
-    slow, fast = frame_s(64, fd=True, bitrate=500_000), frame_s(64, fd=True, bitrate=500_000, data_bitrate=2_000_000)
+    slow = longest_frame_s(64, fd=True, bitrate=500_000)
+    fast = longest_frame_s(64, fd=True, bitrate=500_000, data_bitrate=2_000_000)
     assert slow == pytest.approx(sum(bits) / 500_000)
     assert fast == pytest.approx(bits.nominal / 500_000 + bits.data / 2_000_000)
     frame = can.Message(data=bytes(64), is_fd=True, bitrate_switch=True, is_extended_id=False)
-    assert message_s(frame, 500_000, 2_000_000) < fast
+    assert frame_bits(frame).time_s(500_000, 2_000_000) < fast
 
 
-def refuted() -> list[Stream]:
+def refuted() -> list[PeriodicFrames]:
     """Table 1 of Davis et al. 2007: three messages of 7 bytes at 125 kbit/s."""
-    return [Stream(1, 1e-3, 2.5e-3), Stream(2, 1e-3, 3.5e-3), Stream(3, 1e-3, 3.5e-3)]
+    return [PeriodicFrames(1, 1e-3, 2.5e-3), PeriodicFrames(2, 1e-3, 3.5e-3), PeriodicFrames(3, 1e-3, 3.5e-3)]
 
 
 def test_latencies_are_those_of_the_revised_analysis() -> None:
@@ -157,15 +150,15 @@ def test_latencies_are_those_of_the_revised_analysis() -> None:
 
 
 def test_latency_has_no_limit_on_a_bus_that_is_full() -> None:
-    full = [*refuted(), Stream(0, 1e-3, 5e-3)]
+    full = [*refuted(), PeriodicFrames(0, 1e-3, 5e-3)]
     assert latency_s(full, 3, 8e-6) is None
     assert latency_s(full, 0, 8e-6) == pytest.approx(2e-3)
 
 
 def test_frames_queued_together_wait_for_each_other() -> None:
-    alone = [Stream(5, 1e-3, 100e-3, frames=9)]
+    alone = [PeriodicFrames(5, 1e-3, 100e-3, frames=9)]
     assert latency_s(alone, 5, 1e-6) == pytest.approx(9e-3)
-    with_others = [*alone, Stream(1, 1e-3, 4e-3), Stream(9, 2e-3, math.inf)]
+    with_others = [*alone, PeriodicFrames(1, 1e-3, 4e-3), PeriodicFrames(9, 2e-3, math.inf)]
     assert latency_s(with_others, 5, 1e-6) == pytest.approx(15e-3)  # 2 that has begun, 9, and those of 0, 4, 8, 12 ms
 
 

@@ -28,12 +28,13 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.trial import close_devices, play_chunk
 from analogrig.campaigns.workers import MOST_DEATHS, Processes, ThisProcess
 from analogrig.cli import main
-from analogrig.devices.devices import DeviceDescription, describe
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect, open_dut
+from analogrig.devices.library import LIBRARY
+from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
 from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import judge
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.dut import Dut, connect, open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
@@ -727,7 +728,7 @@ def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("analogrig.protocol.dut.Dut.play", interrupted)
+        patched.setattr("analogrig.devices.dut.Dut.play", interrupted)
         assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
     assert "interrupted: what is done is kept in" in capsys.readouterr().err
     assert journal_of(out).read_bytes().count(b"\n") == 1

@@ -14,7 +14,7 @@ import can
 import pytest
 
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
-from analogrig.links.can_bus import PythonCanBus, completed
+from analogrig.links.can_bus import PythonCanBus, complete_config
 from analogrig.links.line import CanLine
 from tests.harness.processes import LONG_S
 
@@ -23,7 +23,7 @@ FRAME = can.Message(arbitration_id=0x18, is_extended_id=False, data=bytes(8))
 
 @pytest.fixture
 def channel(request: pytest.FixtureRequest) -> str:
-    """Of a virtual bus that nobody else has."""
+    """Channel of a virtual bus that nobody else has."""
     return str(request.node.name)
 
 
@@ -36,7 +36,7 @@ def bus(channel: str) -> Iterator[PythonCanBus]:
 
 @pytest.fixture(autouse=True)
 def _no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of whoever runs the tests."""
+    """Isolate the test from the user's own configuration."""
     for name in [name for name in os.environ if name.startswith("CAN_")]:
         monkeypatch.delenv(name)
     monkeypatch.setattr("can.util.CONFIG_FILES", [])
@@ -66,7 +66,7 @@ def test_environment_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, chan
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
     monkeypatch.setenv("CAN_CHANNEL", channel)
     monkeypatch.setenv("CAN_CONFIG", '{"fd": true, "bitrate": 500000, "data_bitrate": 2000000}')
-    bus = PythonCanBus(completed({}))
+    bus = PythonCanBus(complete_config({}))
     assert (bus.name, bus.is_fd) == (f"virtual/{channel}", True)
     assert bus.line is not None and bus.line.speed == "500000 bit/s, data 2000000 bit/s"
     bus.close()
@@ -75,7 +75,7 @@ def test_environment_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, chan
 def test_file_says_what_is_not_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, channel: str) -> None:
     (tmp_path / "can.conf").write_text(f"[default]\ninterface = virtual\nchannel = {channel}\nbitrate = 250000\n")
     monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
-    bus = PythonCanBus(completed({"bitrate": 125_000}))
+    bus = PythonCanBus(complete_config({"bitrate": 125_000}))
     assert bus.name == f"virtual/{channel}"
     assert bus.line is not None and bus.line.bitrate == 125_000
     bus.close()
@@ -86,13 +86,13 @@ def test_section_that_is_asked_for_comes_first(monkeypatch: pytest.MonkeyPatch, 
         "[default]\ninterface = virtual\nchannel = a\nbitrate = 250000\n[bench]\nchannel = b\n"
     )
     monkeypatch.setattr("can.util.CONFIG_FILES", [str(tmp_path / "can.conf")])
-    assert completed({}) == {"interface": "virtual", "channel": "a", "bitrate": 250_000}
-    assert completed({"config_context": "bench"}) == {"interface": "virtual", "channel": "b", "bitrate": 250_000}
+    assert complete_config({}) == {"interface": "virtual", "channel": "a", "bitrate": 250_000}
+    assert complete_config({"config_context": "bench"}) == {"interface": "virtual", "channel": "b", "bitrate": 250_000}
 
 
 def test_what_the_configuration_says_for_other_interfaces_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CAN_CONFIG", '{"interface": "virtual", "app_name": "bench", "preserve_timestamps": true}')
-    assert completed({}) == {"interface": "virtual", "channel": None, "preserve_timestamps": True}
+    assert complete_config({}) == {"interface": "virtual", "channel": None, "preserve_timestamps": True}
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_what_the_configuration_says_for_other_interfaces_is_left_out(monkeypatc
 )
 def test_key_that_a_constructor_looks_up_is_known(interface: str, key: str) -> None:
     """python-can's documentation has it, whether or not it is among the parameters."""
-    assert completed({"interface": interface, key: 1})[key] == 1
+    assert complete_config({"interface": interface, key: 1})[key] == 1
 
 
 def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
@@ -116,7 +116,7 @@ def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
     fd = {"f_clock": 80_000_000, "nom_brp": 1, "nom_tseg1": 119, "nom_tseg2": 40, "nom_sjw": 1}
     fd |= {"data_brp": 1, "data_tseg1": 14, "data_tseg2": 5, "data_sjw": 1}
     for timing, rates in ((classic, (500_000, None)), (fd, (500_000, 4_000_000))):
-        bus = PythonCanBus(completed({"interface": "virtual", "channel": channel, **timing}))
+        bus = PythonCanBus(complete_config({"interface": "virtual", "channel": channel, **timing}))
         assert bus.line == CanLine(*rates)
         bus.close()
 
@@ -124,9 +124,9 @@ def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
 @pytest.mark.parametrize(
     ("asked", "kind", "said"),
     [
-        ({}, ConfigurationError, "can: say which interface, can:virtual or can:socketcan/can0, or name it in"),
+        ({}, ConfigurationError, "can: no interface given: use can:virtual or can:socketcan/can0, or set it in"),
         ({"interface": "foo"}, ConfigurationError, "can:foo: python-can knows canalystii, .*, and no 'foo'"),
-        ({"interface": "slcan"}, ConfigurationError, "can:slcan: say which channel: can:slcan/CHANNEL"),
+        ({"interface": "slcan"}, ConfigurationError, "can:slcan: no channel given: use can:slcan/CHANNEL"),
         (
             {"interface": "slcan", "channel": "/dev/absent", "sleep_after_open": 0},
             LinkError,
@@ -136,7 +136,7 @@ def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
         (
             {"config_context": "bench"},
             ConfigurationError,
-            r"can: say which .*CAN_INTERFACE_bench, ~/can.conf \[bench\]",
+            r"can: no interface given: .*CAN_INTERFACE_bench, ~/can.conf \[bench\]",
         ),
         (
             {"interface": "virtual", "nope": 1},
@@ -146,13 +146,13 @@ def test_bit_rate_may_be_said_by_the_timing_of_a_bit(channel: str) -> None:
         (
             {"interface": "virtual", "rx_queue": 1},
             ConfigurationError,
-            ".* no key 'rx_queue': is 'rx_queue_size' meant[?]",
+            ".* no key 'rx_queue': did you mean 'rx_queue_size'[?]",
         ),
     ],
 )
 def test_what_cannot_be_opened_is_named(asked: dict[str, Any], kind: type[Exception], said: str) -> None:
     with pytest.raises(kind, match=f"^{said}") as caught:
-        PythonCanBus(completed(asked))
+        PythonCanBus(complete_config(asked))
     assert "\n" not in str(caught.value)
 
 
@@ -240,7 +240,7 @@ def test_what_the_interface_cannot_read_is_counted(bus: PythonCanBus, monkeypatc
 def test_frame_with_a_field_that_makes_no_sense_is_counted(
     bus: PythonCanBus, field: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a datagram of udp_multicast may have."""
+    """Frame with fields that a datagram of udp_multicast may have."""
     strange = can.Message(**{"arbitration_id": 0x20, "is_extended_id": False, "data": bytes(8), **field})
     monkeypatch.setattr(bus._bus, "recv", lambda _: strange)
     assert bus.receive(1.0) is None

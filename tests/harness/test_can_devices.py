@@ -16,13 +16,16 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.catalogue import Counter
 from analogrig.cli import main
-from analogrig.devices.devices import CanDevice, HostDevice, InprocDevice, describe, from_table
+from analogrig.devices.can import CanDevice
+from analogrig.devices.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.devices.host import HostDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.registry import describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.judging.verdict import judge
-from analogrig.links.bus_load import load_of
-from analogrig.protocol.catalogue import Counter
-from analogrig.protocol.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
@@ -72,24 +75,24 @@ def test_bus_is_named_with_what_python_can_is_to_be_told(name: str, expected: di
         ("can:virtual?bitrate=fast", "bitrate: must be a whole number, not 'fast'"),
         ("can:virtual?bitrate=0", "bitrate must be 1 to 20000000, not 0"),
         ("can:virtual?device=bob", "device: must be one of 'none', 'inproc', 'host', not 'bob'"),
-        ("can:virtual?device=host", "a host process answers on SocketCAN, not on virtual: say inproc"),
-        ("can:virtual?data_bitrate=2000000", "data_bitrate is of CAN FD: say fd = true and the bitrate of the rest"),
+        ("can:virtual?device=host", "a host process needs SocketCAN, not virtual: use inproc"),
+        ("can:virtual?data_bitrate=2000000", "data_bitrate is for CAN FD: set fd = true and bitrate as well"),
         ("host?link=can", "link must be 'serial' or 'slcan', not 'can'"),
         ("inproc?link=slcan", "link must be 'serial' or 'can', not 'slcan'"),
-        ("host?bitrate=1000000", "bitrate and fd are of a CAN bus: say link = 'slcan'"),
-        ("host?link=slcan&baud=9600", "baud is of a serial line, and link is 'slcan': say bitrate"),
+        ("host?bitrate=1000000", "bitrate and fd are for a CAN bus: set link = 'slcan'"),
+        ("host?link=slcan&baud=9600", "baud is for a serial line, and link is 'slcan': set bitrate"),
         ("host?foo=1", "unknown key 'foo'"),
         ("host:there", "a device of the kind host has no 'there'"),
         ("can:virtual?wire_faults=flip@to:1", "'flip@to:1' is not KIND@to:FRAME"),
-        ("can:virtual?fd=1&fd=0", "can:virtual?fd=1&fd=0: fd is said twice"),
-        ("can:virtual?interface=slcan", "interface is said twice"),
-        ("can:virtual/a?channel=b", "channel is said twice"),
-        ("inproc:./a.so?library=./b.so", "library is said twice"),
-        ("host?name=bob", "name is said twice"),
+        ("can:virtual?fd=1&fd=0", "can:virtual?fd=1&fd=0: fd is given twice"),
+        ("can:virtual?interface=slcan", "interface is given twice"),
+        ("can:virtual/a?channel=b", "channel is given twice"),
+        ("inproc:./a.so?library=./b.so", "library is given twice"),
+        ("host?name=bob", "name is given twice"),
         *(
             (
                 f"can:{each}//dev/ttyACM0?device=inproc",
-                f"inproc needs a connection of its own, and {each} is an adapter",
+                f"inproc needs a connection of its own, and a {each} adapter",
             )
             for each in ("slcan", "serial", "robotell")
         ),
@@ -144,9 +147,9 @@ def test_silent_bus_of_the_configuration_is_named() -> None:
 
 @pytest.mark.usefixtures("_configured")
 def test_device_that_cannot_be_on_the_bus_of_the_configuration_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="a host process answers on SocketCAN, not on virtual: say inproc"):
+    with pytest.raises(ConfigurationError, match="a host process needs SocketCAN, not virtual: use inproc"):
         open_dut("can:?device=host")
-    with pytest.raises(ConfigurationError, match="inproc needs a connection of its own, and slcan is an adapter"):
+    with pytest.raises(ConfigurationError, match="inproc needs a connection of its own, and a slcan adapter"):
         open_dut("can:/dev/ttyACM0?config_context=board&device=inproc")
 
 
@@ -162,7 +165,7 @@ def test_bit_rate_of_the_configuration_is_in_the_record_and_in_the_load() -> Non
 
 @pytest.mark.usefixtures("_configured")
 def test_real_time_that_does_not_fit_the_bus_of_the_configuration_is_refused() -> None:
-    said = "are 97.2 times what 250000 bit/s carry"
+    said = "need 97.2 times the capacity of 250000 bit/s"
     with open_rig("emulator") as rig, open_dut("can:") as dut, pytest.raises(ConfigurationError, match=said):
         Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
 
@@ -253,7 +256,8 @@ def test_real_time_that_does_not_fit_the_bus_is_refused_with_the_arithmetic() ->
             Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
         assert str(caught.value) == (
             "device bob: real time does not fit its line: 20000 samples/s, each of 135 us to the device and 1080 us"
-            " back (7 estimates every 1 samples), are 24.3 times what 1000000 bit/s carry; 24.3 times slower would fit"
+            " back (7 estimates every 1 samples), need 24.3 times the capacity of 1000000 bit/s;"
+            " 24.3 times slower would fit"
         )
         short = Scenario(samples=56, excitation=THESIS.excitation)
         assert Bench(rig, dut, real_time=24.31).play(short, seed=1).samples == 56
@@ -319,7 +323,7 @@ def test_two_devices_on_one_bus_are_found_out() -> None:
 def test_two_harnesses_on_one_bus_are_found_out() -> None:
     with connect(on_virtual("rivals")) as dut, can.Bus(interface="virtual", channel="rivals") as other:
         other.send(can.Message(arbitration_id=0x30, is_extended_id=False, data=bytes((99, 0, 0, 0, 0, 0, 0, 0))))
-        with pytest.raises(LinkError, match="somebody else speaks with the harness's identifiers"):
+        with pytest.raises(LinkError, match="another node uses the harness's identifiers"):
             dut.identity()
 
 

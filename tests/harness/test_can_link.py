@@ -7,15 +7,15 @@ from collections import deque
 import can
 import pytest
 
-from analogrig.devices.devices import InprocDevice
+from analogrig.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
+from analogrig.devices.can_nodes import MemoryBus
+from analogrig.devices.dut import Dut
+from analogrig.devices.inproc import InprocDevice
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
-from analogrig.links.can_device import MemoryBus
 from analogrig.links.can_link import CanLink
 from analogrig.links.line import CanLine
 from analogrig.links.wire import VirtualClock
-from analogrig.protocol.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
 from analogrig.protocol.conversation import Conversation
-from analogrig.protocol.dut import Dut
 
 SAMPLE = Sample(7, 0, 513, 1000, 2000)
 ESTIMATE = Estimate(3, 1, 513, 0.5)
@@ -92,9 +92,7 @@ def test_block_is_a_frame_of_can_fd(line: CanLine | None, switches: bool) -> Non
 
 def test_block_on_a_classic_bus_is_refused_in_one_line() -> None:
     dut = Dut(CanLink(MemoryBus(1)), InprocDevice(name="bob", link="can", exchange="block"))
-    with pytest.raises(
-        ConfigurationError, match="^device bob: exchange: a block has 64 bytes, which a frame of classic"
-    ):
+    with pytest.raises(ConfigurationError, match="^device bob: exchange: a block has 64 bytes, and a frame of classic"):
         dut.handshake()
 
 
@@ -179,7 +177,7 @@ def test_somebody_else_who_speaks_as_the_harness_ends_the_talk(bus: Bus) -> None
     link = CanLink(bus)
     link.send([SAMPLE])
     bus.said.append(frame(0x18, pack(SAMPLE._replace(force=1001))[1:]))
-    with pytest.raises(LinkError, match=r"speaks with the harness's identifiers \(frame 0x018 with 07000102e903d007\)"):
+    with pytest.raises(LinkError, match=r"uses the harness's identifiers \(frame 0x018 with 07000102e903d007\)"):
         link.receive(1.0)
 
 
@@ -188,7 +186,9 @@ def test_somebody_else_who_speaks_as_the_device_ends_the_talk(bus: Bus) -> None:
     bus.said += [frame(0x20, pack(ESTIMATE._replace(value=0.25))[1:]), estimate()]
     talk = Conversation(CanLink(bus), "bob", 1.0)
     talk.receive(1.0)
-    with pytest.raises(LinkError, match="have the same number, 3: it was reset, or two speak as this device"):
+    with pytest.raises(
+        LinkError, match="have the same number, 3: the device was reset, or two nodes send as this device"
+    ):
         talk.receive(1.0)
 
 

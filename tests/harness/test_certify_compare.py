@@ -23,9 +23,9 @@ from analogrig.campaigns.sides import load, matched
 from analogrig.campaigns.trial import Count
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
-from analogrig.devices.devices import describe
+from analogrig.devices.dut import open_dut
+from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Tweak
 

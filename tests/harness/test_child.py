@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.devices.devices import host_wire
+from analogrig.catalogue import CATALOGUE_HASH, Hello, Identify
+from analogrig.devices import child as child_module
+from analogrig.devices.child import TETHER, Child, ChildWire
+from analogrig.devices.host import host_wire
 from analogrig.errors import LinkClosed, LinkError
-from analogrig.links import child as child_module
-from analogrig.links.child import TETHER, Child, ChildWire
 from analogrig.links.link import FramedLink, Link
-from analogrig.protocol.catalogue import CATALOGUE_HASH, Hello, Identify
 from tests.harness.processes import LONG_S, children, ends
 
 
@@ -125,28 +125,28 @@ def test_program_that_cannot_be_executed_is_named(tmp_path: Path) -> None:
 
 def test_program_that_says_nothing_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_module, "START_TIMEOUT_S", 0.05)
-    with pytest.raises(LinkError, match="said nothing within"):
+    with pytest.raises(LinkError, match="printed nothing within"):
         host_wire(program=program(tmp_path, "read end"))
 
 
 def test_program_that_says_half_a_line_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child_module, "START_TIMEOUT_S", 0.2)
-    with pytest.raises(LinkError, match="said nothing within"):
+    with pytest.raises(LinkError, match="printed nothing within"):
         host_wire(program=program(tmp_path, "printf half; read end"))
 
 
 def test_of_a_program_that_never_stops_talking_the_last_words_are_kept() -> None:
     """More than any pipe holds: it must neither block nor be remembered."""
     child = Child(["sh", "-c", "seq 1 200000 >&2; exit 3"], "the babbler")
-    assert child.obituary() == "the babbler ended with status 3: 200000"
-    assert child.obituary() == "the babbler ended with status 3: 200000"
+    assert child.exit_report() == "the babbler ended with status 3: 200000"
+    assert child.exit_report() == "the babbler ended with status 3: 200000"
     child.end()
 
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_process_does_not_outlive_a_killed_parent(*, stopped: bool) -> None:
     parent = (
-        "import os, signal; from analogrig.devices.devices import host_wire;"
+        "import os, signal; from analogrig.devices.host import host_wire;"
         " from tests.harness.processes import children; wire = host_wire();"
         " (pid,) = children(wire.child.tether_pid); print(pid, flush=True);"
         f" {stopped} and os.kill(pid, signal.SIGSTOP); os.kill(os.getpid(), signal.SIGKILL)"

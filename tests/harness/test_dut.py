@@ -16,32 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.devices.devices import (
-    DeviceDescription,
-    HostDevice,
-    InprocDevice,
-    SerialDevice,
-    describe,
-    from_table,
-    host_wire,
-)
-from analogrig.devices.estimator import Estimator
-from analogrig.errors import (
-    CatalogueMismatch,
-    ConfigurationError,
-    DeviceError,
-    DeviceRefused,
-    LinkClosed,
-    LinkError,
-    LinkTimeout,
-)
-from analogrig.links import frame
-from analogrig.links.can_device import MemoryBus
-from analogrig.links.can_link import CanLink
-from analogrig.links.child import ChildWire
-from analogrig.links.link import CanListener, FramedLink, Link
-from analogrig.links.wire import MemoryWire, VirtualClock
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     CATALOGUE_HASH,
     Alarm,
     Change,
@@ -64,8 +39,31 @@ from analogrig.protocol.catalogue import (
     pack,
     unpack_any,
 )
-from analogrig.protocol.dut import Dut, Replies, connect, open_dut, reopen_dut
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.can_nodes import MemoryBus
+from analogrig.devices.child import ChildWire
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.devices.estimator import Estimator
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.host import HostDevice, host_wire
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import MemoryWire
+from analogrig.devices.registry import describe, from_table
+from analogrig.devices.serial import SerialDevice
+from analogrig.errors import (
+    CatalogueMismatch,
+    ConfigurationError,
+    DeviceError,
+    DeviceRefused,
+    LinkClosed,
+    LinkError,
+    LinkTimeout,
+)
+from analogrig.links import frame
+from analogrig.links.can_link import CanLink
+from analogrig.links.link import CanListener, FramedLink, Link
+from analogrig.links.wire import VirtualClock
+from analogrig.protocol.exchange import Replies
 from analogrig.run import LOST
 from tests.harness.processes import children
 
@@ -244,7 +242,7 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
     [
         ('kind = "hots"', "'serial', 'can', not 'hots'"),
         ('kind = "serial"', "the key 'url' is lacking"),
-        ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, exchange, "),
+        ('kind = "host"\nurl = "/dev/ttyS0"', "unknown key 'url' (known: name, description, exchange, "),
         ("timeout_s = 1.0", "kind: must be one of 'host', 'inproc', "),
         ('kind = "inproc"\ntimeout_s = 0.0', "timeout_s must be more than 0 and at most 3600, not 0"),
         ('kind = "serial"\nurl = "loop://"\nbaud = 0', "baud must be 1 to 100000000, not 0"),
@@ -262,13 +260,13 @@ def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str
 def test_stranger_is_refused_with_both_catalogues() -> None:
     dut = Dut(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), InprocDevice(name="bob"))
     with pytest.raises(
-        CatalogueMismatch, match=f"device bob: it speaks catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
+        CatalogueMismatch, match=f"device bob: built from catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
     ):
         dut.handshake()
 
 
 def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> None:
-    """As when the harness before was killed: answers are still under way, and the device is running."""
+    """The earlier harness was killed: answers are still under way, and the device is running."""
     link = FramedLink(MemoryWire(1))
     feed(started(link), 0, 100)
     link.send([Sample(9, 0, 100, 1, 2), Identify(10), Sample(11, 0, 101, 1, 2)])
@@ -366,7 +364,7 @@ def repeat(message: Message) -> list[Message]:
 
 
 def with_missing(lost: Iterable[int]) -> Replies:
-    """What a device says on a good line if it is told that these samples are missing."""
+    """Replies over a good line with these samples declared missing."""
     missing = MISSING.copy()
     missing[list(lost)] = True
     return started(FramedLink(MemoryWire(1))).feed(0, FORCE, DISPLACEMENT, missing)
@@ -378,7 +376,7 @@ def assert_same_but_for_the_loss(replies: Replies, lost: Sequence[int]) -> None:
 
 
 EXCHANGES = {"sample": (Sample, [84]), "block": (SampleBlock, range(84, 98)), "stream": (SampleBlock, range(84, 98))}
-"""Of each kind of exchange the messages, and the samples of the one that begins with sample 84."""
+"""Messages of each kind of exchange, and the samples of the one that begins with sample 84."""
 
 
 @pytest.mark.parametrize("exchange", EXCHANGES)
@@ -420,7 +418,7 @@ class NotANumber(MemoryWire):
 @pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
 def test_number_that_is_none_is_said_to_be_the_devices(kind: type[Message], what: str, exchange: str) -> None:
     dut = started(FramedLink(NotANumber(kind, 84)), exchange=exchange)
-    said = f"^device bob: its {kind.__name__} holds {what} = nan for sample 84, which is no number$"
+    said = f"^device bob: its {kind.__name__} holds {what} = nan for sample 84, which is not finite$"
     for _ in range(2):
         with pytest.raises(DeviceError, match=said):
             feed(dut, 0, N)
@@ -522,7 +520,7 @@ def test_command_that_comes_again_late_is_not_obeyed(line: FaultyLink, reference
 
 
 def test_command_that_the_device_obeys_again_is_told(line: FaultyLink) -> None:
-    """As if it had come so late that the device takes it for a new one."""
+    """Repeat a message so late that the device takes it for a new one."""
 
     def obey_again(message: Message) -> list[Message]:
         if isinstance(message, Configure) and message.key == Key.CEILING:
@@ -589,7 +587,7 @@ def test_lost_answer_is_told(line: FaultyLink, kind: type, after: str) -> None:
 def test_lost_answer_in_a_block_is_told(line: FaultyLink) -> None:
     dut = started(line, exchange="block")
     line.from_device = about(Stepped, 81, lose)
-    said = "1 message was lost between Estimate 81 and Estimate 82, or somebody else speaks as the device"
+    said = "1 message was lost between Estimate 81 and Estimate 82, or another node sends as the device"
     with pytest.raises(LinkError, match=f"^device bob: {said}"):
         feed(dut, 0, N)
 
@@ -618,21 +616,23 @@ def test_repeated_everything_changes_nothing(line: FaultyLink, reference: Replie
 def test_answer_that_was_not_due_is_told(line: FaultyLink) -> None:
     dut = started(line)
     line.from_device = about(Estimate, 81, lambda message: [Stepped(message.seq, 0, 81, 0.0)])
-    with pytest.raises(DeviceError, match=r"^device bob: Estimate of THETA_0 for sample 81 was due, Stepped\(.*came$"):
+    with pytest.raises(
+        DeviceError, match=r"^device bob: expected Estimate of THETA_0 for sample 81, received Stepped\(.*$"
+    ):
         feed(dut, 0, N)
 
 
 def test_diagnosis_of_nothing_is_told(line: FaultyLink) -> None:
     dut = started(line)
     line.from_device = about(Stepped, 81, lambda message: [Diagnosis(message.seq, Change.UNDECIDED, 80, 1.0)])
-    with pytest.raises(DeviceError, match=r"^device bob: Stepped for sample 81 was due, Diagnosis\(.*came$"):
+    with pytest.raises(DeviceError, match=r"^device bob: expected Stepped for sample 81, received Diagnosis\(.*$"):
         feed(dut, 0, N)
 
 
 def test_answer_about_another_sample_is_told(line: FaultyLink) -> None:
     dut = started(line)
     line.from_device = about(Stepped, 81, lambda message: [Stepped(message.seq, 0, 80, 0.0)])
-    with pytest.raises(DeviceError, match=r"^device bob: Stepped for sample 81 was due, .*sample_index=80"):
+    with pytest.raises(DeviceError, match=r"^device bob: expected Stepped for sample 81, .*sample_index=80"):
         feed(dut, 0, N)
 
 
@@ -640,7 +640,7 @@ def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:
     dut = started(line)
     feed(dut, 0, 80)
     line.to_device = lose
-    with pytest.raises(LinkTimeout, match=r"sample 80 within 2 s .*; it answers nothing else either$"):
+    with pytest.raises(LinkTimeout, match=r"sample 80 within 2 s .*; it does not answer any other request$"):
         feed(dut, 80, N)
 
 
@@ -810,6 +810,8 @@ def test_own_library_that_cannot_be_loaded_is_not_the_projects(tmp_path: Path) -
 def test_library_is_not_read_as_a_description(stranger: Path) -> None:
     unnamed = stranger.rename(stranger.with_suffix(""))
     for name in (str(unnamed), "absent.so"):
-        with pytest.raises(ConfigurationError, match=f"^{name}: is compiled, .* say inproc:{name} if"):
+        with pytest.raises(
+            ConfigurationError, match=f"^{name}: is a compiled file, .* use inproc:{name} for a library"
+        ):
             describe(name)
     unnamed.rename(stranger)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from analogrig.config import locate
-from analogrig.devices.devices import HOST_PROGRAM
+from analogrig.devices.host import HOST_PROGRAM
 from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.firmware import CORES, needs_firmware

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from analogrig import config
+from analogrig.catalogue import Configure, Configured, Identify, Key, Trigger
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.library import MemoryWire
 from analogrig.errors import ConfigurationError
 from analogrig.links.link import FramedLink
-from analogrig.links.wire import MemoryWire
-from analogrig.protocol.catalogue import Configure, Configured, Identify, Key, Trigger
-from analogrig.protocol.estimator_config import EstimatorConfig
 
 
 def test_defaults_are_those_of_the_device() -> None:

@@ -9,12 +9,12 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.campaigns.trials import Trials
-from analogrig.devices.devices import describe
+from analogrig.catalogue import SteppedFlag
+from analogrig.devices.dut import open_dut
+from analogrig.devices.registry import describe
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import judge
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import SteppedFlag
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import CHANNELS, Run

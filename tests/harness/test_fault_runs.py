@@ -1,4 +1,4 @@
-"""What becomes of a run over a line with faults: what harness/README.md says, and never a wrong estimate."""
+"""Runs over a line with faults: the documented outcome, and never a wrong estimate."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from analogrig.devices.devices import describe
+from analogrig.devices.registry import describe
 from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from tests.harness.fault_runs import (
@@ -29,13 +29,13 @@ from tests.harness.firmware import needs_firmware
 
 def test_every_fault_is_documented() -> None:
     for link, faulty in FAULTY.items():
-        assert {*documented(link)} == {(kind, direction) for kind in faulty.HAPPENS for direction in DIRECTIONS}
+        assert {*documented(link)} == {(kind, direction) for kind in faulty.KINDS for direction in DIRECTIONS}
 
 
 @pytest.mark.parametrize(("link", "exchange"), WAYS)
 def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchange: ExchangeKind) -> None:
     stride = 12 if link == "serial" else 60
-    for kind in FAULTY[link].HAPPENS:
+    for kind in FAULTY[link].KINDS:
         assert outcomes_everywhere(link, kind, exchange, stride).total() > 20
 
 
@@ -83,7 +83,7 @@ PLACES: tuple[tuple[Direction, str, int], ...] = (("to", "handshake", 0), ("to",
 SOME = ("flip", "drop", "duplicate", "disconnect", "hang", "wrong-baud", "reset")
 SOME_OF_CAN = ("drop", "duplicate", "error", "collide", "fd", "bus-off", "babble", "disconnect", "hang", "reset")
 REAL = [
-    *(("serial", "host", kind) for kind in FaultyWire.HAPPENS if kind != "delay"),
+    *(("serial", "host", kind) for kind in FaultyWire.KINDS if kind != "delay"),
     *(pytest.param("serial", "qemu-m4", kind, marks=needs_firmware) for kind in SOME),
     *(("can", "can:virtual", kind) for kind in SOME_OF_CAN),
     *(("can", "host?link=slcan", kind) for kind in ("drop", "collide", "reset")),

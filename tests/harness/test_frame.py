@@ -8,8 +8,7 @@ import random
 
 import pytest
 
-from analogrig.links import frame
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     LAYOUTS,
@@ -24,6 +23,7 @@ from analogrig.protocol.catalogue import (
     pack,
     unpack,
 )
+from analogrig.links import frame
 
 POLYNOMIAL = 0x82F63B78
 """Castagnoli's, reflected."""
@@ -53,7 +53,7 @@ def crc32c(content: bytes, seed: int = 0) -> int:
 
 
 def cobs(content: bytes) -> bytes:
-    """Of fewer than 254 bytes: before each run of non-zero bytes its length plus one."""
+    """COBS of fewer than 254 bytes: before each run of non-zero bytes its length plus one."""
     return b"".join(bytes([len(run) + 1]) + run for run in content.split(b"\0"))
 
 

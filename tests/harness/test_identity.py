@@ -22,10 +22,10 @@ from analogrig import identity as identity_module
 from analogrig.campaigns.provenance import load
 from analogrig.cli import main
 from analogrig.config import fixtures
+from analogrig.devices.library import LIBRARY
 from analogrig.errors import RecordingError
 from analogrig.identity import DeviceFile, Identity
 from analogrig.judging.verdict import judge
-from analogrig.links.wire import LIBRARY
 from analogrig.reporting import render
 from analogrig.run import Run
 

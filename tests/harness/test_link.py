@@ -13,12 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.devices.devices import HOST_PROGRAM
-from analogrig.errors import ConfigurationError, LinkClosed, LinkError
-from analogrig.links import frame
-from analogrig.links.link import FramedLink
-from analogrig.links.wire import MemoryWire, PortWire
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     CATALOGUE_HASH,
     Command,
     Control,
@@ -29,6 +24,12 @@ from analogrig.protocol.catalogue import (
     Stepped,
     pack,
 )
+from analogrig.devices.host import HOST_PROGRAM
+from analogrig.devices.library import MemoryWire
+from analogrig.errors import ConfigurationError, LinkClosed, LinkError
+from analogrig.links import frame
+from analogrig.links.link import FramedLink
+from analogrig.links.wire import PortWire
 from tests.harness.processes import LONG_S
 
 
@@ -121,7 +122,7 @@ def test_other_end_that_hangs_up_is_told_from_silence(link: FramedLink, terminal
 def test_line_that_takes_nothing_is_an_error_not_a_hang(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("analogrig.links.wire.WRITE_TIMEOUT_S", 0.05)
     link = at_port(terminal.path)
-    with pytest.raises(LinkError, match="takes nothing"):
+    with pytest.raises(LinkError, match="the other end does not read"):
         link.send([Identify(0)] * 100_000)
     link.close()
 
@@ -182,7 +183,7 @@ def test_library_that_was_not_built_is_named_with_the_cure(tmp_path: Path, monke
     absent = tmp_path / "absent.so"
     with pytest.raises(ConfigurationError, match=r"absent\.so: cannot be loaded as a library of a device"):
         MemoryWire(1, library=absent)
-    monkeypatch.setattr("analogrig.links.wire.LIBRARY", absent)
+    monkeypatch.setattr("analogrig.devices.library.LIBRARY", absent)
     with pytest.raises(LinkError, match="make setup"):
         MemoryWire(1, library=absent)
 

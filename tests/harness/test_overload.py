@@ -10,9 +10,9 @@ import pytest
 
 from analogrig import cli
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import as_json, judge
-from analogrig.protocol.dut import open_dut
 from analogrig.reporting import render
 from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig

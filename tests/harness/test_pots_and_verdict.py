@@ -13,12 +13,12 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.hardware.instrument import Instrument, Taken
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import open_dut
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.scenario import Tweak as Asked

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import open_dut
 from analogrig.run import Run
 from analogrig.scenario import Scenario, Tweak
 from tests.harness.allowed import open_allowed

@@ -13,11 +13,11 @@ import pytest
 from analogrig import cli
 from analogrig.bench import Bench
 from analogrig.cli import options
+from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging import information
 from analogrig.judging.verdict import as_json, judge
 from analogrig.plant import Plant, SampledPlant
-from analogrig.protocol.dut import open_dut
 from analogrig.reporting.netlist import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig

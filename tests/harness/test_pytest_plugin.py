@@ -19,9 +19,9 @@ import analogrig.reporting  # these two for the runs in this process, which forg
 import analogrig.testing.properties.experiments  # noqa: F401
 from analogrig import cli, config
 from analogrig.bench import Bench
-from analogrig.devices.devices import host_child
+from analogrig.devices.dut import open_dut
+from analogrig.devices.host import host_child
 from analogrig.errors import ConfigurationError
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
 from analogrig.testing.experiment import Play, judged

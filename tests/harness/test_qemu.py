@@ -16,18 +16,13 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.config import names
-from analogrig.devices.devices import (
-    KINDS,
-    DeviceDescription,
-    HostDevice,
-    InprocDevice,
-    QemuDevice,
-    QemuM4,
-    describe,
-    from_table,
-)
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect, reopen_dut
+from analogrig.devices.host import HostDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.qemu import QemuDevice, QemuM4
+from analogrig.devices.registry import KINDS, describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
-from analogrig.protocol.dut import Dut, connect, reopen_dut
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -79,7 +74,7 @@ DEVICES = [
 def test_every_scenario_gives_the_same_bits_on_every_device(
     reference: tuple[Scenario, Run], device: dict[str, str], exchange: str
 ) -> None:
-    """Of M0 the image, on an M3: there is no board of its own."""
+    """The M0 image runs on an M3, since QEMU has no M0 board."""
     scenario, expected = reference
     run = play(from_table({"name": "bob", "exchange": exchange, **device}, "bob"), scenario)
     assert run.conditions.faults == ()

@@ -19,8 +19,9 @@ from analogrig.campaigns.rare import PLAY_N, false_alarm_rate
 from analogrig.campaigns.trials import Trials
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
-from analogrig.devices.devices import DeviceDescription, describe
+from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator
+from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError
 from analogrig.judging.statistics import mean_bounds
 from analogrig.rigs.description import open_rig

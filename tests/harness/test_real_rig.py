@@ -18,6 +18,7 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
 from analogrig.hardware.instrument import PotBox, Turn
 from analogrig.hardware.plan import LEAD_N, records
@@ -25,7 +26,6 @@ from analogrig.hardware.real import RealRig
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import described as described_rig
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Performance

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import DeviceDescription, HostDevice, InprocDevice
+from analogrig.catalogue import BLOCK_SAMPLES, Sample
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect
+from analogrig.devices.host import HostDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import MemoryWire
 from analogrig.errors import ConfigurationError
 from analogrig.judging.verdict import judge
 from analogrig.links.line import SerialLine
 from analogrig.links.link import FramedLink
-from analogrig.links.wire import MemoryWire, VirtualClock
-from analogrig.protocol.catalogue import BLOCK_SAMPLES, Sample
-from analogrig.protocol.dut import Dut, connect
+from analogrig.links.wire import VirtualClock
 from analogrig.rigs.description import open_rig
 from analogrig.run import UNREPORTED, Run
 from analogrig.scenario import Scenario
@@ -120,7 +123,7 @@ def test_real_time_that_does_not_fit_the_line_is_refused_with_the_arithmetic() -
         play(InprocDevice(name="bob", exchange="stream", baud=921_600), 1.0)
     assert str(caught.value) == (
         "device bob: real time does not fit its line: 20000 samples/s, each of 55.8 us to the device and 1389 us back"
-        " (7 estimates every 1 samples), are 27.78 times what 921600 baud carry; 27.8 times slower would fit"
+        " (7 estimates every 1 samples), need 27.78 times the capacity of 921600 baud; 27.8 times slower would fit"
     )
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig

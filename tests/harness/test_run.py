@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import Change
 from analogrig.run import Run
 from tests.harness.runs import made_run
 

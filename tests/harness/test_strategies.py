@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from analogrig import config
 from analogrig.campaigns.trials import Trials
-from analogrig.devices.devices import InprocDevice
+from analogrig.devices.inproc import InprocDevice
 from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig

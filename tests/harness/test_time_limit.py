@@ -16,14 +16,15 @@ from typing import Literal
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import InprocDevice, describe
+from analogrig.catalogue import Sample, SampleBlock, unpack_any
+from analogrig.devices.dut import Dut
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.library import MemoryWire
+from analogrig.devices.registry import describe
 from analogrig.errors import TimeLimitReached
 from analogrig.judging.verdict import judge
 from analogrig.links import frame
 from analogrig.links.link import FramedLink
-from analogrig.links.wire import MemoryWire
-from analogrig.protocol.catalogue import Sample, SampleBlock, unpack_any
-from analogrig.protocol.dut import Dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import BLOCK_SAMPLES
 from analogrig.run import Run

@@ -9,9 +9,9 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.campaigns.trials import BLOCK_SAMPLES, Trials, are_possible
-from analogrig.devices.devices import describe
+from analogrig.devices.dut import open_dut
+from analogrig.devices.registry import describe
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario

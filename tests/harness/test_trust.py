@@ -33,11 +33,11 @@ from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.cli import main
-from analogrig.devices.devices import KINDS, describe, from_table, named_things
+from analogrig.devices.dut import open_dut, reopen_dut
+from analogrig.devices.registry import KINDS, describe, from_table, named_things
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import DRIVERS
 from analogrig.hardware.wiring import InstrumentPots, RealDescription
-from analogrig.protocol.dut import open_dut, reopen_dut
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario

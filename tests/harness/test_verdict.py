@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from analogrig.catalogue import Change
 from analogrig.judging.verdict import DiagnosisVerdict, as_json, judge
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import Change
 from analogrig.run import LOST
 from tests.harness.runs import ESTIMATOR, made_run
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from analogrig.campaigns.rows import row
+from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
 from analogrig.plant import Plant
-from analogrig.protocol.catalogue import Change
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
 from analogrig.run import Run, Segment

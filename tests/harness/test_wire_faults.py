@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from analogrig.devices.devices import describe
+from analogrig.catalogue import Sample, pack
+from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, LinkClosed
 from analogrig.links import frame
 from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.wire import VirtualClock
 from analogrig.links.wire_faults import WireFault, WireFaults
-from analogrig.protocol.catalogue import Sample, pack
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 
@@ -44,7 +44,7 @@ class Line:
 
 def faulty(text: str) -> tuple[Line, FaultyWire]:
     line = Line()
-    return line, FaultyWire(lambda: line, WireFaults.parse(text, FaultyWire.HAPPENS))
+    return line, FaultyWire(lambda: line, WireFaults.parse(text, FaultyWire.KINDS))
 
 
 def sent_through(text: str) -> bytes:
@@ -127,7 +127,7 @@ def test_babble_has_no_end_but_takes_time() -> None:
 def test_reset_opens_the_device_again_and_forgets_what_it_was_saying() -> None:
     old, new = Line(), Line()
     boots = iter((old, new))
-    wire = FaultyWire(lambda: next(boots), WireFaults.parse("reset@from:1", FaultyWire.HAPPENS))
+    wire = FaultyWire(lambda: next(boots), WireFaults.parse("reset@from:1", FaultyWire.KINDS))
     old.said.append(b"".join(FRAMES[:5]))
     new.said.append(FRAMES[7])
     assert wire.read(0.0) == b""
@@ -155,7 +155,7 @@ def test_faults_of_one_direction_are_the_same_whenever_the_other_speaks() -> Non
 
 
 def test_faults_are_words_between_commas() -> None:
-    assert WireFaults.parse(" flip@to:81, wrong-baud@from:0,drop@1e-3,seed=7 ", FaultyWire.HAPPENS) == WireFaults(
+    assert WireFaults.parse(" flip@to:81, wrong-baud@from:0,drop@1e-3,seed=7 ", FaultyWire.KINDS) == WireFaults(
         (WireFault("flip", "to", 81), WireFault("wrong-baud", "from", 0)), {"drop": 0.001}, 7
     )
 
@@ -165,13 +165,13 @@ def test_faults_are_words_between_commas() -> None:
 )
 def test_wrong_word_is_named(text: str) -> None:
     with pytest.raises(ConfigurationError, match=re.escape(f"'{text}'")):
-        WireFaults.parse(text, FaultyWire.HAPPENS)
+        WireFaults.parse(text, FaultyWire.KINDS)
 
 
 @pytest.mark.parametrize("text", ["drop@to:3,flip@to:3", "flip@0.1,flip@0.2"])
 def test_fault_that_would_hide_another_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"^wire faults: {re.escape(repr(text.split(',')[1]))}: .* already$"):
-        WireFaults.parse(text, FaultyWire.HAPPENS)
+        WireFaults.parse(text, FaultyWire.KINDS)
 
 
 def test_device_file_may_ask_for_faults(tmp_path: Path) -> None:

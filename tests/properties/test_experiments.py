@@ -10,9 +10,9 @@ from typing import Any, cast
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import InprocDevice
-from analogrig.protocol.dut import connect
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.dut import connect
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.inproc import InprocDevice
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from analogrig.testing.experiment import Play

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.judging.statistics import Decision, SequentialTest
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from analogrig.testing.properties.test_detection import SINGLY

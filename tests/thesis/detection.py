@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.bench import Bench
-from analogrig.devices.devices import DeviceDescription, InprocDevice
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import connect, open_dut
+from analogrig.devices.inproc import InprocDevice
 from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
 from analogrig.plant import PARAMETERS
-from analogrig.protocol.dut import connect, open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 

@@ -17,7 +17,7 @@ from scipy.signal import butter, cont2discrete, freqz, lfilter
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig.devices.reference import Twin
+from analogrig.devices.reference import ReferenceEstimator
 from analogrig.run import Run
 from analogrig_thesis.chapter4 import THESIS_SCHEMES
 from analogrig_thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
@@ -728,7 +728,7 @@ def test_scheme_of_the_thesis_in_double_precision_converges_as_the_printed_recur
     scheme = next(each for each in THESIS_SCHEMES if each.key == "mean-between-faults")
     config, per_m, scale = scheme.config, 1e7, 2.0**-20
     assert config.ceiling is not None
-    twin = Twin(dataclasses.replace(config, p0=config.p0 / scale**2, ceiling=config.ceiling * scale))
+    twin = ReferenceEstimator(dataclasses.replace(config, p0=config.p0 / scale**2, ceiling=config.ceiling * scale))
     u = square(800, 2940.0, -2940.0)
     y = per_m * suspension(u)
     steps = [(twin.step(*pair).alarm, list(twin.theta)) for pair in zip(u * scale, y * scale, strict=True)]

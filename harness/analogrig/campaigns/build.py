@@ -13,9 +13,9 @@ from pathlib import Path
 
 import analogrig
 import analogrig_emulator
-from analogrig.devices.devices import DeviceDescription
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
-from analogrig.links.wire import LIBRARY
 
 DIGITS = 16
 """Of a SHA-256, which tell builds apart."""

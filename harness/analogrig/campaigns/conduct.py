@@ -18,10 +18,9 @@ from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import RATES, Row, counts
 from analogrig.campaigns.trial import close_devices, play_chunk
 from analogrig.campaigns.workers import Workers
-from analogrig.devices.devices import InprocDevice
+from analogrig.devices.dut import connect
 from analogrig.errors import DeviceError, LinkError
 from analogrig.judging.statistics import Decision
-from analogrig.protocol.dut import connect
 
 
 @dataclass
@@ -111,7 +110,7 @@ def unreachable(plan: Plan) -> dict[str, str]:
     found = {}
     for device in map(device_as_planned, plan.devices):
         try:
-            if not isinstance(device, InprocDevice):
+            if not device.is_in_process:
                 connect(device).close()
         except (LinkError, DeviceError) as error:
             found[device.name] = str(error)

@@ -20,7 +20,8 @@ from analogrig import config
 from analogrig.campaigns import build
 from analogrig.campaigns.difference import differences, named
 from analogrig.campaigns.spec import AXES, MAX_CELLS, MAX_TRIALS, CampaignSpec
-from analogrig.devices.devices import DeviceDescription, from_table, trusted
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.wiring import RealDescription

@@ -13,9 +13,9 @@ from typing import Any, Generic, TypeVar
 from analogrig.bench import Bench, uninterrupted
 from analogrig.campaigns.plan import Case, device_as_planned, open_table
 from analogrig.campaigns.trials import Trials, are_possible
-from analogrig.devices.devices import DeviceDescription
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect
 from analogrig.errors import AnalogrigError, RigError
-from analogrig.protocol.dut import Dut, connect
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run

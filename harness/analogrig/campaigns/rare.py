@@ -26,12 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.campaigns.trials import entered, flags_of
-from analogrig.devices.devices import DeviceDescription, InprocDevice
+from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, DeviceError
 from analogrig.judging.exposure import Heard, exposed
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.estimator_config import EstimatorConfig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance
 from analogrig.run import CHANNELS
@@ -106,7 +105,7 @@ def false_alarm_rate(
     settings = dataclasses.replace(device.estimator, force_zero=rig.force_zero)
     if settings.trigger != "cusum":
         raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
-    estimator = Estimator(settings, library=device.program if isinstance(device, InprocDevice) else LIBRARY)
+    estimator = Estimator(settings, library=device.estimator_library)
     first = settings.warm_up_n + LEAD_IN_N
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
     performance = rig.perform(played, seed, block_samples=played.samples)

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.devices import DeviceDescription, InprocDevice
-from analogrig.devices.estimator import Estimator, Steps, StepStatus
+from analogrig.catalogue import SteppedFlag, Trigger
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.estimator import Estimator, EstimatorOutput, StepStatus
 from analogrig.judging.exposure import Exposure, Heard, exposed
-from analogrig.links.wire import LIBRARY
-from analogrig.protocol.catalogue import SteppedFlag, Trigger
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
@@ -37,13 +36,7 @@ _FLAGS[StepStatus.GATHERING] = SteppedFlag.GATHERING
 
 def are_possible(rig: Rig, device: DeviceDescription) -> bool:
     """Whether trials give what Bench gives: an emulated rig, and a device whose line does nothing to the samples."""
-    return (
-        isinstance(rig, EmulatorRig)
-        and isinstance(device, InprocDevice)
-        and device.link == "serial"
-        and not device.wire_faults
-        and device.report_interval_n == 1
-    )
+    return isinstance(rig, EmulatorRig) and device.can_run_in_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +60,7 @@ class Trials:
         self._rig = rig
         zero = rig.force_zero
         self._device = dataclasses.replace(device, estimator=dataclasses.replace(device.estimator, force_zero=zero))
-        library = device.program if isinstance(device, InprocDevice) else LIBRARY
-        self._estimator = Estimator(self._device.estimator, library=library)
+        self._estimator = Estimator(self._device.estimator, library=device.estimator_library)
         # Runs share their tables: to write them anew for each takes as long as to play a thousand samples.
         self._tables = rig.description(), self._device.as_table()
         self._scenario_table: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
@@ -116,14 +108,14 @@ class Trials:
         self._estimator.restart()
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
         blocks: list[Block] = []
-        parts: list[Steps] = []
+        parts: list[EstimatorOutput] = []
         for block in performance.blocks:
             blocks.append(block)
             parts.append(self._estimator.run(*entered(block)))
         return self._run(scenario, seed, performance, blocks, parts)
 
     def _run(
-        self, scenario: Scenario, seed: int, performance: Performance, blocks: list[Block], parts: list[Steps]
+        self, scenario: Scenario, seed: int, performance: Performance, blocks: list[Block], parts: list[EstimatorOutput]
     ) -> Run:
         statistic = np.concatenate([steps.statistic for steps in parts])
         alarms = np.concatenate([block.first + steps.alarms for block, steps in zip(blocks, parts, strict=True)])

@@ -83,7 +83,7 @@ def _own_rigs() -> list[dict[str, str]]:
 
 
 def _device_kinds() -> list[dict[str, str]]:
-    from analogrig.devices.devices import KINDS as DEVICE_KINDS
+    from analogrig.devices.registry import KINDS as DEVICE_KINDS
 
     return [_entry(kind.usage, kind.summary) for kind in DEVICE_KINDS.values()]
 

@@ -67,7 +67,7 @@ def add_allow(command: argparse.ArgumentParser) -> None:
 
 def trust_of(arguments: argparse.Namespace) -> Trust:
     """Things that the command line names: those of --allow, and what --dut states itself."""
-    from analogrig.devices.devices import named_things
+    from analogrig.devices.registry import named_things
     from analogrig.trust import OPTION, Trust
 
     trust, dut = Trust(arguments.allow, option=OPTION), getattr(arguments, "dut", None)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show, show_json, working
 
 if TYPE_CHECKING:
+    from analogrig.devices.dut import Dut
     from analogrig.identity import Identity
     from analogrig.judging.verdict import Verdict
     from analogrig.output import OutputFolder
-    from analogrig.protocol.dut import Dut
     from analogrig.recordings import CanLog
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run

@@ -49,8 +49,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _replayed(arguments: argparse.Namespace, output: OutputFolder) -> int:
+    from analogrig.devices.dut import open_dut, reopen_dut
     from analogrig.errors import ConfigurationError
-    from analogrig.protocol.dut import open_dut, reopen_dut
     from analogrig.rigs.recording import RecordingRig
 
     named = arguments.dut

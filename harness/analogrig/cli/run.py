@@ -39,7 +39,7 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with output_folder(arguments) as output, opened(arguments) as (rig, scenario, seed):
-        from analogrig.protocol.dut import open_dut
+        from analogrig.devices.dut import open_dut
 
         device = arguments.dut or scenario.dut or "host"
         log = can_log(output, arguments)

@@ -1,1 +1,1 @@
-"""Devices: kinds of estimator under test and how each is reached."""
+"""Devices under test: kinds, registry, sessions, and the estimator without a device."""

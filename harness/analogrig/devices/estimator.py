@@ -1,4 +1,4 @@
-"""The C estimator in this process, whole blocks at a time: no frames, no link, no device."""
+"""The C estimator in this process: whole blocks of samples, without frames, link or device."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.library import LIBRARY, load_library
 from analogrig.errors import ConfigurationError
-from analogrig.links.wire import LIBRARY, load_library
-from analogrig.protocol.estimator_config import EstimatorConfig
 
 
 class StepStatus(enum.IntEnum):
-    """As est_status_t of est.h."""
+    """est_status_t of est.h."""
 
     UPDATED = 0
     MISSING = 1
@@ -27,11 +27,11 @@ class StepStatus(enum.IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """What each of n samples gave."""
+class EstimatorOutput:
+    """Output of the estimator for n samples."""
 
     theta: NDArray[np.float32]
-    """(n, p) after the sample."""
+    """(n, p) after each sample."""
     innovation: NDArray[np.float32]
     """(n,) codes; 0 where there was no equation."""
     statistic: NDArray[np.float32]
@@ -49,7 +49,7 @@ class _Out(ctypes.Structure):
 _COUNTERS = dict.fromkeys(("updated", "missing"), ctypes.c_uint32) | dict.fromkeys(
     ("refused", "saturated", "stuck", "alarms", "restarts", "slips", "refreshes"), ctypes.c_uint16
 )
-"""The fields of est_counters_t."""
+"""Fields of est_counters_t with their C types."""
 
 
 class _Counters(ctypes.Structure):
@@ -57,7 +57,7 @@ class _Counters(ctypes.Structure):
 
 
 _FUNCTIONS = ("size", "init", "set", "start", "run", "theta_count", "counters")
-"""Of estimator_c/ports/library/library.h."""
+"""Functions of estimator_c/ports/library/library.h, without their prefix."""
 
 
 def _loaded(library: Path) -> ctypes.CDLL:
@@ -71,12 +71,12 @@ def _loaded(library: Path) -> ctypes.CDLL:
 
 
 class Estimator:
-    """One estimator; the samples of a run may come in blocks of any length."""
+    """One estimator, fed in blocks of any length."""
 
     def __init__(self, config: EstimatorConfig | None = None, *, library: Path = LIBRARY) -> None:
-        """Ready for the first sample.
+        """Configure an estimator for its first sample.
 
-        :raises ConfigurationError: the estimator refuses the configuration, or a user's own library is none.
+        :raises ConfigurationError: it rejects the configuration, or the user's library is not one of a device.
         :raises LinkError: the library was not built.
         """
         self._c = _loaded(library)
@@ -88,7 +88,7 @@ class Estimator:
         self.restart()
 
     def restart(self) -> None:
-        """The next sample is the first.
+        """Begin anew with the next sample.
 
         :raises ConfigurationError: the fields of the configuration do not go together.
         """
@@ -97,17 +97,17 @@ class Estimator:
 
     @property
     def parameters(self) -> int:
-        """The number of elements of theta."""
+        """Number of elements of theta."""
         return int(self._c.library_theta_count(self._state))
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Since the start, by the names of est_counters_t."""
+        """Counters since the start, by their names in est_counters_t."""
         counters = self._c.library_counters(self._state)
         return {name: int(getattr(counters, name)) for name in _COUNTERS}
 
-    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> Steps:
-        """Enter n samples and keep everything.
+    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> EstimatorOutput:
+        """Estimator output for n samples.
 
         :param u: (n,) codes of force.
         :param y: (n,) codes of displacement.
@@ -119,27 +119,27 @@ class Estimator:
         status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
         out = _Out(*(array.ctypes.data for array in (theta, innovation, statistic, status, alarm)))
         self._enter(u, y, valid, out)
-        return Steps(theta, innovation, statistic, status, np.flatnonzero(alarm))
+        return EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
 
     def alarms(
         self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, **filled: NDArray[Any]
     ) -> NDArray[np.int64]:
-        """As run(), for the alarms alone: several times as fast.
+        """Indices of the samples with an alarm; several times as fast as ``run``.
 
-        :param filled: arrays of the names, shapes and dtypes of ``Steps`` that are filled as well.
+        :param filled: arrays of the names, shapes and dtypes of ``EstimatorOutput`` to be filled as well.
         """
         alarm = np.empty(np.size(u), np.uint8)
         out = _Out(alarm=alarm.ctypes.data, **{name: array.ctypes.data for name, array in filled.items()})
         return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
 
     def save(self) -> NDArray[np.uint8]:
-        """All that it knows after the last sample, for ``branch`` of this very estimator."""
+        """State after the last sample, for ``branch`` of the same object; (size,)."""
         return np.frombuffer(bytes(self._state), np.uint8).copy()
 
     def branch(
         self, saved: NDArray[np.uint8], u: ArrayLike, y: ArrayLike, valid: ArrayLike
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.uint8]]:
-        """Goes on from several saved states, each with samples of its own.
+        """Continue from several saved states, each with its own samples.
 
         :param saved: (b, size), rows of ``save``.
         :param u: (b, n); y and valid likewise, as of ``run``.

@@ -1,8 +1,7 @@
-"""The estimator of estimator_c once more, in plain Python and float64: to be read, to explore, an oracle for the C.
+"""Reference implementation of the estimator in plain Python and float64, as an oracle for the C and for exploration.
 
-It follows the text of estimator_c/README.md and not the C line by line; the two agree to the precision of float32.
-Nothing here is made to be fast, small or safe: what only guards the device (stuck or absurd readings, counters) is
-left out.
+It follows the text of estimator_c/README.md, not the C code; both agree to the precision of float32. It is not
+optimised. Guards of the device (stuck or absurd readings, counters) are left out.
 """
 
 from __future__ import annotations
@@ -11,13 +10,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
 
 DOUBT_N = 12
-"""Samples after which the doubt about an edge ends."""
+"""Samples after an edge during which a slip is considered."""
 
 SLIP_DOUBT = 1000.0
-"""How much less certain a slip leaves every parameter."""
+"""Factor on every variance in P after a slip."""
 
 CONTRACTION = 0.99
 REFRESH_STEP = 8e-6
@@ -25,10 +24,10 @@ REFRESH_STRIDE = 0.005
 REFRESH_MEMORIES = 2.0
 
 SETTLED = 1.0001
-"""The whitening has settled once the variance of the noise is below this."""
+"""Noise variance, in variances of e, below which the whitening has settled."""
 
 WEIGHT_DUE, WEIGHT_OVERDUE = 0.5, 0.25
-"""Below the first of these weights the limits of the d's are due, below the second even if the step is long anyway."""
+"""Weights below which the d's are limited: in a step with little other work, and in any step."""
 
 NOISE_RATE, NOISE_CLIP, NOISE_KEPT = 0.005, 9.0, 0.9851
 
@@ -36,8 +35,8 @@ Vector = list[float]
 
 
 @dataclass(frozen=True)
-class TwinStep:
-    """What one sample gave."""
+class ReferenceStep:
+    """Output for one sample."""
 
     innovation: float = 0.0
     """Codes; 0 where there was no equation."""
@@ -46,20 +45,23 @@ class TwinStep:
 
 
 class Whitener:
-    """The noise C(z) e of consecutive equations, made white: the innovations algorithm for a moving average that begins
-    with the first equation (Brockwell and Davis, Time Series: Theory and Methods, 1991, section 5.3)."""
+    """Whitening of the noise C(z) e of consecutive equations.
+
+    Innovations algorithm for a moving average that begins with the first equation (Brockwell and Davis, Time Series:
+    Theory and Methods, 1991, section 5.3).
+    """
 
     def __init__(self, c: Sequence[float]) -> None:
         self.c = list(c)
         self.restart()
 
     def restart(self) -> None:
-        """The next equation is the first."""
+        """Begin anew with the next equation."""
         self.rows: list[tuple[Vector, float]] = []  # gains and variance of the equations before, newest first
         self.past: list[Vector] = []  # whitened equations, newest first
 
     def gains(self) -> tuple[Vector, float]:
-        """Those of the next equation, and the variance of its whitened noise, in variances of e."""
+        """Gains of the next equation, and the variance of its whitened noise in variances of e."""
         order = len(self.c)
         taps = [1.0, *self.c]
         gains, covariance = [0.0] * order, [0.0] * (order + 1)
@@ -74,7 +76,7 @@ class Whitener:
         return gains, variance
 
     def whiten(self, equation: Sequence[float]) -> tuple[Vector, float]:
-        """The equation, every element alike, and the variance of its noise."""
+        """Whitened equation, and the variance of its noise in variances of e."""
         gains, variance = self.gains()
         out = list(equation)
         for gain, before in zip(gains, self.past, strict=False):
@@ -86,30 +88,30 @@ class Whitener:
 
     @property
     def latest(self) -> Vector:
-        """The gains of the newest equation."""
+        """Gains of the newest equation."""
         return self.rows[0][0]
 
 
 class Covariance:
-    """P in units of the noise variance, as U D U' / weight (Bierman 1977); to forget is to lower the weight."""
+    """P in units of the noise variance, as U D U' / weight (Bierman 1977). Forgetting lowers the weight."""
 
     def __init__(self, prior: Sequence[float]) -> None:
         self.prior = list(prior)
         self.reset()
 
     def reset(self) -> None:
-        """P := P0."""
+        """Set P to P0."""
         n = len(self.prior)
         self.d, self.weight = list(self.prior), 1.0
         self.u = [[float(i == j) for j in range(n)] for i in range(n)]
 
     def inflate(self, factor: float) -> None:
-        """Less certain by this factor, nowhere beyond the prior."""
+        """Multiply P by this factor, up to the prior."""
         self.d = [min(d * factor / self.weight, p) for d, p in zip(self.d, self.prior, strict=True)]
         self.weight = 1.0
 
     def measure(self, phi: Sequence[float], variance: float, forgetting: float) -> tuple[Vector, float]:
-        """One equation: its gain and the variance of its innovation; Bierman, section V.3, thesis Equ 3.21."""
+        """Enter an equation; return its gain and the variance of its innovation (Bierman, V.3; thesis Equ 3.21)."""
         n = len(self.d)
         gain = [0.0] * n
         self.weight *= forgetting
@@ -127,7 +129,7 @@ class Covariance:
         return [g / alpha for g in gain], alpha / self.weight
 
     def walk(self, variance: float) -> None:
-        """P := P + variance I: Thornton (1976), modified weighted Gram-Schmidt on (U, I)."""
+        """Add variance * I to P (Thornton 1976: modified weighted Gram-Schmidt on (U, I))."""
         n = len(self.d)
         rows = [[*self.u[i], *(float(i == k) for k in range(n))] for i in range(n)]
         weights = [*self.d, *([variance * self.weight] * n)]
@@ -146,18 +148,18 @@ class Covariance:
 
 @dataclass
 class Doubt:
-    """Edges of u since a moment, and what they would have done one sample early or late."""
+    """Hypotheses that the edges of u since a moment came one sample early or late."""
 
     theta: Vector
-    """What was believed before."""
+    """Estimate before the first of the edges."""
     age_n: int = 1
     early: Vector = field(default_factory=list)
     late: Vector = field(default_factory=list)
-    """Their shares in the whitened equations, newest first."""
+    """Effects of the early and late edges on the whitened equations, newest first."""
 
 
 class Refresh(Enum):
-    """What is next to be done about C."""
+    """Next step of a refresh of C."""
 
     WAITS = 0
     COMPARES = 1
@@ -165,12 +167,12 @@ class Refresh(Enum):
 
 
 def cusum(before: float, innovation: float, variance: float) -> float:
-    """The logarithm of the likelihood ratio of a fourfold variance, from zero on."""
+    """CUSUM of the log-likelihood ratio of a fourfold variance, at least zero."""
     return max(0.0, before + 0.375 * innovation * innovation / variance - 0.69314718)
 
 
-class Twin:
-    """One estimator. ``theta`` may be read after every step."""
+class ReferenceEstimator:
+    """One estimator. ``theta`` is the estimate after the last step."""
 
     def __init__(self, config: EstimatorConfig) -> None:
         self.config = config
@@ -183,11 +185,11 @@ class Twin:
         self.covariance = Covariance(prior)
         self.whitener = Whitener(c)
         self.noise_variance = config.noise_variance
-        self.u: Vector = []  # newest first, as all that follow
+        self.u: Vector = []  # newest first, like y and residuals
         self.y: Vector = []
         self.residuals = [0.0] * config.nc
         self.pending = self._past_n
-        self.settled = False  # the gains of the whitening have come to C
+        self.settled = False  # the gains of the whitening have converged to C
         self.equations = 0  # since C was last considered
         self.refresh = Refresh.WAITS
         self.since_n = 0  # samples since an edge of u
@@ -196,7 +198,7 @@ class Twin:
         self.mean, self.mean_n = 0.0, 0
         self.quiet_n = config.warm_up_n
         self.doubt: Doubt | None = None
-        self.slipped: Vector | None = None  # theta as a slip leaves it, from the next sample on
+        self.slipped: Vector | None = None  # theta after a slip, valid from the next sample on
         self.slips = 0
         self.refreshes = 0
 
@@ -204,17 +206,17 @@ class Twin:
     def _past_n(self) -> int:
         return max(self.config.na, self.config.nb + self.config.nk - 1)
 
-    def run(self, u: Iterable[float], y: Iterable[float], valid: Iterable[bool] | None = None) -> list[TwinStep]:
-        """One step for each sample."""
+    def run(self, u: Iterable[float], y: Iterable[float], valid: Iterable[bool] | None = None) -> list[ReferenceStep]:
+        """Outputs for n samples, one each."""
         pairs = list(zip(u, y, strict=True))
         good = [True] * len(pairs) if valid is None else [bool(v) for v in valid]
         return [self.step(*pair, valid=v) for pair, v in zip(pairs, good, strict=True)]
 
-    def step(self, u: float, y: float, *, valid: bool = True) -> TwinStep:
+    def step(self, u: float, y: float, *, valid: bool = True) -> ReferenceStep:
         """Enter one sample."""
         if not valid:
             self._gap()
-            return TwinStep(statistic=self.statistic)
+            return ReferenceStep(statistic=self.statistic)
         self._enter_input(u)
         if self.pending:
             self.pending -= 1
@@ -227,7 +229,7 @@ class Twin:
                 self.whitener.restart()
                 self.residuals = [0.0] * self.config.nc
                 self.settled = False
-            step = TwinStep(statistic=self.statistic)
+            step = ReferenceStep(statistic=self.statistic)
         else:
             step = self._equation(y)
         self.y = [y, *self.y][: self.config.na]
@@ -278,34 +280,34 @@ class Twin:
         phi = [-y for y in self.y] + self.u[config.nk : config.nk + config.nb] + self.residuals
         return [*phi, 1.0] if config.offset else phi
 
-    def _equation(self, y: float) -> TwinStep:
+    def _equation(self, y: float) -> ReferenceStep:
         self._limit()
         (*phi, target), variance = self.whitener.whiten([*self._regressor(), y])
         self.settled = variance < SETTLED
         innovation = target - _dot(phi, self.theta)
-        readings = self._otherwise(phi, target)
+        readings = self._rival_innovations(phi, target)
         gain, variance = self.covariance.measure(phi, variance, self.config.forgetting)
         self.theta = [t + g * innovation for t, g in zip(self.theta, gain, strict=True)]
         self._adapt(phi, target, innovation, variance)
         alarm = self._watch(innovation, readings, self._noise_before * variance)
-        step = TwinStep(innovation, self.statistic, alarm)
+        step = ReferenceStep(innovation, self.statistic, alarm)
         if alarm:
             self._alarm()
         return step
 
     @property
     def _considers_c(self) -> bool:
-        """At this equation."""
+        """True if this equation includes a step of a refresh of C."""
         return bool(self.config.refresh_n) and self.equations + 1 >= self.config.refresh_n
 
     def _limit(self) -> None:
-        """No d beyond the prior, from time to time: in a step that is short otherwise, if there is one in time."""
+        """Limit the d's to the prior once the weight is low, preferably in a step with little other work."""
         long = not self.settled or self.doubt is not None or self._considers_c
         if self.covariance.weight < (WEIGHT_OVERDUE if long else WEIGHT_DUE):
             self.covariance.inflate(1.0)
 
-    def _otherwise(self, phi: Vector, target: float) -> tuple[float, float] | None:
-        """The innovation had the edges in doubt come one sample early, and late."""
+    def _rival_innovations(self, phi: Vector, target: float) -> tuple[float, float] | None:
+        """Innovations under the hypotheses of early and late edges."""
         doubt, config = self.doubt, self.config
         if doubt is None:
             return None
@@ -314,16 +316,16 @@ class Twin:
             b = [0.0] * config.nb
         late = -sum(b[j] * self._height(config.nk + j, doubt.age_n) for j in range(config.nb))
         early = sum(b[j] * self._height(config.nk + j - 1, doubt.age_n) for j in range(config.nb))
-        doubt.early = self._also_whitened(doubt.early, early)
-        doubt.late = self._also_whitened(doubt.late, late)
-        believed = target - _dot(phi, doubt.theta)
-        return believed - doubt.early[0], believed - doubt.late[0]
+        doubt.early = self._whitened_effect(doubt.early, early)
+        doubt.late = self._whitened_effect(doubt.late, late)
+        innovation = target - _dot(phi, doubt.theta)
+        return innovation - doubt.early[0], innovation - doubt.late[0]
 
     def _height(self, lag: int, age_n: int) -> float:
-        """Of the step of u ``lag`` samples ago, if it is one of those in doubt: after an edge it is noise."""
+        """Height of the step of u ``lag`` samples ago; 0 for one before the edges in doubt, which is noise."""
         return self.u[lag] - self.u[lag + 1] if 0 <= lag < age_n else 0.0
 
-    def _also_whitened(self, past: Vector, x: float) -> Vector:
+    def _whitened_effect(self, past: Vector, x: float) -> Vector:
         gains = self.whitener.latest
         return [x - sum(g * w for g, w in zip(gains, past, strict=False)), *past][: max(len(gains), 1)]
 
@@ -342,7 +344,7 @@ class Twin:
         self.equations += 1
 
     def _refresh(self) -> None:
-        """Whether A is worth taking C from, whether C is still near to it, and to take it are for three equations."""
+        """Do one step of a refresh of C: check that A is reliable, compare C with A, or take C from A."""
         stage, self.refresh = self.refresh, Refresh.WAITS
         remembers_edge = (1.0 - self.config.forgetting) * self.since_n < REFRESH_MEMORIES
         if self.doubt is not None:
@@ -364,7 +366,7 @@ class Twin:
             self.equations = -1
             return
         self.refresh = Refresh.TAKES
-        if step > REFRESH_STRIDE or not self.settled:  # the whitening begins anew, and takes C with it
+        if step > REFRESH_STRIDE or not self.settled:  # the whitening restarts with the new C
             self.pending = 1
 
     def _take_c(self) -> None:
@@ -410,13 +412,13 @@ class Twin:
             self._forget()
         return False
 
-    def _slip(self, believed: Vector) -> None:
-        """The edges have moved by one sample: what was believed before holds on, its b's moved by one place."""
+    def _slip(self, before: Vector) -> None:
+        """Shift the b's of the estimate ``before`` the edges by one place, since the edges moved by one sample."""
         config = self.config
         first, last = config.na, config.na + config.nb
-        b = believed[first:last]
+        b = before[first:last]
         moved = [0.0, *b[:-1]] if self.rivals[1] < self.rivals[0] else [*b[1:], 0.0]
-        self.slipped = [*believed[:first], *moved, *believed[last:]]
+        self.slipped = [*before[:first], *moved, *before[last:]]
         self.covariance.inflate(SLIP_DOUBT)
         self.statistic = min(self.rivals)
         self.slips += 1
@@ -436,7 +438,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def _stable(c: Sequence[float]) -> bool:
-    """All zeros of 1 + c[0] z^-1 + ... inside the unit circle (Schur and Cohn)."""
+    """True if all zeros of 1 + c[0] z^-1 + ... are inside the unit circle (Schur and Cohn)."""
     a = list(c)
     while a:
         k = a.pop()

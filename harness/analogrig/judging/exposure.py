@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.protocol.catalogue import SteppedFlag
+from analogrig.catalogue import SteppedFlag
 from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, Run
 from analogrig.wording import number_of
 

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
+from analogrig.catalogue import Change, SteppedFlag
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import PARAMETERS, physical_parameters
-from analogrig.protocol.catalogue import Change, SteppedFlag
 from analogrig.run import LOST, Run, Segment
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of

@@ -1,1 +1,1 @@
-"""What carries messages between harness and device: wires, CAN buses, links over them, their faults, their load."""
+"""Links: wires and CAN buses to a device, message framing, line speeds and line faults."""

@@ -1,6 +1,6 @@
-"""CAN buses: what carries frames to a device and back, as they are, and nothing else; opened by python-can.
+"""CAN buses: carry frames to a device and back, unchanged, by python-can.
 
-python-can's exceptions end here: what they mean is one line that names the bus, the cause and the cure.
+Exceptions of python-can become errors of one line that name the bus, the cause and the cure.
 """
 
 from __future__ import annotations
@@ -18,81 +18,92 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
-from analogrig.links.child import Child
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import BACKENDS, BitTimingDict, BitTimingFdDict, can, slcanBus
-from analogrig.links.wire import WRITE_TIMEOUT_S, Clock
+from analogrig.links.wire import WRITE_TIMEOUT_S, Clock, Connection
 
 RECEIVED_AHEAD_N = 200
-"""So many frames the system keeps for us at least: half of what a socket's buffer of 208 kB holds."""
+"""Received frames that the system buffers at least: half the capacity of a socket buffer of 208 kB."""
 
 _FULL_QUEUE_S = 1e-3
-"""Linux says that the queue of a controller is full (ENOBUFS), and not when it is no longer."""
+"""Time between two attempts to send. Linux reports a full controller queue (ENOBUFS), but not its end."""
 
 _SOCKETCAN = {
     errno.EAFNOSUPPORT: "this kernel has no CAN (no address family AF_CAN); try `modprobe can can-raw`, or can:virtual",
-    errno.ENODEV: "there is no such interface; `ip -details link show type can` lists those that there are",
+    errno.ENODEV: "there is no such interface; `ip -details link show type can` lists all",
     errno.ENETDOWN: "the interface is down: ip link set CHANNEL up type can bitrate N",
-    errno.EINVAL: "the interface is no CAN interface, or refuses what it is asked",
+    errno.EINVAL: "the interface is no CAN interface, or refuses these settings",
 }
-"""What Linux means."""
+"""Meaning of error numbers of Linux."""
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # what it has to say is in the exceptions, too
+logging.getLogger("can").addHandler(logging.NullHandler())  # its messages are in the exceptions, too
 
 
-class CanBus(Protocol):
-    """A bus on which one device is, and perhaps others."""
-
-    @property
-    def name(self) -> str:
-        """What it is, for errors and records."""
-
-    @property
-    def clock(self) -> Clock:
-        """The time in which its time-outs are meant."""
+class CanBus(Connection, Protocol):
+    """A bus with one device, and perhaps other nodes."""
 
     @property
     def is_fd(self) -> bool:
-        """Whether frames of CAN FD may be sent."""
+        """True if frames of CAN FD may be sent."""
 
     @property
     def line(self) -> CanLine | None:
-        """Its bit rates, if they are known."""
+        """Bit rates, if they are known."""
 
     @property
     def unread_n(self) -> int | None:
-        """So many frames may come before one of them is read; None: as many as like to."""
+        """Largest number of received frames that the system buffers; None if it is unlimited."""
 
     @property
     def damaged(self) -> int:
-        """How often something came that was no frame."""
+        """Number of received items that were not valid frames."""
 
     def send(self, frame: can.Message) -> None:
-        """Send one frame; waits while the controller has no room for it.
+        """Send one frame, waiting while the controller's queue is full.
 
         :raises LinkError: it cannot be sent.
         :raises LinkClosed: the bus is gone.
         """
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """The next frame, of whatever kind and whoever sent it; None if none comes in time, or nearly so.
+        """The next frame of any kind and any sender; None once the time-out has passed or is about to.
 
         :raises LinkClosed: the bus is gone.
         """
 
+
+class WrappedBus:
+    """A bus that adds something to another one. Everything not overridden is passed through."""
+
+    def __init__(self, bus: CanBus) -> None:
+        """Take over ``bus``."""
+        self.name, self.clock, self.is_fd = bus.name, bus.clock, bus.is_fd
+        self.line, self.unread_n = bus.line, bus.unread_n
+        self._bus = bus
+
+    @property
+    def damaged(self) -> int:
+        return self._bus.damaged
+
+    def send(self, frame: can.Message) -> None:
+        self._bus.send(frame)
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        return self._bus.receive(timeout_s)
+
     def close(self) -> None:
-        """Let go of the bus. May be called twice."""
+        self._bus.close()
 
 
 class PythonCanBus:
-    """Any bus that python-can can open."""
+    """A bus opened by python-can."""
 
     unread_n = RECEIVED_AHEAD_N
 
     def __init__(self, config: Mapping[str, Any], *, name: str | None = None) -> None:
-        """Open what ``config`` says in the words of ``can.Bus``, with interface and channel, and nothing else.
+        """Open ``can.Bus(**config)``, with interface and channel. python-can's own configuration is not read.
 
-        :raises ConfigurationError: there is no such kind of interface, or it cannot be as it is asked to be.
+        :raises ConfigurationError: there is no such interface, or it rejects a setting.
         :raises LinkError: it cannot be opened.
         """
         interface, self.channel = str(config["interface"]), config["channel"]
@@ -108,41 +119,41 @@ class PythonCanBus:
         self._bus = self._open(config)
 
     def _open(self, config: Mapping[str, Any]) -> can.BusABC:
-        """:raises ConfigurationError, LinkError: it cannot be."""
+        """:raises ConfigurationError, LinkError: as for the constructor."""
         try:
             return can.Bus(**config, ignore_config=True)
         except (TypeError, ValueError) as error:
             if self.channel is None:
-                raise ConfigurationError(f"can:{self.name}: say which channel: can:{self.name}/CHANNEL") from error
+                raise ConfigurationError(f"can:{self.name}: no channel given: use can:{self.name}/CHANNEL") from error
             raise ConfigurationError(f"can:{self.name}: {_words(error)}") from error
-        except Exception as error:  # the interfaces raise whatever their drivers make them
+        except Exception as error:  # drivers raise exceptions of any type
             number = _errno(error)
             cure = "" if number is not None else "; is its driver installed, and the adapter there?"
             raise LinkError(f"cannot open can:{self.name}: {self._reason(error, number)}{cure}") from error
 
     def _reason(self, error: Exception, number: int | None) -> str:
-        """In one line, from an error of the system if it was one."""
+        """Cause in one line; the operating system's message, if there is one."""
         if number in self._meaning:
             return self._meaning[number]
         return os.strerror(number) if number is not None and number > 0 else _words(error)
 
     def send(self, frame: can.Message) -> None:
         deadline_s = self.clock() + WRITE_TIMEOUT_S
-        while not self._take(frame, deadline_s):
+        while not self._try_send(frame, deadline_s):
             time.sleep(_FULL_QUEUE_S)
 
-    def _take(self, frame: can.Message, deadline_s: float) -> bool:
-        """Whether the controller had room for it."""
+    def _try_send(self, frame: can.Message, deadline_s: float) -> bool:
+        """Send the frame; False if the controller's queue is full."""
         try:
             self._bus.send(frame, max(0.0, deadline_s - self.clock()))
-        except Exception as error:  # the interfaces raise whatever their drivers make them
+        except Exception as error:  # drivers raise exceptions of any type
             number = _errno(error)
             if number == errno.ENOBUFS and self.clock() < deadline_s:
                 return False
-            raise self._failed(error, number) from error
+            raise self._send_error(error, number) from error
         return True
 
-    def _failed(self, error: Exception, number: int | None) -> LinkError:
+    def _send_error(self, error: Exception, number: int | None) -> LinkError:
         if number == errno.ENOBUFS or isinstance(error, can.CanTimeoutError) or "buffer full" in str(error):
             return LinkError(
                 f"{self.name}: nothing can be sent, the controller's queue has been full for {WRITE_TIMEOUT_S:g} s:"
@@ -154,27 +165,27 @@ class PythonCanBus:
     def receive(self, timeout_s: float) -> can.Message | None:
         try:
             frame = self._bus.recv(timeout_s)
-        except Exception as error:  # as above; what is no system's error is a frame that makes no sense
+        except Exception as error:  # as above; without an error number, the frame was malformed
             number = _errno(error)
             if number is not None:
                 raise LinkClosed(f"{self.name}: {self._reason(error, number)}") from error
-            self._forget_damage(error)
+            self._discard_damage(error)
             return None
-        if frame is not None and not _is_sound(frame):
+        if frame is not None and not _is_valid(frame):
             self.damaged += 1
             return None
         if frame is not None and self._never_echoes:
-            frame.is_rx = True  # for SocketCAN nothing is that comes from another program of this computer
+            frame.is_rx = True  # SocketCAN marks frames of other programs on this machine as sent
         return frame
 
-    def _forget_damage(self, error: Exception) -> None:
-        """python-can's slcan keeps a line that is no text for ever, and fails with each one after it."""
+    def _discard_damage(self, error: Exception) -> None:
+        """Count damaged input, and flush it: python-can's slcan would fail on it again at every later line."""
         self.damaged += 1
         if any(isinstance(each, UnicodeDecodeError) for each in _causes(error)) and isinstance(self._bus, slcanBus):
             self._bus.flush()
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):  # of a bus that is gone
+        with contextlib.suppress(Exception):  # the bus may be gone
             self._bus.shutdown()
 
 
@@ -182,8 +193,8 @@ _FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitra
 _MOST_BYTES = 64
 
 
-def _is_sound(frame: can.Message) -> bool:
-    """Whether its fields are what they should be: python-can takes over what comes from a network."""
+def _is_valid(frame: can.Message) -> bool:
+    """True if all fields have valid types and ranges. python-can does not check what a network delivers."""
     identifier: Any = frame.arbitration_id
     data: Any = frame.data
     code: Any = frame.dlc
@@ -200,7 +211,7 @@ def _is_sound(frame: can.Message) -> bool:
 
 
 def _line(config: Mapping[str, Any]) -> CanLine | None:
-    """The bit rates, whichever way they are said; None: they are not."""
+    """Bit rates from ``bitrate`` or ``timing``; None if neither is given."""
     timing = config.get("timing")
     if isinstance(timing, can.BitTimingFd):
         return CanLine(timing.nom_bitrate, timing.data_bitrate)
@@ -210,61 +221,63 @@ def _line(config: Mapping[str, Any]) -> CanLine | None:
 
 # --------------------------------------------------------------------------------------- python-can's own configuration
 
-_OF_ANY = frozenset({"interface", "channel", "fd", "bitrate", "data_bitrate", "timing"})
-"""Keys that may describe a bus also where an interface has no use for them."""
+_COMMON_KEYS = frozenset({"interface", "channel", "fd", "bitrate", "data_bitrate", "timing"})
+"""Keys that any description may have, even if its interface does not use them."""
 _TIMING = frozenset(BitTimingDict.__annotations__) | frozenset(BitTimingFdDict.__annotations__)
-"""Of what ``timing`` is made."""
+"""Keys of ``timing``."""
 
 
-def completed(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """All that ``can.Bus`` is to be told: ``asked``, and what python-can's files and environment say besides.
+def complete_config(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments for ``can.Bus``: ``given``, completed from python-can's configuration files and environment.
 
-    ``config_context`` in ``asked`` is the section of theirs that comes first. What they say that is of no use to the
-    interface is left out.
+    ``config_context`` in ``given`` is the section of the files that takes precedence. Keys from there that the
+    interface does not use are left out.
 
-    :raises ConfigurationError: there is no such kind of interface, or it has not heard of a key that was asked for.
+    :raises ConfigurationError: there is no such interface, or it has no such key as one of ``given``.
     """
-    said = dict(asked)
-    context = said.pop("config_context", None)
-    config = _loaded(said, None if context is None else str(context))
+    arguments = dict(given)
+    context = arguments.pop("config_context", None)
+    config = _load_config(arguments, None if context is None else str(context))
     interface = str(config["interface"])
     known = _keys(interface)
     if known is None:
         return config
-    for key in said:
+    for key in arguments:
         if key not in known:
             near = difflib.get_close_matches(key, known, 1)
-            meant = f": is {near[0]!r} meant?" if near else ""
-            raise ConfigurationError(f"can:{interface}: python-can's {interface} has no key {key!r}{meant}")
+            hint = f": did you mean {near[0]!r}?" if near else ""
+            raise ConfigurationError(f"can:{interface}: python-can's {interface} has no key {key!r}{hint}")
     return {key: value for key, value in config.items() if key in known}
 
 
-def _loaded(asked: dict[str, Any], context: str | None) -> dict[str, Any]:
+def _load_config(given: dict[str, Any], context: str | None) -> dict[str, Any]:
     try:
-        return dict(can.util.load_config(config=asked, context=context))
+        return dict(can.util.load_config(config=given, context=context))
     except can.CanInterfaceNotImplementedError as error:
         known = ", ".join(sorted(can.VALID_INTERFACES))
-        interface = asked.get("interface")
+        interface = given.get("interface")
         if interface is not None:
             raise ConfigurationError(f"can:{interface}: python-can knows {known}, and no {interface!r}") from error
         suffix, section = ("", "") if context is None else (f"_{context}", f" [{context}]")
         raise ConfigurationError(
-            "can: say which interface, can:virtual or can:socketcan/can0, or name it in python-can's own"
+            "can: no interface given: use can:virtual or can:socketcan/can0, or set it in python-can's own"
             f" configuration (CAN_INTERFACE{suffix}, ~/can.conf{section}); python-can knows {known}"
         ) from error
-    except Exception as error:  # of a configuration file, whatever is wrong with it
+    except Exception as error:  # a wrong configuration file raises exceptions of any type
         raise ConfigurationError(f"can: python-can's configuration: {_words(error)}") from error
 
 
 def _keys(interface: str) -> set[str] | None:
-    """What the constructor of an interface names: its parameters, and what it looks up in those without a name, which
-    takes any; None: its driver is not there, so that nobody knows."""
+    """Keys that the constructor of an interface knows; None if its driver is absent.
+
+    They are its parameters, and the names that it looks up in its keyword arguments.
+    """
     module, name = BACKENDS[interface]
     try:
         kind = getattr(importlib.import_module(module), name)
-    except Exception:  # noqa: BLE001 - the opening says what the driver has to say
+    except Exception:  # noqa: BLE001 - opening the bus reports the driver's error
         return None
-    keys = set(_OF_ANY | _TIMING)
+    keys = set(_COMMON_KEYS | _TIMING)
     for each in set(kind.__mro__) - {can.BusABC}:
         code = getattr(inspect.unwrap(vars(each).get("__init__", each)), "__code__", None)
         if code is not None:
@@ -280,51 +293,17 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _errno(error: Exception) -> int | None:
-    """What the system has said, if it was the system."""
+    """Error number of the operating system; None if the error has another cause."""
     for each in _causes(error):
         if isinstance(each, can.CanError) and isinstance(each.error_code, int):
             return each.error_code
         if isinstance(each, OSError) and not isinstance(each, can.CanError):
             return each.errno or 0
-        if isinstance(each, termios.error):  # of a terminal whose other end is gone; no OSError, though it is one
+        if isinstance(each, termios.error):  # a terminal's other end has hung up; not an OSError
             return int(each.args[0])
     return None
 
 
 def _words(error: Exception) -> str:
-    """In one line."""
+    """Message of the exception in one line."""
     return " ".join(str(error).split()) or type(error).__name__
-
-
-class ChildBus:
-    """A bus with a device that is a child: it ends with the bus, and its death is told for what it is."""
-
-    def __init__(self, child: Child, bus: CanBus) -> None:
-        """Take over both."""
-        self.child = child
-        self.name, self.clock, self.is_fd = bus.name, bus.clock, bus.is_fd
-        self.line, self.unread_n = bus.line, bus.unread_n
-        self._bus = bus
-
-    @property
-    def damaged(self) -> int:
-        return self._bus.damaged
-
-    def send(self, frame: can.Message) -> None:
-        try:
-            self._bus.send(frame)
-        except LinkClosed as error:
-            raise LinkClosed(self.child.obituary()) from error
-
-    def receive(self, timeout_s: float) -> can.Message | None:
-        try:
-            frame = self._bus.receive(timeout_s)
-        except LinkClosed as error:
-            raise LinkClosed(self.child.obituary()) from error
-        if frame is None and self.child.has_ended:
-            raise LinkClosed(self.child.obituary())
-        return frame
-
-    def close(self) -> None:
-        self._bus.close()
-        self.child.end()

@@ -1,7 +1,7 @@
-"""Messages as frames on a CAN bus, on which others may speak too.
+"""Link over a CAN bus that may have other nodes.
 
-The identifier of a frame is that of the message in estimator_c/catalogue/analogrig.dbc. Whatever else is on the bus is
-counted and passed over; somebody else who speaks with the harness's own identifiers ends the run.
+A frame has the identifier of its message in estimator_c/catalogue/analogrig.dbc. Frames of other nodes are counted and
+skipped; another sender of the harness's own identifiers ends the run.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import copy
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from analogrig.catalogue import LAYOUTS, Message, pack, unpack_any
 from analogrig.errors import LinkError
-from analogrig.links.bus_load import CLASSIC_BYTES
 from analogrig.links.can_bus import CanBus
+from analogrig.links.frame_bits import CLASSIC_BYTES
 from analogrig.links.link import CanListener
 from analogrig.links.python_can import can
-from analogrig.protocol.catalogue import LAYOUTS, Message, pack, unpack_any
 from analogrig.wording import number_of
 
-_OURS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
-_DEVICES = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}
+_HARNESS_IDS = {layout.id for layout in LAYOUTS.values() if layout.from_harness}
+_DEVICE_IDS = {layout.id for layout in LAYOUTS.values() if not layout.from_harness}
 
-# As include/uapi/linux/can/error.h has them, which python-can hands on from SocketCAN: the identifier is a set of them.
+# Error classes of include/uapi/linux/can/error.h. The identifier of an error frame is a set of them.
 TRANSMIT_TIMEOUT, LOST_ARBITRATION, CONTROLLER, VIOLATION, TRANSCEIVER = 0x01, 0x02, 0x04, 0x08, 0x10
 NOT_ACKNOWLEDGED, BUS_OFF, BUS_ERROR, RESTARTED = 0x20, 0x40, 0x80, 0x100
 _WORDS = {
@@ -36,11 +36,11 @@ _WORDS = {
     RESTARTED: "restarted",
 }
 RECEIVE_OVERFLOW, PASSIVE, ACTIVE = 0x01, 0x30, 0x40
-"""Bits of byte 1 of a frame about the controller."""
+"""Bits of byte 1 of an error frame of the class CONTROLLER."""
 
 
 class CanLink:
-    """Messages over a bus; they come in the order in which they were sent."""
+    """Link that carries messages as frames over a CAN bus, in order."""
 
     def __init__(self, bus: CanBus) -> None:
         """Take over ``bus``."""
@@ -55,23 +55,23 @@ class CanLink:
         self._state = ""
         self._last_error = ""
         self._sent: dict[int, bytes] = {}
-        """What was said last with each sequence number."""
+        """Latest packet sent, by sequence number."""
         self._listeners: list[CanListener] = []
 
     @property
     def counters(self) -> Mapping[str, int]:
         dropped = self._counted["frames_dropped"] + self.bus.damaged
-        no = {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
-        return no | self._counted | {"frames_dropped": dropped}
+        none = {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
+        return none | self._counted | {"frames_dropped": dropped}
 
     @property
     def trouble(self) -> str:
-        said = [f"the bus is {self._state}"] if self._state else []
+        problems = [f"the bus is {self._state}"] if self._state else []
         if errors := self._counted["error_frames"]:
-            said.append(f"{number_of(errors, 'error frame')} (the last: {self._last_error})")
+            problems.append(f"{number_of(errors, 'error frame')} (the last: {self._last_error})")
         if foreign := self._counted["frames_foreign"]:
-            said.append(number_of(foreign, "frame of others", "frames of others"))
-        return ", ".join(said)
+            problems.append(number_of(foreign, "frame of others", "frames of others"))
+        return ", ".join(problems)
 
     def listen(self, listener: CanListener) -> bool:
         self._listeners.append(listener)
@@ -82,7 +82,7 @@ class CanLink:
             frame = self._frame(message)
             self._sent[message.seq] = bytes((frame.arbitration_id,)) + frame.data
             self.bus.send(frame)
-            self._passed(frame, is_rx=False)
+            self._report(frame, is_rx=False)
 
     def receive(self, timeout_s: float) -> Message | None:
         deadline_s = self.clock() + timeout_s
@@ -99,7 +99,7 @@ class CanLink:
         self.bus.close()
 
     def _frame(self, message: Message) -> can.Message:
-        """A classic one, unless it is too long for that."""
+        """Frame of a message: classic, unless it is too long for that."""
         packet = pack(message)
         is_fd = len(packet) > 1 + CLASSIC_BYTES
         return can.Message(
@@ -112,15 +112,15 @@ class CanLink:
         )
 
     def _message(self, frame: can.Message) -> Message | None:
-        """Of the device; None if it is none."""
+        """Message of the device; None for any other frame."""
         if not self._is_echo(frame):
-            self._passed(frame, is_rx=True)
+            self._report(frame, is_rx=True)
         if frame.is_error_frame:
             self._note_error(frame)
-        elif frame.is_extended_id or frame.arbitration_id not in _OURS | _DEVICES or frame.is_remote_frame:
+        elif frame.is_extended_id or frame.arbitration_id not in _HARNESS_IDS | _DEVICE_IDS or frame.is_remote_frame:
             self._counted["frames_foreign"] += 1
-        elif frame.arbitration_id in _OURS:
-            self._note_echo(frame)
+        elif frame.arbitration_id in _HARNESS_IDS:
+            self._check_echo(frame)
         else:
             packet = bytes((frame.arbitration_id,)) + frame.data
             message = unpack_any(packet) if self.carries_blocks or not frame.is_fd else None
@@ -129,19 +129,21 @@ class CanLink:
         return None
 
     def _is_echo(self, frame: can.Message) -> bool:
-        """Whether the system shows it because we sent it; not all interfaces say so."""
+        """True for a frame of this link that the interface returns. Not all interfaces mark them."""
         if not frame.is_rx:
             return True
-        if frame.arbitration_id not in _OURS or frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame:
+        if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame:
+            return False
+        if frame.arbitration_id not in _HARNESS_IDS:
             return False
         packet = bytes((frame.arbitration_id,)) + frame.data
         return len(packet) > 1 and self._sent.get(packet[1]) == packet
 
-    def _note_echo(self, frame: can.Message) -> None:
-        """:raises LinkError: it is not one of ours."""
+    def _check_echo(self, frame: can.Message) -> None:
+        """:raises LinkError: another node has sent the frame."""
         if not self._is_echo(frame):
             raise LinkError(
-                f"{self.name}: somebody else speaks with the harness's identifiers (frame {frame.arbitration_id:#05x}"
+                f"{self.name}: another node uses the harness's identifiers (frame {frame.arbitration_id:#05x}"
                 f" with {frame.data.hex() or 'no data'}): another harness on the same bus?"
             )
 
@@ -163,10 +165,10 @@ class CanLink:
         self._state = state
         self._counted[state.replace("-", "_")] += 1
 
-    def _passed(self, frame: can.Message, *, is_rx: bool) -> None:
+    def _report(self, frame: can.Message, *, is_rx: bool) -> None:
         if self.line is not None:
             self.line_s += self.line.frame_s(frame)
         for listener in self._listeners:
-            told = copy.copy(frame)
-            told.timestamp, told.is_rx = self.clock(), is_rx
-            listener(told)
+            reported = copy.copy(frame)
+            reported.timestamp, reported.is_rx = self.clock(), is_rx
+            listener(reported)

@@ -1,4 +1,4 @@
-"""A CAN bus with faults: frames are lost, late or strange, others speak too, or the controller has had enough."""
+"""A CAN bus with faults of its frames, its other nodes, or the controller."""
 
 from __future__ import annotations
 
@@ -7,28 +7,26 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
+from analogrig.catalogue import LAYOUTS, Hello, pack, unpack
 from analogrig.links.can_bus import CanBus
-from analogrig.links.can_device import MemoryBus
 from analogrig.links.can_link import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
 from analogrig.links.faulty_wire import STRANGERS_HASH
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import can
-from analogrig.links.wire import VirtualClock
 from analogrig.links.wire_faults import LONGEST_DELAY_S, Direction, FaultyLine, Lane, WireFaults
-from analogrig.protocol.catalogue import LAYOUTS, Hello, pack, unpack
 
 _FOREIGN = range(max(layout.id for layout in LAYOUTS.values()) + 1, 0x800)
-"""Identifiers that give way to all of ours."""
+"""Identifiers with lower priority than all of the catalogue."""
 _FIRST = range(min(layout.id for layout in LAYOUTS.values()))
-"""Identifiers that none of ours gets past."""
+"""Identifiers with higher priority than all of the catalogue."""
 _FRAME_S = CanLine(1_000_000).message_s(Hello)
-"""Of the frames that others send."""
+"""Duration of a frame of another node [s]."""
 _BABBLED_N = 3
-"""So many go by for each of ours."""
+"""Frames of another node for each frame of the exchange."""
 
 
 def _error(classes: int, controller: int = 0) -> can.Message:
-    """As SocketCAN shows one."""
+    """Error frame in SocketCAN's encoding."""
     return can.Message(
         arbitration_id=classes,
         is_extended_id=False,
@@ -37,26 +35,23 @@ def _error(classes: int, controller: int = 0) -> can.Message:
     )
 
 
-class FaultyBus(FaultyLine[can.Message]):
-    """A bus that does to the frames what ``faults`` say."""
+class FaultyBus(FaultyLine[CanBus, can.Message]):
+    """A bus that applies faults to its frames."""
 
     def __init__(self, open_bus: Callable[[], CanBus], faults: WireFaults) -> None:
-        """Open the bus; a device that is reset is one that is opened again."""
-        super().__init__(faults)
-        self._open = open_bus
-        self._bus = open_bus()
-        self.name, self.clock, self.is_fd = self._bus.name, self._bus.clock, self._bus.is_fd
-        self.line, self.unread_n = self._bus.line, self._bus.unread_n
+        """Open the bus. A reset of the device opens it again."""
+        super().__init__(open_bus, faults)
+        self.is_fd, self.line, self.unread_n = self._line.is_fd, self._line.line, self._line.unread_n
         self._ready: deque[can.Message] = deque()
-        """What has come, and was not asked for yet."""
+        """Received frames that were not read yet."""
         self._babbled: range = range(0)
-        """The identifiers of who babbles."""
+        """Identifiers of the babbling node."""
         self._off_until_s: float | None = None
         self._is_at_other_rate = False
 
     @property
     def damaged(self) -> int:
-        return self._bus.damaged
+        return self._line.damaged
 
     def send(self, frame: can.Message) -> None:
         self._send([frame])
@@ -66,29 +61,20 @@ class FaultyBus(FaultyLine[can.Message]):
             self._ready += self._receive(timeout_s)
         return self._ready.popleft() if self._ready else None
 
-    def close(self) -> None:
-        self._bus.close()
-
     @property
     def waiting(self) -> int:
         return super().waiting + len(self._ready)
 
     def _write(self, sent: Sequence[can.Message]) -> None:
         for frame in sent:
-            self._bus.send(frame)
+            self._line.send(frame)
 
     def _read(self, timeout_s: float) -> list[can.Message]:
-        frame = self._bus.receive(timeout_s)
+        frame = self._line.receive(timeout_s)
         return [] if frame is None else [frame]
 
-    def _boot(self) -> None:
-        self._bus.close()
-        self._bus = self._open()
-        if isinstance(self._bus, MemoryBus) and isinstance(self.clock, VirtualClock):
-            self._bus.clock = self.clock
-
     def _noise(self, direction: Direction, passed: list[can.Message]) -> list[can.Message]:
-        """The frames of others, at full load of the bus; those with the lower identifier go first."""
+        """Frames of another node at full bus load, in order of priority."""
         rng = self._lanes[direction].rng
         foreign = [
             can.Message(
@@ -96,8 +82,8 @@ class FaultyBus(FaultyLine[can.Message]):
             )
             for _ in range(_BABBLED_N)
         ]
-        if isinstance(self.clock, VirtualClock) and direction == "from":
-            self.clock.advance(_BABBLED_N * _FRAME_S)
+        if direction == "from":
+            self._advance(_BABBLED_N * _FRAME_S)
         return foreign if self._babbled == _FIRST else [*passed, *foreign]
 
     def _stranger(self, sent: can.Message) -> can.Message:
@@ -106,18 +92,18 @@ class FaultyBus(FaultyLine[can.Message]):
             return sent
         return self._with_data(sent, pack(message._replace(catalogue_hash=STRANGERS_HASH))[1:])
 
-    def _changed(self, lane: Lane[can.Message], sent: can.Message) -> can.Message | None:
+    def _apply_lasting(self, lane: Lane[can.Message], sent: can.Message) -> can.Message | None:
         if self._is_at_other_rate:
             self._show(_error(VIOLATION | CONTROLLER, PASSIVE))
             return None
-        return None if self._off_until_s is not None else super()._changed(lane, sent)
+        return None if self._off_until_s is not None else super()._apply_lasting(lane, sent)
 
     def _show(self, frame: can.Message) -> None:
-        """To the harness."""
+        """Deliver a frame to the harness."""
         self._lanes["from"].put(frame, self.clock())
 
     def _deliver(self) -> None:
-        if self._off_until_s is not None and self.clock() >= self._off_until_s:  # the controller starts again
+        if self._off_until_s is not None and self.clock() >= self._off_until_s:  # the controller restarts
             self._off_until_s = None
             self._show(_error(RESTARTED))
         super()._deliver()
@@ -132,10 +118,10 @@ class FaultyBus(FaultyLine[can.Message]):
         out.data = bytearray(data)
         return out
 
-    # ---- what happens to a frame
+    # ---- faults of one frame
 
     def _destroy(self, lane: Lane[can.Message], sent: can.Message) -> None:
-        """And its sender sends it again, as controllers do."""
+        """Destroy the frame by an error frame; its controller then repeats it."""
         self._show(_error(VIOLATION))
         lane.put(sent, self.clock())
 
@@ -147,7 +133,7 @@ class FaultyBus(FaultyLine[can.Message]):
         lane.put(sent, self.clock())
 
     def _collide(self, lane: Lane[can.Message], sent: can.Message) -> None:
-        """Somebody else has just sent the like, and both ends hear it."""
+        """Insert a similar frame of another node, which both ends receive."""
         data = bytearray(sent.data)
         data[lane.rng.randrange(1, len(data))] ^= 1 << lane.rng.randrange(8)
         other = self._with_data(sent, bytes(data))
@@ -162,7 +148,7 @@ class FaultyBus(FaultyLine[can.Message]):
         out.is_fd = out.bitrate_switch = True
         lane.put(out, self.clock())
 
-    def _switch_off(self, lane: Lane[can.Message], sent: can.Message) -> None:  # noqa: ARG002 - it is lost
+    def _switch_off(self, lane: Lane[can.Message], sent: can.Message) -> None:  # noqa: ARG002 - the frame is lost
         self._show(_error(NOT_ACKNOWLEDGED | CONTROLLER, PASSIVE))
         self._show(_error(BUS_OFF))
         self._off_until_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S
@@ -175,20 +161,20 @@ class FaultyBus(FaultyLine[can.Message]):
         self._babbled = _FIRST
         self._start_babble(lane, sent)
 
-    def _change_rate(self, lane: Lane[can.Message], sent: can.Message) -> None:  # noqa: ARG002 - it is lost
+    def _change_rate(self, lane: Lane[can.Message], sent: can.Message) -> None:  # noqa: ARG002 - the frame is lost
         self._is_at_other_rate = True
 
-    PASSES: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
-        **FaultyLine.PASSES,
+    TRANSIENT: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
+        **FaultyLine.TRANSIENT,
         "error": _destroy,
         "remote": _ask_remotely,
         "collide": _collide,
         "fd": _send_as_fd,
         "bus-off": _switch_off,
     }
-    HAPPENS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
-        **PASSES,
-        **FaultyLine.LASTS,
+    KINDS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
+        **TRANSIENT,
+        **FaultyLine.LASTING,
         "babble": _give_way,
         "jam": _go_first,
         "wrong-bitrate": _change_rate,

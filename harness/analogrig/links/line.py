@@ -1,8 +1,8 @@
-"""Lines: how long messages take on what lies between the harness and a device.
+"""Line speeds: time that messages take on a serial line or a CAN bus.
 
-A pseudo-terminal takes any number of bytes at once, a virtual bus any number of frames. Here each takes its bits, the
-device answers when the last bit of a message is there, and takes no time itself. Nothing is delayed, so that the figure
-is the same every time; it is exact for lock-step, where nothing is sent before the answers have come.
+Pseudo-terminals and virtual buses have no speed of their own. Here every message takes the time of its bits, and the
+device answers at once after the last bit. Nothing is delayed, so the time is reproducible. It is exact for lock-step,
+where nothing is sent before the answers have arrived.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from analogrig.catalogue import LAYOUTS, Message
 from analogrig.links import frame
-from analogrig.links.bus_load import CLASSIC_BYTES, frame_s, message_s
-from analogrig.protocol.catalogue import LAYOUTS, Message
+from analogrig.links.frame_bits import CLASSIC_BYTES, frame_bits, longest_frame_s
 
 if TYPE_CHECKING:
     import can
@@ -21,26 +21,26 @@ BITS_PER_BYTE = 10
 """8N1: a start bit and a stop bit around each byte."""
 
 
-class Line(Protocol):
-    """What a user says about the line to a device."""
+class LineSpeed(Protocol):
+    """Speed of the line to a device."""
 
     @property
     def speed(self) -> str:
-        """In words, for errors."""
+        """Text for errors."""
 
     def rates(self) -> dict[str, int]:
-        """By name, for the record [bit/s]."""
+        """Bit rates by name, for the record [bit/s]."""
 
     def message_s(self, kind: type[Message]) -> float:
-        """How long one message takes, at most [s]."""
+        """Longest time of one message of this type [s]."""
 
     def together_s(self, to_s: float, from_s: float) -> float:
-        """How long it takes when this much is said to the device and from it [s]."""
+        """Time for traffic of these durations to and from the device [s]."""
 
 
 @dataclass(frozen=True)
 class SerialLine:
-    """A wire for each direction."""
+    """A serial line with one wire for each direction."""
 
     baud: int
 
@@ -52,7 +52,7 @@ class SerialLine:
         return {"baud": self.baud}
 
     def bytes_s(self, n: int) -> float:
-        """How long so many bytes take [s]."""
+        """Time of n bytes [s]."""
         return n * BITS_PER_BYTE / self.baud
 
     def message_s(self, kind: type[Message]) -> float:
@@ -64,28 +64,28 @@ class SerialLine:
 
 @dataclass(frozen=True)
 class CanLine:
-    """A bus for both directions."""
+    """A CAN bus, which carries both directions in turn."""
 
     bitrate: int
     data_bitrate: int | None = None
-    """Of the data of a frame of CAN FD; None: the same."""
+    """Bit rate of the data phase of CAN FD; None if it is ``bitrate``."""
 
     @property
     def speed(self) -> str:
-        faster = "" if self.data_bitrate is None else f", data {self.data_bitrate} bit/s"
-        return f"{self.bitrate} bit/s{faster}"
+        data = "" if self.data_bitrate is None else f", data {self.data_bitrate} bit/s"
+        return f"{self.bitrate} bit/s{data}"
 
     def rates(self) -> dict[str, int]:
-        faster = {} if self.data_bitrate is None else {"data_bitrate": self.data_bitrate}
-        return {"bitrate": self.bitrate, **faster}
+        data = {} if self.data_bitrate is None else {"data_bitrate": self.data_bitrate}
+        return {"bitrate": self.bitrate, **data}
 
     def frame_s(self, frame: can.Message) -> float:
-        """How long this very frame takes, with the space after it [s]."""
-        return message_s(frame, self.bitrate, self.data_bitrate)
+        """Time of this very frame, with the interframe space after it [s]."""
+        return frame_bits(frame).time_s(self.bitrate, self.data_bitrate)
 
     def message_s(self, kind: type[Message]) -> float:
         length = LAYOUTS[kind.__name__].length
-        return frame_s(length, fd=length > CLASSIC_BYTES, bitrate=self.bitrate, data_bitrate=self.data_bitrate)
+        return longest_frame_s(length, fd=length > CLASSIC_BYTES, bitrate=self.bitrate, data_bitrate=self.data_bitrate)
 
     def together_s(self, to_s: float, from_s: float) -> float:
         return to_s + from_s

@@ -1,4 +1,4 @@
-"""Links: what carries messages to a device and back, and nothing else."""
+"""Links: carry messages of the catalogue to a device and back."""
 
 from __future__ import annotations
 
@@ -6,82 +6,71 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
+from analogrig.catalogue import Message, pack, unpack_any
 from analogrig.links import frame
-from analogrig.links.line import Line, SerialLine
-from analogrig.links.wire import Clock, Wire
-from analogrig.protocol.catalogue import Message, pack, unpack_any
+from analogrig.links.line import LineSpeed, SerialLine
+from analogrig.links.wire import Connection, Wire
 
 if TYPE_CHECKING:
     import can
 
 CanListener = Callable[["can.Message"], object]
-"""Is told every frame on a CAN bus as it comes or goes: ``is_rx`` is False if it is the harness's own, ``timestamp`` is
-the clock of the link. python-can's writers of logs are such."""
+"""Callback for every frame on a CAN bus, such as a log writer of python-can. ``is_rx`` is False for frames of the
+harness; ``timestamp`` is the link's clock."""
 
 
-class Link(Protocol):
-    """A line to one device."""
-
-    @property
-    def name(self) -> str:
-        """What it is, for errors and records."""
-
-    @property
-    def clock(self) -> Clock:
-        """The time in which its time-outs are meant."""
+class Link(Connection, Protocol):
+    """A line that carries messages to one device."""
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """What was seen on the line that was no message of the device, by name; ``frames_dropped``: was no good."""
+        """Counts, by name, of input that was no message of the device. ``frames_dropped`` counts damaged frames."""
 
     @property
     def trouble(self) -> str:
-        """What the line itself has to say if nothing comes, or nothing."""
+        """Known problems of the line, which may explain a silent device; may be empty."""
 
     @property
-    def line(self) -> Line | None:
-        """Its speed, if that is known."""
+    def line(self) -> LineSpeed | None:
+        """Speed of the line, if it is known."""
 
     @property
     def line_s(self) -> float:
-        """How long a line of the described speed would have taken until now [s]; 0.0 if none is described."""
+        """Time that all traffic so far would take at that speed [s]; 0.0 if the speed is unknown."""
 
     @property
     def carries_blocks(self) -> bool:
-        """Whether a SampleBlock fits into a message, or only what has 8 bytes."""
+        """True if a SampleBlock fits into a message; False if only messages of 8 bytes do."""
 
     @property
     def unread_n(self) -> int | None:
-        """So many messages may come before one of them is read; None: as many as like to."""
+        """Largest number of received messages that the system buffers; None if it is unlimited."""
 
     def listen(self, listener: CanListener) -> bool:
-        """Tell the listener all that passes from now on; False: these are no CAN frames."""
+        """Report all frames to the listener from now on; False if the link has no CAN frames."""
 
     def send(self, messages: Iterable[Message]) -> None:
-        """Send the messages, in one go where the line can.
+        """Send the messages, in one write where the line allows it.
 
         :raises LinkError: they cannot be sent.
         """
 
     def receive(self, timeout_s: float) -> Message | None:
-        """The next message, or None if none comes in time.
+        """The next message, or None after the time-out.
 
-        :raises LinkClosed: the other end is gone.
+        :raises LinkClosed: the other end has hung up.
         """
-
-    def close(self) -> None:
-        """Let go of the line. May be called twice."""
 
 
 class FramedLink:
-    """Messages as frames over a wire; they come in the order in which they were sent."""
+    """Link that carries messages in frames over a wire, in order."""
 
     trouble = ""
     carries_blocks = True
     unread_n = None
 
     def __init__(self, wire: Wire, line: SerialLine | None = None) -> None:
-        """Take over ``wire``; ``line`` is what it would be, or is, outside of this computer."""
+        """Take over ``wire``; ``line`` is its speed, or that of the serial line that it stands for."""
         self.wire = wire
         self.name = wire.name
         self.clock = wire.clock
@@ -89,18 +78,18 @@ class FramedLink:
         self.line = line
         self._decoder = frame.FrameDecoder()
         self._messages: deque[Message] = deque()
-        self._no_messages_n = 0
+        self._unknown_n = 0
 
     @property
     def counters(self) -> Mapping[str, int]:
-        return {"frames_dropped": self._decoder.dropped + self._no_messages_n}
+        return {"frames_dropped": self._decoder.dropped + self._unknown_n}
 
-    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - there is nothing to tell it
+    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - a wire carries no CAN frames
         return False
 
     def send(self, messages: Iterable[Message]) -> None:
         sent = b"".join([frame.encode(pack(message)) for message in messages])
-        self._time(sent)
+        self._add_time(sent)
         self.wire.write(sent)
 
     def receive(self, timeout_s: float) -> Message | None:
@@ -118,14 +107,14 @@ class FramedLink:
         self.wire.close()
 
     def _enter(self, received: bytes) -> None:
-        self._time(received)
+        self._add_time(received)
         for packet in self._decoder.feed(received):
             message = unpack_any(packet)
             if message is not None:
                 self._messages.append(message)
-            self._no_messages_n += message is None
+            self._unknown_n += message is None
 
-    def _time(self, passed: bytes) -> None:
-        """One direction after the other."""
+    def _add_time(self, transferred: bytes) -> None:
+        """Add the bytes' time. Both directions add up, since lock-step uses one at a time."""
         if self.line is not None:
-            self.line_s += self.line.bytes_s(len(passed))
+            self.line_s += self.line.bytes_s(len(transferred))

@@ -1,6 +1,6 @@
-"""python-can, for all modules that use it: without asammdf, until a measurement file is written or read.
+"""python-can, imported without asammdf until a measurement file is read or written.
 
-python-can imports asammdf with itself wherever it is installed, and pandas with it, which takes longer than a run.
+python-can imports asammdf and thus pandas if they are installed, which takes longer than a run.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-_NOT_THERE: Any = None
-"""What ``sys.modules`` has for a package that cannot be imported."""
+_ABSENT: Any = None
+"""Entry of ``sys.modules`` for a package that cannot be imported."""
 
 
 def _import() -> None:
-    """As if asammdf were absent; its formats look for it when they are first used, as they would have done at once."""
-    sys.modules["asammdf"] = _NOT_THERE
+    """Import python-can with asammdf hidden, and have its formats load asammdf on first use."""
+    sys.modules["asammdf"] = _ABSENT
     try:
         from can.io import mf4
     finally:
@@ -26,28 +26,28 @@ def _import() -> None:
     kinds = {"MF4Writer": formats.MF4Writer, "MF4Reader": formats.MF4Reader}
 
     @functools.cache
-    def look() -> None:
-        """The names of asammdf go where the classes that there are look for them."""
+    def load() -> None:
+        """Import asammdf into the module of the formats, and keep their patched classes."""
         importlib.reload(mf4)
         vars(mf4).update(kinds)
 
     for kind in kinds.values():
-        kind.__init__ = _after(look, kind.__init__)
+        kind.__init__ = _after(load, kind.__init__)
 
 
-def _after(look: Callable[[], None], init: Callable[..., None]) -> Callable[..., None]:
+def _after(load: Callable[[], None], init: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(init)
-    def looking(*arguments: Any, **named: Any) -> None:
-        look()
+    def loading(*arguments: Any, **named: Any) -> None:
+        load()
         init(*arguments, **named)
 
-    return looking
+    return loading
 
 
 if "can" not in sys.modules and "asammdf" not in sys.modules:
     _import()
 
-import can  # noqa: E402 - not before
+import can  # noqa: E402 - after the workaround above
 from can.interfaces import BACKENDS  # noqa: E402
 from can.interfaces.slcan import slcanBus  # noqa: E402
 from can.typechecking import BitTimingDict, BitTimingFdDict  # noqa: E402

@@ -1,39 +1,32 @@
-"""Wires: what carries bytes to a device and back, as they are, and nothing else."""
+"""Wires: lines that carry bytes to a device and back, unchanged."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
 import os
 import select
 import time
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from typing import Protocol
 
 import serial
 
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
-from analogrig.protocol.catalogue import CATALOGUE_HASH, FirmwareId
 
 DEFAULT_BAUD = 115_200
 WRITE_TIMEOUT_S = 2.0
 
-LIBRARY = Path(__file__).parents[1] / "_device.so"
-
 _READ_BYTES = 65_536
 _POLL_S = 1e-3
-"""The resolution of poll(); a message of samples in real time lasts less."""
-_ALWAYS_ROOM = 255
-"""Blocks that may wait in the input of a device that works while it is told."""
+"""Resolution of poll(). In real time, messages of samples are shorter."""
 
 Clock = Callable[[], float]
-"""Seconds from any beginning, never backwards."""
+"""Monotonic time [s] from an arbitrary origin."""
 
 
 class VirtualClock:
-    """Time that goes by only when it is told to: what waits in vain costs nothing, and is the same every time."""
+    """A clock that stands still until it is advanced. Time-outs cost no time and are reproducible."""
 
     def __init__(self) -> None:
         self._now_s = 0.0
@@ -45,35 +38,39 @@ class VirtualClock:
         self._now_s += by_s
 
 
-class Wire(Protocol):
-    """A line of bytes to one device."""
+class Connection(Protocol):
+    """Common part of wires, CAN buses and links."""
 
     @property
     def name(self) -> str:
-        """What it is, for errors and records."""
+        """Name for errors and records."""
 
     @property
     def clock(self) -> Clock:
-        """The time in which its time-outs are meant."""
+        """Clock of its time-outs."""
+
+    def close(self) -> None:
+        """Release the line. May be called twice."""
+
+
+class Wire(Connection, Protocol):
+    """A line that carries bytes to one device."""
 
     def write(self, sent: bytes) -> None:
-        """Send all of it.
+        """Send all bytes.
 
-        :raises LinkError: it cannot be sent.
+        :raises LinkError: they cannot be sent.
         """
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, at least one byte unless the time is over, or nearly over.
+        """Received bytes; at least one, unless the time-out has passed or is about to.
 
-        :raises LinkClosed: the other end is gone.
+        :raises LinkClosed: the other end has hung up.
         """
-
-    def close(self) -> None:
-        """Let go of the line. May be called twice."""
 
 
 class DescriptorWire:
-    """A file descriptor: a terminal, or one end of a pair of sockets."""
+    """A wire on a file descriptor: a terminal, or one end of a socket pair."""
 
     def __init__(self, fd: int, name: str) -> None:
         """Take over ``fd``."""
@@ -90,19 +87,19 @@ class DescriptorWire:
         try:
             sent = sent[self._take(sent) :]
             if sent:
-                self._write_slowly(sent, self.clock() + WRITE_TIMEOUT_S)
+                self._write_rest(sent, self.clock() + WRITE_TIMEOUT_S)
         except OSError as error:
             raise LinkClosed(f"{self.name}: {_reason(error)}") from error
 
-    def _write_slowly(self, sent: bytes, deadline_s: float) -> None:
-        """As the other end takes it."""
+    def _write_rest(self, sent: bytes, deadline_s: float) -> None:
+        """Write in pieces, each when the other end has room for it."""
         while sent:
             if not self._writable.poll(math.ceil(max(0.0, deadline_s - self.clock()) * 1000.0)):
-                raise LinkError(f"{self.name}: nothing can be sent, the other end takes nothing")
+                raise LinkError(f"{self.name}: nothing can be sent: the other end does not read")
             sent = sent[self._take(sent) :]
 
     def _take(self, sent: bytes) -> int:
-        """How much of it the line takes at once."""
+        """Number of bytes that the line accepts without waiting."""
         try:
             return os.write(self._fd, sent)
         except BlockingIOError:
@@ -112,7 +109,7 @@ class DescriptorWire:
         try:
             if not self._readable.poll(int(timeout_s * 1000.0)):
                 if timeout_s >= _POLL_S:
-                    return b""  # the rest of the time is for the next call
+                    return b""  # the caller asks again for the remaining fraction
                 time.sleep(timeout_s)
                 if not self._readable.poll(0):
                     return b""
@@ -131,12 +128,12 @@ class DescriptorWire:
 
 
 class PortWire:
-    """Anything pyserial can open: ``/dev/ttyUSB0``, a pseudo-terminal, ``socket://host:port``, ``loop://``."""
+    """A wire that pyserial opens: ``/dev/ttyUSB0``, a pseudo-terminal, ``socket://host:port``, ``loop://``."""
 
     def __init__(self, url: str, baud: int = DEFAULT_BAUD, *, name: str | None = None) -> None:
-        """Open ``url``; where the system can, nobody else may open it meanwhile.
+        """Open ``url``, exclusively where the system supports that.
 
-        :raises ConfigurationError: pyserial knows no such kind of URL.
+        :raises ConfigurationError: pyserial has no handler for the URL.
         :raises LinkError: it cannot be opened.
         """
         self.name = url if name is None else name
@@ -145,9 +142,9 @@ class PortWire:
             self._port = serial.serial_for_url(url, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True)
         except OSError as error:
             raise LinkError(f"cannot open {url}: {_reason(error)}") from error
-        except Exception as error:  # the handlers of pyserial's URLs raise whatever a wrong URL makes them
+        except Exception as error:  # pyserial's URL handlers raise exceptions of any type
             raise ConfigurationError(f"{url}: not a serial port or URL that pyserial understands: {error}") from error
-        # A plain file descriptor is used as one: pyserial's read() and write() cost as much as a whole exchange.
+        # Bypass pyserial on a plain descriptor: its read() and write() cost as much as a whole exchange.
         is_plain = type(self._port) is serial.Serial
         self._wire = DescriptorWire(self._port.fileno(), self.name) if is_plain else _UrlWire(self._port, self.name)
 
@@ -163,7 +160,7 @@ class PortWire:
 
 
 class _UrlWire:
-    """What pyserial has opened and is no file descriptor."""
+    """A wire on an object of pyserial that has no file descriptor."""
 
     def __init__(self, port: serial.Serial, name: str) -> None:
         self._port = port
@@ -173,7 +170,7 @@ class _UrlWire:
         try:
             self._port.write(sent)
         except serial.SerialTimeoutException as error:
-            raise LinkError(f"{self._name}: nothing can be sent, the other end takes nothing") from error
+            raise LinkError(f"{self._name}: nothing can be sent: the other end does not read") from error
         except OSError as error:
             raise LinkClosed(f"{self._name}: {_reason(error)}") from error
 
@@ -187,104 +184,5 @@ class _UrlWire:
 
 
 def _reason(error: OSError) -> str:
-    """What the system says, without what pyserial wraps around it."""
+    """Message of the operating system, without the text that pyserial adds."""
     return os.strerror(error.errno) if error.errno else str(error)
-
-
-class Progress(ctypes.Structure):
-    """As device_progress_t of estimator_c/device/device.h."""
-
-    _fields_ = (("taken", ctypes.c_size_t), ("given", ctypes.c_size_t))
-
-
-class Identity(ctypes.Structure):
-    """As device_identity_t of estimator_c/device/device.h."""
-
-    _fields_ = (
-        ("catalogue_hash", ctypes.c_uint32),
-        ("boot_nonce", ctypes.c_uint32),
-        ("input_blocks", ctypes.c_uint8),
-        ("firmware_id", ctypes.c_uint8),
-    )
-
-
-def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
-    """The project's library of the device, or a user's own, with these functions in it.
-
-    :raises LinkError: the project's was not built.
-    :raises ConfigurationError: the user's cannot be loaded, or lacks one of them.
-    """
-    try:
-        c = ctypes.CDLL(str(library))
-    except OSError as error:
-        if library == LIBRARY:
-            raise LinkError(f"{library} cannot be loaded: run `make setup` ({error})") from error
-        reason = str(error).removeprefix(f"{library}: ")
-        raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
-    lacking = [function for function in functions if not hasattr(c, function)]
-    if lacking:
-        raise ConfigurationError(
-            f"{library}: is no library of a device: it lacks {', '.join(lacking)}"
-            ' (harness/README.md, "Your own estimator", says what to compile)'
-        )
-    return c
-
-
-class MemoryWire:
-    """A device in this very process: the same C, the same frames, no operating system between, and no real time."""
-
-    name = "memory"
-
-    def __init__(
-        self,
-        boot_nonce: int,
-        *,
-        catalogue_hash: int = CATALOGUE_HASH,
-        clock: VirtualClock | None = None,
-        input_blocks: int = _ALWAYS_ROOM,
-        library: Path = LIBRARY,
-    ) -> None:
-        """Boot a device; another ``catalogue_hash`` makes it a stranger.
-
-        :raises LinkError: the device library was not built.
-        :raises ConfigurationError: that of a user is none.
-        """
-        c = load_library(library, ("serial_device_size", "serial_device_init", "serial_device_run"))
-        c.serial_device_run.restype = Progress
-        c.serial_device_size.restype = ctypes.c_size_t
-        self._run = c.serial_device_run
-        self._init = c.serial_device_init
-        self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
-        self._device = ctypes.create_string_buffer(c.serial_device_size())
-        self._output = ctypes.create_string_buffer(_READ_BYTES)
-        self._answers = b""
-        self.clock = VirtualClock() if clock is None else clock
-        self.boot(boot_nonce)
-
-    def boot(self, boot_nonce: int) -> None:
-        """As if it had been switched off and on: it begins anew, and what it was saying is lost."""
-        self._answers = b""
-        self._init(
-            self._device,
-            ctypes.byref(Identity(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)),
-        )
-
-    def write(self, sent: bytes) -> None:
-        while True:
-            progress = self._run(
-                self._device, sent, ctypes.c_size_t(len(sent)), self._output, ctypes.c_size_t(_READ_BYTES)
-            )
-            self._answers += ctypes.string_at(self._output, progress.given)
-            sent = sent[progress.taken :]
-            if not progress.given and not sent:
-                return
-
-    def read(self, timeout_s: float) -> bytes:
-        """What the device has answered; if that is nothing, nothing will come, and the clock goes on."""
-        answers, self._answers = self._answers, b""
-        if not answers:
-            self.clock.advance(timeout_s)
-        return answers
-
-    def close(self) -> None:
-        """Nothing is held."""

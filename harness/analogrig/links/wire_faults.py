@@ -1,10 +1,10 @@
-"""Faults of a line, from a seed: how they are asked for, and what those do that befall any line, serial or CAN.
+"""Faults of a line: their notation, and the faults that serial lines and CAN buses share.
 
-A fault happens at a numbered frame of one direction, or at any frame with a given probability; the frames are counted
-from the opening of the line, from 0. harness/README.md says what becomes of a run with each of them.
+A fault happens at a numbered frame of one direction, or at any frame with a given probability. Frames are counted from
+the opening of the line, from 0. Everything random comes from a seed.
 """
 
-# ruff: noqa: S311 - the faults are drawn from a seed; they are no secret
+# ruff: noqa: S311 - faults need a reproducible generator, not a secure one
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from random import Random
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from analogrig.errors import ConfigurationError, LinkClosed
-from analogrig.links.wire import Clock
+from analogrig.links.wire import Connection, VirtualClock
 
 Direction = Literal["to", "from"]
-"""To the device, or from it."""
+"""Direction to the device or from it."""
 DIRECTIONS: tuple[Direction, ...] = ("to", "from")
 
 LONGEST_DELAY_S = 3.0
@@ -31,11 +31,14 @@ _FAULT = re.compile(r"([a-z-]+)@(?:(to|from):([0-9]{1,12})|([0-9.]+(?:e-?[0-9]+)
 _SEED = re.compile(r"seed=([0-9]{1,18})")
 
 T = TypeVar("T")
+"""A frame."""
+L = TypeVar("L", bound=Connection)
+"""A wire or a CAN bus."""
 
 
 @dataclass(frozen=True)
 class WireFault:
-    """Once, at one frame."""
+    """A fault that happens once, at one frame."""
 
     kind: str
     direction: Direction
@@ -44,18 +47,18 @@ class WireFault:
 
 @dataclass(frozen=True)
 class WireFaults:
-    """All that shall go wrong on a line."""
+    """All faults of a line."""
 
     at: tuple[WireFault, ...] = ()
     rates: Mapping[str, float] = field(default_factory=dict)
-    """By kind: the probability at every frame of both directions."""
+    """Probability at every frame of both directions, by kind."""
     seed: int = 0
 
     @classmethod
     def parse(cls, text: str, kinds: Collection[str]) -> WireFaults:
-        """From words between commas: ``flip@to:81``, ``delay@from:0``, ``lose@0.001``, ``seed=7``.
+        """Faults from comma-separated words: ``flip@to:81``, ``delay@from:0``, ``lose@0.001``, ``seed=7``.
 
-        :raises ConfigurationError: a word is none of these, or the line has no such kind of fault.
+        :raises ConfigurationError: a word is not one of these, or the line has no such kind of fault.
         """
         at, rates, seed = [], {}, 0
         for word in filter(None, (word.strip() for word in text.split(","))):
@@ -90,26 +93,26 @@ def _probability(text: str, word: str) -> float:
 
 @dataclass
 class Lane(Generic[T]):
-    """One direction."""
+    """State of one direction."""
 
     rng: Random
-    """Its own: which of the two speaks first is a matter of timing."""
+    """Generator of this direction alone: the order of frames of both directions depends on timing."""
     frames: int = 0
     held: list[tuple[int, T]] = field(default_factory=list)
-    """Frames that come after so many others."""
+    """Delayed frames, each with the number of frames that pass before it."""
     queue: deque[tuple[float, T]] = field(default_factory=deque)
-    """What is on its way, and when it comes."""
+    """Frames on their way, each with its arrival time."""
     stalled_s: float = 0.0
-    """Until then nothing comes."""
+    """Time before which nothing arrives."""
     babbles: bool = False
     lost_n: int = 0
-    """So many frames more are lost."""
+    """Number of further frames to be lost."""
 
     def put(self, sent: T, now_s: float) -> None:
         self.queue.append((max(now_s, self.stalled_s), sent))
 
     def release(self, now_s: float) -> None:
-        """One frame has passed: those that waited for it come."""
+        """Count one frame that has passed, and queue the frames that waited for it."""
         self.held = [(n - 1, sent) for n, sent in self.held]
         for n, sent in self.held:
             if n <= 0:
@@ -117,21 +120,22 @@ class Lane(Generic[T]):
         self.held = [(n, sent) for n, sent in self.held if n > 0]
 
     def due(self, now_s: float) -> list[T]:
-        """All that has come by now."""
+        """Frames that have arrived by now."""
         out = []
         while self.queue and self.queue[0][0] <= now_s:
             out.append(self.queue.popleft()[1])
         return out
 
 
-class FaultyLine(ABC, Generic[T]):
-    """Does to the frames of a line, which are of the type T, what its faults say."""
+class FaultyLine(ABC, Generic[L, T]):
+    """A line of type L that applies faults to its frames, of type T."""
 
-    name: str
-    clock: Clock
-
-    def __init__(self, faults: WireFaults) -> None:
-        """The line is open."""
+    def __init__(self, open_line: Callable[[], L], faults: WireFaults) -> None:
+        """Open the line. A reset of the device opens it again."""
+        self._open = open_line
+        self._line = open_line()
+        self.name = self._line.name
+        self.clock = self._line.clock
         self._at = {(fault.direction, fault.frame): fault.kind for fault in faults.at}
         self._rates = dict(faults.rates)
         self._lanes: dict[Direction, Lane[T]] = {
@@ -142,44 +146,56 @@ class FaultyLine(ABC, Generic[T]):
 
     @property
     def frames(self) -> Mapping[Direction, int]:
-        """How many frames have come by in each direction."""
+        """Number of frames so far, by direction."""
         return {direction: lane.frames for direction, lane in self._lanes.items()}
 
     @property
     def waiting(self) -> int:
-        """How many frames are kept."""
+        """Number of frames that are held back."""
         return sum(len(lane.queue) + len(lane.held) for lane in self._lanes.values())
 
-    # ---- what the line does
+    def close(self) -> None:
+        self._line.close()
+
+    # ---- differences between lines
 
     @abstractmethod
     def _write(self, sent: Sequence[T]) -> None:
-        """To the device."""
+        """Pass frames on to the device."""
 
     @abstractmethod
     def _read(self, timeout_s: float) -> list[T]:
-        """The frames that the device has completed."""
-
-    @abstractmethod
-    def _boot(self) -> None:
-        """Open the device again."""
+        """Complete frames from the device."""
 
     @abstractmethod
     def _noise(self, direction: Direction, passed: list[T]) -> list[T]:
-        """What comes when these would, and somebody babbles."""
+        """Frames that arrive instead of ``passed`` while another node babbles."""
 
     @abstractmethod
     def _stranger(self, sent: T) -> T:
-        """As if the device had been built from another catalogue."""
+        """The frame as a device built from another catalogue would send it."""
 
-    # ---- passing
+    # ---- transport
+
+    def _boot(self) -> None:
+        """Open the device again; virtual time goes on."""
+        self._line.close()
+        self._line = self._open()
+        if isinstance(self.clock, VirtualClock):
+            line: Any = self._line
+            line.clock = self.clock
+
+    def _advance(self, by_s: float) -> None:
+        """Let virtual time pass; real time passes by itself."""
+        if isinstance(self.clock, VirtualClock):
+            self.clock.advance(by_s)
 
     def _send(self, sent: Sequence[T]) -> None:
         self._enter("to", sent)
         self._deliver()
 
     def _receive(self, timeout_s: float) -> list[T]:
-        """What has come, at least one frame unless the time is over."""
+        """Frames that have arrived; at least one, unless the time-out has passed."""
         deadline_s, is_over = self.clock() + timeout_s, False
         lane = self._lanes["from"]
         while True:
@@ -195,7 +211,7 @@ class FaultyLine(ABC, Generic[T]):
             is_over = self.clock() >= deadline_s
 
     def _deliver(self) -> None:
-        """To the device, what is due."""
+        """Pass on to the device what is due."""
         if self._is_closed:
             raise LinkClosed(f"{self.name}: the line is cut")
         lane = self._lanes["to"]
@@ -206,7 +222,7 @@ class FaultyLine(ABC, Generic[T]):
             self._write(sent)
 
     def _soon_s(self) -> float:
-        """How long nothing will come of itself."""
+        """Time until the next held frame is due [s]."""
         due_s = [lane.queue[0][0] for lane in self._lanes.values() if lane.queue]
         return max(0.0, min(due_s) - self.clock()) if due_s else LONGEST_DELAY_S
 
@@ -214,15 +230,15 @@ class FaultyLine(ABC, Generic[T]):
         lane, boots = self._lanes[direction], self._boots
         for each in sent:
             if direction == "from" and boots != self._boots:
-                break  # of a device that has been reset meanwhile
+                break  # the device was reset meanwhile: its earlier frames are lost
             kind = self._due_kind(direction, lane)
             lane.frames += 1
-            passed = self._changed(lane, each)
+            passed = self._apply_lasting(lane, each)
             if passed is not None:
                 if kind is None:
                     lane.put(passed, self.clock())
                 else:
-                    self.HAPPENS[kind](self, lane, passed)
+                    self.KINDS[kind](self, lane, passed)
             lane.release(self.clock())
 
     def _due_kind(self, direction: Direction, lane: Lane[T]) -> str | None:
@@ -231,8 +247,8 @@ class FaultyLine(ABC, Generic[T]):
             return kind
         return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
 
-    def _changed(self, lane: Lane[T], sent: T) -> T | None:
-        """By what lasts; None: it is lost."""
+    def _apply_lasting(self, lane: Lane[T], sent: T) -> T | None:
+        """The frame after faults that last; None if it is lost."""
         if self._is_silent:
             return None
         if lane.lost_n:
@@ -240,16 +256,16 @@ class FaultyLine(ABC, Generic[T]):
             return None
         return self._stranger(sent) if self._is_stranger else sent
 
-    # ---- what happens to a frame
+    # ---- faults of one frame
 
     def _drop(self, lane: Lane[T], sent: T) -> None:
-        """It is lost."""
+        """Lose the frame."""
 
     def _duplicate(self, lane: Lane[T], sent: T) -> None:
         lane.put(sent, self.clock())
         lane.put(sent, self.clock())
 
-    def _lose_many(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002 - it is lost
+    def _lose_many(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002 - the frame is lost
         lane.lost_n = int(MOST_FRAMES_OUT ** lane.rng.random())
 
     def _reorder(self, lane: Lane[T], sent: T) -> None:
@@ -277,14 +293,14 @@ class FaultyLine(ABC, Generic[T]):
         self._is_stranger = True
 
     def _reset(self, lane: Lane[T], sent: T) -> None:
-        """The device boots; what it was told and what it was saying is lost, but for what comes to it now."""
+        """Boot the device. Everything on the way is lost, except the frame that reaches it now."""
         self._boots += 1
         self._boot()
         self._lanes["from"].queue.clear()
         if lane is self._lanes["to"]:
             lane.put(sent, self.clock())
 
-    PASSES: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
+    TRANSIENT: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
         "drop": _drop,
         "duplicate": _duplicate,
         "outage": _lose_many,
@@ -292,14 +308,14 @@ class FaultyLine(ABC, Generic[T]):
         "repeat": _repeat,
         "delay": _delay,
     }
-    """The kinds after which the line is as it was, of any line."""
-    LASTS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
+    """Faults of any line after which the line is intact."""
+    LASTING: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
         "babble": _start_babble,
         "disconnect": _disconnect,
         "hang": _hang,
         "stranger": _replace_catalogue,
         "reset": _reset,
     }
-    """The others of any line."""
-    HAPPENS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {**PASSES, **LASTS}
-    """All kinds of a line, by name."""
+    """Faults of any line that last."""
+    KINDS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {**TRANSIENT, **LASTING}
+    """All faults of this line, by kind."""

@@ -1,10 +1,11 @@
-"""Samples out, answers in: the part of the talk with a device that is one run.
+"""Exchange of one run: samples to the device, answers from it.
 
-The device answers its messages in their order, and each sample with all that is about it. So the answers tell by
-themselves which message of samples was lost on the way there: those of a later one come. When nothing comes, the device
-is asked whether it is still the same and has said nothing since; then, too, the messages were lost. Their samples are
-missing to the device, which sees the gap in the indices, and are marked as lost here. An answer that was lost on the
-way back cannot be had again, and ends the run.
+The device answers messages in order, and each sample completely. Answers to a later message therefore show that an
+earlier one was lost on the way to the device. If no answer comes, a request for the identity shows whether the device
+was reset and whether answers were lost. If neither, the unanswered messages were lost on the way there.
+
+Lost samples are marked LOST here; the device sees a gap in the indices. A lost answer ends the run: it cannot be
+requested again.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     BLOCK_SAMPLES,
     INDICES,
     RUN_SHIFT,
@@ -35,23 +35,24 @@ from analogrig.protocol.catalogue import (
     Stepped,
     SteppedFlag,
     index_up_to,
-    is_number,
+    is_finite,
 )
+from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.pace import Pace
 from analogrig.run import LOST, UNREPORTED
 
-MOST_SILENCES = 10
-"""So often a run goes on after it waited in vain for answers; each time costs a time-out."""
+MOST_TIMEOUTS = 10
+"""Largest number of time-outs in a run that goes on after each."""
 
 _RUN_MASK = (RUNS - 1) << RUN_SHIFT
 _NO_INDEX = -1
 _NO_ELEMENT = -1
 
-_SAID = frozenset(Change) - {Change.UNDECIDED}
+_DECIDED = frozenset(Change) - {Change.UNDECIDED}
 
 Codes = tuple[int, int, bool]
-"""Force, displacement, and whether they are missing."""
+"""Force, displacement, and True if they are missing."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class RaisedAlarm:
     """An alarm of the device."""
 
     index: int
-    """The sample, counted from the start, not modulo anything."""
+    """Sample, counted from the start of the run without wrap-around."""
     kind: int
     """The trigger that raised it."""
     statistic: float
@@ -67,21 +68,21 @@ class RaisedAlarm:
 
 @dataclass(frozen=True)
 class StatedDiagnosis:
-    """What the device says has changed."""
+    """A diagnosis of the device: the parameter that has changed."""
 
     index: int
-    """The sample after which it was said; this and ``onset`` are counted from the start, not modulo anything."""
+    """Sample after which it was sent, counted, like ``onset``, from the start of the run without wrap-around."""
     change: int
-    """As Change of the catalogue."""
+    """Change of the catalogue."""
     onset: int
-    """The likeliest sample of the change; that of the alarm if several parameters have changed."""
+    """Most likely sample of the change; that of the alarm if several parameters have changed."""
     extent: float
-    """Of the parameter, new over old; 1 if several have changed."""
+    """Parameter after the change over that before; 1 if several have changed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Replies:
-    """What the device said to n samples; p parameters."""
+    """Answers of the device to n samples, with p parameters."""
 
     theta: NDArray[np.float32]
     """(n, p): the estimate after each sample, in the order of est.h, in codes."""
@@ -97,29 +98,29 @@ class Replies:
 
 @dataclass(frozen=True)
 class Packing:
-    """How samples travel."""
+    """Packing of samples into messages."""
 
     in_blocks: bool
-    """Up to BLOCK_SAMPLES in a message, or one, which any line carries."""
+    """True for up to BLOCK_SAMPLES in a message; False for one, which every line carries."""
     window: int
-    """The most messages that may be unanswered."""
+    """Largest number of unanswered messages."""
 
     @property
     def per_message(self) -> int:
         return BLOCK_SAMPLES if self.in_blocks else 1
 
 
-def most_answers(in_blocks: bool, parameters: int) -> int:  # noqa: FBT001 - as in Packing
-    """To one message of samples: each has its estimates and Stepped; and there may be an alarm and a diagnosis."""
-    return (BLOCK_SAMPLES if in_blocks else 1) * (parameters + 2) + 2
+def most_answers(samples: int, parameters: int) -> int:
+    """Largest number of answers to a message: estimates and Stepped for each sample, an alarm and a diagnosis."""
+    return samples * (parameters + 2) + 2
 
 
-class _Rows:
-    """Answers as they come, in plain lists, since numpy takes as long for one number as for a hundred."""
+class _PendingReplies:
+    """Answers not yet taken, in lists: numpy takes as long for one number as for a hundred."""
 
     def __init__(self, width: int) -> None:
         self.width = width
-        """Elements of theta, and the innovation."""
+        """Number of elements of theta, plus one for the innovation."""
         self.values: list[float] = []
         self.statistics: list[float] = []
         self.flags: list[int] = []
@@ -128,7 +129,7 @@ class _Rows:
         self._last_taken = (width * [0.0], 0.0)
 
     def repeat(self, flags: int, statistic: float | None = None) -> None:
-        """A sample without an estimate of its own: that of the row before, and no innovation."""
+        """Enter a sample without a report: the estimate of the sample before, and no innovation."""
         row = self.values[-self.width :] or self._last_taken[0]
         self.values += [*row[:-1], 0.0]
         self.finish(flags, (self.statistics or self._last_taken[1:])[-1] if statistic is None else statistic)
@@ -138,7 +139,7 @@ class _Rows:
         self.statistics.append(statistic)
 
     def take(self, n: int, before: int) -> Replies:
-        """The first n samples, and the alarms and diagnoses ``before`` an index."""
+        """Remove and return the first n samples, and the alarms and diagnoses before the index ``before``."""
         cut = n * self.width
         values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
         out = Replies(
@@ -157,7 +158,7 @@ class _Rows:
 
 
 class Exchange:
-    """One run of a device, from its first sample to its last."""
+    """Exchange of one run, from its first sample to its last."""
 
     def __init__(
         self,
@@ -167,34 +168,34 @@ class Exchange:
         packing: Packing,
         run: int,
         report_interval_n: int,
-        is_there: Callable[[], None],
+        check_device: Callable[[], None],
         pace: Pace | None = None,
     ) -> None:
-        """The device has been started with the run id ``run``.
+        """Prepare for a device that was started with the run id ``run``.
 
-        ``is_there`` raises if the device is not the one that was started, or has said something that was not heard.
+        :param check_device: raises if the device was reset, or if a message of it was lost.
         """
         self._talk = talk
         self._packing = packing
         self._run = (run % RUNS) << RUN_SHIFT
         self._is_thinned = report_interval_n > 1
-        self._is_there = is_there
+        self._check_device = check_device
         self._pace = pace
         self._elements = (*range(parameters), int(Element.INNOVATION), _NO_ELEMENT)
-        self._rows = _Rows(parameters + 1)
+        self._rows = _PendingReplies(parameters + 1)
         self._pending: deque[tuple[int, int]] = deque()
-        """Of each message without all its answers: the first sample, and how many."""
+        """First sample and number of samples of each message that is not completely answered."""
         self._deadline_s = 0.0
-        """When the answers to the oldest of them are due."""
-        self._at = 0
-        """Of the elements that are due for a sample, the next."""
+        """Deadline of the answers to the oldest of them."""
+        self._next_element = 0
+        """Position in ``_elements`` of the next estimate for a sample."""
         self._answered = 0
-        """The oldest sample without all its answers; all before are rows."""
+        """The oldest sample that is not completely answered."""
         self._wire_index = _NO_INDEX
-        """The same as the line has it, if there is one."""
+        """Its index in messages, or _NO_INDEX if there is none."""
         self._diagnosis: Diagnosis | None = None
-        """It names no sample: the next Stepped does."""
-        self._silences = 0
+        """A diagnosis that waits for the next Stepped, which names its sample."""
+        self._timeouts = 0
         self.next_index = 0
 
     def enter(
@@ -204,7 +205,7 @@ class Exchange:
         displacement: NDArray[np.uint16],
         missing: NDArray[np.bool_],
     ) -> None:
-        """Send consecutive samples; skipped indices are missing samples to the device.
+        """Send consecutive samples. The device takes skipped indices as missing samples.
 
         :raises LinkTimeout, LinkError, DeviceError: see ``Dut.feed``.
         :raises ValueError: the arrays differ in length, or the samples have been entered before.
@@ -223,11 +224,11 @@ class Exchange:
 
     @property
     def ready(self) -> int:
-        """Rows that can be taken."""
+        """Number of samples that can be taken."""
         return len(self._rows.flags)
 
     def take(self, n: int, before: int) -> Replies:
-        """The oldest n rows, with the alarms and diagnoses ``before`` a sample."""
+        """Remove and return the oldest n samples, with the alarms and diagnoses before the sample ``before``."""
         return self._rows.take(n, before)
 
     # ---- to the device
@@ -242,7 +243,7 @@ class Exchange:
         try:
             deadline_s = self._talk.send(self._message(first, samples))
         except LinkClosed as error:
-            raise self._placed(error) from error
+            raise self._with_place(error) from error
         if not self._pending:
             self._deadline_s = deadline_s
             self._await(first)
@@ -262,53 +263,53 @@ class Exchange:
     # ---- from the device
 
     def _wait_for(self, due_s: float) -> None:
-        """Take what comes until then."""
+        """Accept messages until this time on the clock."""
         try:
             while self._talk.clock() < due_s:
                 message = self._talk.receive(due_s)
                 if message is not None:
                     self._accept(message)
         except LinkClosed as error:
-            raise self._placed(error) from error
+            raise self._with_place(error) from error
 
     def _collect(self, most: int) -> None:
-        """Take what comes until at most so many messages are without all their answers."""
+        """Accept messages until at most ``most`` are not completely answered."""
         try:
             while len(self._pending) > most:
                 message = self._talk.receive(self._deadline_s)
                 if message is None:
-                    self._silence()
+                    self._handle_timeout()
                 else:
                     self._accept(message)
         except LinkClosed as error:
-            raise self._placed(error) from error
+            raise self._with_place(error) from error
 
     def _accept(self, message: Message) -> None:
-        """An answer about the oldest sample, or about one whose predecessors were lost."""
-        if not is_number(message):
-            raise self._no_number(message)
+        """Accept an answer about the oldest sample, or about one whose predecessors were lost."""
+        if not is_finite(message):
+            raise self._non_finite(message)
         if (
             isinstance(message, Estimate)
             and message.sample_index == self._wire_index
-            and message.element == self._elements[self._at]
+            and message.element == self._elements[self._next_element]
         ):
             self._rows.values.append(message.value)
-            self._at += 1
+            self._next_element += 1
         elif isinstance(message, Stepped) and message.sample_index == self._wire_index and self._ends(message):
             self._step(message)
         elif isinstance(message, Alarm) and message.sample_index == self._wire_index:
             self._rows.alarms.append(RaisedAlarm(self._answered, message.trigger, message.statistic))
-        elif isinstance(message, Diagnosis) and message.change in _SAID and self._pending:
+        elif isinstance(message, Diagnosis) and message.change in _DECIDED and self._pending:
             self._diagnosis = message
-        elif lost := self._predecessors(message):
+        elif lost := self._lost_before(message):
             self._lose(lost)
             self._accept(message)
         else:
-            raise self._wrong(message)
+            raise self._unexpected(message)
 
     def _ends(self, message: Stepped) -> bool:
-        """Whether it is the last word about a sample of this run."""
-        is_whole = self._elements[self._at] == _NO_ELEMENT or (self._is_thinned and self._at == 0)
+        """True if the message completes a sample of this run."""
+        is_whole = self._elements[self._next_element] == _NO_ELEMENT or (self._is_thinned and self._next_element == 0)
         return is_whole and message.flags & _RUN_MASK == self._run
 
     def _step(self, message: Stepped) -> None:
@@ -318,23 +319,23 @@ class Exchange:
             stated = StatedDiagnosis(self._answered, self._diagnosis.change, onset, self._diagnosis.extent)
             self._rows.diagnoses.append(stated)
             self._diagnosis = None
-        if self._at:
+        if self._next_element:
             self._rows.finish(flags, message.statistic)
-            self._at = 0
+            self._next_element = 0
         else:
             self._rows.repeat(flags | UNREPORTED, message.statistic)
         first, n = self._pending[0]
         if self._answered + 1 < first + n:
             self._await(self._answered + 1)
         else:
-            self._pass_on()
+            self._finish_message()
 
     def _await(self, index: int) -> None:
         self._answered = index
         self._wire_index = index % INDICES
 
-    def _pass_on(self) -> None:
-        """The oldest message is done with; the next one is the oldest."""
+    def _finish_message(self) -> None:
+        """Remove the oldest message, and await the answers to the next one."""
         first, n = self._pending.popleft()
         self._deadline_s = self._talk.clock() + self._talk.timeout_s
         if self._pending:
@@ -343,56 +344,60 @@ class Exchange:
             self._answered = first + n
             self._wire_index = _NO_INDEX
 
-    def _predecessors(self, message: Message) -> int:
-        """How many messages were lost if the answer is to the one after them; 0 if it is not."""
+    def _lost_before(self, message: Message) -> int:
+        """Number of lost messages if this answers a later one; 0 if it does not."""
         index = getattr(message, "sample_index", None)
-        if self._at or not self._pending or self._answered != self._pending[0][0]:
+        if self._next_element or not self._pending or self._answered != self._pending[0][0]:
             return 0
         return next((i for i, (first, _) in enumerate(self._pending) if first % INDICES == index), 0)
 
     def _lose(self, messages: int) -> None:
-        """The oldest so many never came to the device."""
+        """Mark the samples of the oldest messages as lost on the way to the device."""
         for _ in range(messages):
             for _ in range(self._pending[0][1]):
                 self._rows.repeat(LOST | SteppedFlag.MISSING)
-            self._pass_on()
+            self._finish_message()
 
-    def _silence(self) -> None:
-        """Find out why nothing has come in time.
+    def _handle_timeout(self) -> None:
+        """Find the cause of a time-out, and mark samples as lost if their messages were.
 
-        :raises LinkError, DeviceError: not because messages were lost, or it goes on too long.
+        :raises LinkError, DeviceError: there is another cause, or there were too many time-outs.
         """
-        heard = (
+        problem = (
             f"device {self._talk.name}: no estimate for sample {self._answered} within {self._talk.timeout_s:g} s"
-            f" ({self._talk.so_far})"
+            f" ({self._talk.context})"
         )
         try:
-            self._is_there()
+            self._check_device()
         except LinkTimeout as error:
-            raise LinkTimeout(f"{heard}; it answers nothing else either") from error
-        if self._at:
-            raise LinkTimeout(f"{heard}; it is alive, but does not finish its answer")
-        self._silences += 1
-        if self._silences > MOST_SILENCES:
-            raise LinkTimeout(f"{heard}; it is alive, but messages to it were lost {self._silences} times in this run")
+            raise LinkTimeout(f"{problem}; it does not answer any other request") from error
+        if self._next_element:
+            raise LinkTimeout(f"{problem}; it is alive, but does not finish its answer")
+        self._timeouts += 1
+        if self._timeouts > MOST_TIMEOUTS:
+            raise LinkTimeout(
+                f"{problem}; it is alive, but messages to it were lost {self._timeouts} times in this run"
+            )
         self._lose(len(self._pending))
 
-    def _no_number(self, message: Message) -> DeviceError:
-        """What the device has computed, and of which sample."""
+    def _non_finite(self, message: Message) -> DeviceError:
+        """Error for an answer with a value that is NaN or infinite."""
         wire_index = getattr(message, "sample_index", self._answered % INDICES)
         index = index_up_to(sum(self._pending[-1]) - 1 if self._pending else self._answered, wire_index)
         names = {int(element): element.name for element in Element}
-        what = names.get(message.element) if isinstance(message, Estimate) else message._fields[-1]
+        field = names.get(message.element) if isinstance(message, Estimate) else message._fields[-1]
         return DeviceError(
-            f"device {self._talk.name}: its {type(message).__name__} holds {what} = {message[-1]} for sample {index},"
-            " which is no number"
+            f"device {self._talk.name}: its {type(message).__name__} holds {field} = {message[-1]} for sample {index},"
+            " which is not finite"
         )
 
-    def _wrong(self, message: Message) -> DeviceError:
-        due = self._elements[self._at]
+    def _unexpected(self, message: Message) -> DeviceError:
+        due = self._elements[self._next_element]
         wanted = "Stepped" if due == _NO_ELEMENT else f"Estimate of {Element(due).name}"
-        return DeviceError(f"device {self._talk.name}: {wanted} for sample {self._answered} was due, {message} came")
+        return DeviceError(
+            f"device {self._talk.name}: expected {wanted} for sample {self._answered}, received {message}"
+        )
 
-    def _placed(self, error: LinkError) -> LinkClosed:
+    def _with_place(self, error: LinkError) -> LinkClosed:
         place = f"after sample {self._answered - 1}" if self._answered > 0 else "before the first sample"
         return LinkClosed(f"{error} {place}")

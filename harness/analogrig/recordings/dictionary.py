@@ -6,9 +6,9 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from analogrig import catalogue
+from analogrig.catalogue import LAYOUTS, Message, pack, unpack
 from analogrig.errors import ConfigurationError
-from analogrig.protocol import catalogue
-from analogrig.protocol.catalogue import LAYOUTS, Message, pack, unpack
 from analogrig.recordings.frames import silenced
 
 if TYPE_CHECKING:

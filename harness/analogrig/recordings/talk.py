@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from analogrig.errors import RecordingError
-from analogrig.protocol import catalogue
-from analogrig.protocol.catalogue import (
+from analogrig import catalogue
+from analogrig.catalogue import (
     CATALOGUE_HASH,
     INDICES,
     LAYOUTS,
@@ -21,6 +20,7 @@ from analogrig.protocol.catalogue import (
     brief,
     index_up_to,
 )
+from analogrig.errors import RecordingError
 from analogrig.recordings.dictionary import Dictionary
 
 if TYPE_CHECKING:

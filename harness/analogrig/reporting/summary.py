@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
-from analogrig.links.bus_load import BusLoad, load_of
 from analogrig.plant import UNITS
+from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.run import Run
 from analogrig.wording import number_named, number_of
 

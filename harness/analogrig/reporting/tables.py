@@ -9,8 +9,8 @@ from typing import Any
 from analogrig.identity import Identity
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
-from analogrig.links.bus_load import load_of
 from analogrig.plant import PARAMETERS, UNITS
+from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.payload import is_thinned, marked_alarms
 from analogrig.reporting.summary import lamps_text, latency_text, load_text
 from analogrig.run import Run

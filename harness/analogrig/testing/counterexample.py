@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig import config
-from analogrig.devices.devices import describe, recorded
+from analogrig.devices.registry import describe, recorded
 from analogrig.hardware.wiring import RealDescription
 from analogrig.run import Run
 from analogrig.scenario import Statement

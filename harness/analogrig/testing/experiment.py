@@ -18,7 +18,7 @@ from analogrig.testing.statement import KNOWN, Finding, make_known, said
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.protocol.dut import Dut
+    from analogrig.devices.dut import Dut
     from analogrig.rigs.rig import Rig
     from analogrig.testing.played import Played
 

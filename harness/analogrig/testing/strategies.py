@@ -279,7 +279,7 @@ def link_faults(kinds: Sequence[str] | None = None, most: int = 3) -> st.SearchS
         st.builds("{}:{}".format, st.sampled_from(["to", "from"]), st.integers(0, 400)),
         _number(0.001, 0.02, 2).map("{:g}".format),
     )
-    fault = st.builds("{}@{}".format, st.sampled_from(sorted(kinds or FaultyWire.HAPPENS)), where)
+    fault = st.builds("{}@{}".format, st.sampled_from(sorted(kinds or FaultyWire.KINDS)), where)
     return st.lists(fault, max_size=most, unique_by=lambda text: text.partition("@")[0]).flatmap(
         lambda faults: seeds().map(lambda seed: ",".join([*faults, f"seed={seed}"]) if faults else "")
     )

@@ -10,8 +10,8 @@ from typing import Any
 
 import can
 
-from analogrig.devices.devices import HOST_PROGRAM
-from analogrig.links.child import Child
+from analogrig.devices.child import Child
+from analogrig.devices.host import HOST_PROGRAM
 
 VIRTUAL = "vcan0"
 CONTROLLERS = ("can0", "can1", "can2")

@@ -11,9 +11,9 @@ import can
 import pytest
 
 from analogrig.bench import Bench
+from analogrig.catalogue import LAYOUTS, Sample, unpack
+from analogrig.devices.dut import open_dut
 from analogrig.errors import LinkError, LinkTimeout
-from analogrig.protocol.catalogue import LAYOUTS, Sample, unpack
-from analogrig.protocol.dut import open_dut
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -153,7 +153,7 @@ def test_another_harness_on_the_bus_is_noticed() -> None:
         intruder = can.Message(arbitration_id=LAYOUTS["Sample"].id, is_extended_id=False, data=bytes(range(8)))
         run = play(ON_VIRTUAL, at_sample(lambda: other.send(intruder)))
     (fault,) = run.conditions.faults
-    assert "somebody else speaks with the harness's identifiers" in fault
+    assert "another node uses the harness's identifiers" in fault
 
 
 def test_interface_that_is_absent_is_told() -> None:

@@ -9,9 +9,7 @@ from collections.abc import Callable
 import can
 import pytest
 
-from analogrig.devices.devices import HOST_PROGRAM
-from analogrig.links.child import Child
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
     RUN_SHIFT,
@@ -30,6 +28,8 @@ from analogrig.protocol.catalogue import (
     pack,
     unpack,
 )
+from analogrig.devices.child import Child
+from analogrig.devices.host import HOST_PROGRAM
 from tests.harness.processes import LONG_S, children
 
 from .interfaces import CONTROLLERS, VIRTUAL, device, down, queue, socketcan
@@ -105,7 +105,8 @@ def test_device_gives_the_reason_when_there_is_no_such_interface() -> None:
 def test_device_ends_with_the_reason_when_its_interface_goes_down(interface: str) -> None:
     with device(interface) as child, down(interface):
         assert (
-            child.obituary() == f"the device ended with status 1: analogrig-device: lost {interface}: Network is down"
+            child.exit_report()
+            == f"the device ended with status 1: analogrig-device: lost {interface}: Network is down"
         )
 
 

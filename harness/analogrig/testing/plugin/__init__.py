@@ -24,7 +24,7 @@ from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SC
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.protocol.dut import Dut
+    from analogrig.devices.dut import Dut
     from analogrig.rigs.rig import Rig
     from analogrig.testing.experiment import Play
 

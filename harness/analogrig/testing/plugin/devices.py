@@ -17,7 +17,7 @@ import pytest
 from analogrig.testing.plugin.options import DUT, RIG, Source
 
 if TYPE_CHECKING:
-    from analogrig.protocol.dut import Dut
+    from analogrig.devices.dut import Dut
     from analogrig.trust import Trust
 
 _TOLD = "analogrig_owned"
@@ -47,9 +47,9 @@ class Devices:
 
         :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
-        from analogrig.devices.devices import trusted
+        from analogrig.devices.dut import open_dut
+        from analogrig.devices.registry import trusted
         from analogrig.errors import AnalogrigError
-        from analogrig.protocol.dut import open_dut
 
         only_one = trusted(name, trust).only_one
         dut = self._open.pop(name, None)
@@ -74,7 +74,7 @@ class Devices:
 
     def _let_go(self, only_one: str) -> None:
         """Of what is open under another name, and cannot be opened twice."""
-        from analogrig.devices.devices import describe
+        from analogrig.devices.registry import describe
 
         for name in [name for name in self._open if only_one and describe(name).only_one == only_one]:
             self.release(name)
@@ -176,7 +176,7 @@ def _single(rig: str, dut: str) -> str:
     """Which of a rig and a device there is only one of; whether they exist at all will be found out by who asks."""
     if not rig and not dut:
         return ""
-    from analogrig.devices.devices import describe
+    from analogrig.devices.registry import describe
     from analogrig.errors import AnalogrigError
     from analogrig.rigs.description import described
     from analogrig_emulator import EmulatorError

@@ -19,8 +19,8 @@ from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR, t
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
+    from analogrig.devices.dut import Dut
     from analogrig.judging.verdict import TweakVerdict
-    from analogrig.protocol.dut import Dut
     from analogrig.rigs.rig import Rig
     from analogrig.scenario import Scenario
     from analogrig.testing.counterexample import Counterexample

@@ -77,7 +77,7 @@ def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
 def _is_scenario(path: Path) -> bool:
     """A rig or a device beside it is none."""
     from analogrig import config
-    from analogrig.devices.devices import KINDS
+    from analogrig.devices.registry import KINDS
     from analogrig.errors import AnalogrigError
 
     with contextlib.suppress(AnalogrigError):

@@ -34,7 +34,7 @@ def trust_of(config: pytest.Config, dut: str | None) -> Trust:
 
     :param dut: device that the command line or the environment names.
     """
-    from analogrig.devices.devices import named_things
+    from analogrig.devices.registry import named_things
     from analogrig.trust import Trust, file_of
 
     trust = Trust(config.getoption(FLAG), option=FLAG)

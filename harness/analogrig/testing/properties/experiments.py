@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from analogrig.bench import Bench
 from analogrig.campaigns.rare import false_alarm_rate
 from analogrig.campaigns.trials import Trials, are_possible
-from analogrig.devices.devices import DeviceDescription, InprocDevice, recorded
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.dut import Dut, connect
+from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
 from analogrig.judging.verdict import judge
-from analogrig.protocol.dut import Dut, connect
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
@@ -338,7 +339,7 @@ def _configure(play: Play, **settings: Any) -> None:
 def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
     """They leave the estimate as it is without them, or the run is INCONCLUSIVE, or refused with the cause."""
     bench, device = play.bench, described(play.bench.dut)
-    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
@@ -366,7 +367,7 @@ def faults_among_the_samples_cost_no_more_than_samples(
     """Of each kind of fault that passes, ``each`` at messages with samples: what is lost is as if it had been declared
     missing, to the bit, and nothing else changes. At least so many of the kinds must have left a valid run."""
     device = dataclasses.replace(described(play.bench.dut), wire_faults="")
-    if not isinstance(device, InprocDevice) and device.timeout_s > LONGEST_TIMEOUT_S:
+    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()

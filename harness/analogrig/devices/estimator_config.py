@@ -1,4 +1,4 @@
-"""The settings of the estimator in the device: est_config_t of estimator_c/core/est.h, as a user writes them."""
+"""Configuration of the estimator in the device: est_config_t of estimator_c/core/est.h in a user's terms."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from analogrig import config
+from analogrig.catalogue import Element, Key, Trigger
 from analogrig.errors import ConfigurationError
-from analogrig.protocol.catalogue import Element, Key, Trigger
 
 TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"]
 ResetName = Literal["covariance", "all"]
 EdgeInstants = Literal["locked", "may-slip", "anywhere"]
 
 _RESETS: tuple[ResetName, ...] = ("covariance", "all")
-"""In the order of est_reset_t."""
+"""Names in the order of est_reset_t."""
 
 _EDGE_INSTANTS: tuple[EdgeInstants, ...] = ("locked", "may-slip", "anywhere")
-"""In the order of est_edge_instants_t."""
+"""Names in the order of est_edge_instants_t."""
 
 _SETTINGS = (
     *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
     *("forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"),
     *("isolation", "force_zero"),
 )
-"""The fields that the device knows under the same name and as they are."""
+"""Fields with the same name and value in the device."""
 
 DEFAULT_ARL0 = 1e5
 
 MAX_NA = sum(key.name[0] == "C" and key.name[1:].isdecimal() for key in Key)
-"""The catalogue has keys for so many coefficients of C; a build of the device may take fewer."""
+"""Largest order of C in the catalogue. A build of the device may have a lower limit."""
 
 MAX_PARAMETERS = sum(element.name.startswith("THETA_") for element in Element)
-"""The catalogue has names for so many elements of theta; a build of the device may have fewer."""
+"""Largest number of elements of theta in the catalogue. A build of the device may have a lower limit."""
 
 MOST_CEILING = 1e9
-"""As EST_CEILING_LIMIT in est.h."""
+"""EST_CEILING_LIMIT of est.h."""
 
 _VARIANCES, _CODES, _U16 = (1e-9, 1e9), (-1e6, 1e6), (0, 65535)
 _SWITCH = (0, 1)
@@ -71,10 +71,7 @@ _IN_RANGE: Mapping[str, tuple[float, float]] = {
     "edge_instants": (0, len(_EDGE_INSTANTS) - 1),
     "reset": (0, len(_RESETS) - 1),
 }
-"""What est_config_valid() lets through at most, whatever the build."""
-_NOT_WHOLE = frozenset(
-    {"forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"}
-)
+"""Widest ranges of est_config_valid() over all builds. Fields with whole limits have whole values."""
 
 
 @dataclass(frozen=True)
@@ -88,39 +85,38 @@ class EstimatorConfig:
     nb: int = 3
     nk: int = 0
     nc: int = 0
-    """Coefficients of C to be estimated along with theta (extended least squares)."""
+    """Number of coefficients of C in theta (extended least squares)."""
     offset: bool = True
     noise_estimated: bool = False
-    """Follow the variance of the noise, beginning with ``noise_variance``."""
+    """Estimate the variance of the noise, starting from ``noise_variance``."""
     refresh_n: int = 40
-    """Take C from the estimate of A after so many equations, and each time A has moved; 0: never."""
+    """Equations after which C is set from the estimate of A, and again each time A has moved; 0: never."""
     stuck_n: int = 16
-    """The displacement is stuck once it was the same for so many samples after an edge of the force, at most
-    255; 0: never."""
+    """Samples of constant displacement after an edge of the force that count as stuck, up to 255; 0: never."""
     idle_n: int = 1000
-    """Excitation is lost once the force had no edge for so many samples; 0: never."""
+    """Samples without an edge of the force after which excitation counts as lost; 0: never."""
     forgetting: float = 0.99
     random_walk: float = 0.0
-    """Variance by which each parameter walks per sample, in noise variances."""
+    """Variance of each parameter's random walk per sample, in noise variances."""
     p0: float = 10.0
     p0_offset: float = 1.0e6
     """codes^2"""
     noise_variance: float = 1.2
     """codes^2"""
     c: tuple[float, ...] = (-1.6, 0.64)
-    """Prefilter C = 1 + c[0] z^-1 + ...; what is not given is zero."""
+    """Prefilter C = 1 + c[0] z^-1 + ...; further coefficients are zero."""
     edge_codes: float = 64.0
-    """A step of the force at least this large is an edge; codes."""
+    """Smallest step of the force that counts as an edge; codes."""
     code_low: float = -1.0e6
     """A reading at or below ``code_low``, or at or above ``code_high``, is saturated; codes."""
     code_high: float = 1.0e6
     isolation: bool = True
-    """Say after an alarm which of M, B, K has changed; for na = 2, nb + nk <= 3 and the trigger ``cusum``."""
+    """Diagnose after an alarm whether M, B or K has changed; for na = 2, nb + nk <= 3 and the trigger ``cusum``."""
     force_zero: float = 0.0
-    """The code at which the force is zero, for that. The bench sets it, by the range of the rig's card."""
+    """Code of zero force, for isolation. The bench sets it from the range of the rig's card."""
     edge_instants: EdgeInstants = "may-slip"
-    """Where between two samples the edges of the force come: always at the same place (``locked``), at nearly the same
-    (``may-slip``), or each elsewhere (``anywhere``), as when the period is no whole number of samples."""
+    """Instants of the force's edges between two samples: constant (``locked``), nearly constant (``may-slip``), or
+    varying (``anywhere``), as with a period that is no whole number of samples."""
     trigger: TriggerName = "cusum"
     ceiling: float | None = None
     """Codes; ln(ARL0) for ``cusum``, where ``arl0`` may be given instead."""
@@ -157,18 +153,18 @@ class EstimatorConfig:
 
     @property
     def parameters(self) -> int:
-        """The number of elements of theta."""
+        """Number of elements of theta."""
         return self.na + self.nb + self.nc + self.offset
 
     @property
     def statistic_ceiling(self) -> float | None:
-        """Where the trigger's statistic raises an alarm; None without a trigger."""
+        """Value of the trigger's statistic that raises an alarm; None without a trigger."""
         if self.trigger == "cusum" and self.ceiling is None:
             return math.log(DEFAULT_ARL0 if self.arl0 is None else self.arl0)
         return self.ceiling
 
     def settings(self) -> Iterator[tuple[Key, float]]:
-        """Every key of the device with its value, in an order in which each is in range if all are."""
+        """Every key of the device with its value, in an order that keeps each intermediate state valid."""
         for name in _SETTINGS:
             yield Key[name.upper()], float(getattr(self, name))
         for i in range(self.na):
@@ -182,58 +178,59 @@ class EstimatorConfig:
         yield Key.RESET, float(_RESETS.index(self.reset))
 
     def check_ranges(self) -> None:
-        """:raises ValueError: no device can have these settings."""
+        """:raises ValueError: a setting is out of range in every build of the device."""
         for key, value in self.settings():
-            if not _is_possible(key, value):
+            if not _is_in_range(key, value):
                 raise ValueError(f"estimator: {key.name.lower()} = {value:g} is no setting of an estimator")
 
     @classmethod
     def from_settings(cls, settings: Mapping[int, float], where: str, most_parameters: int = MAX_PARAMETERS) -> Self:
-        """What a device says that it has, by its keys; what it has not said is as by default.
+        """Configuration from values that a device has reported; the others have their defaults.
 
-        :param most_parameters: it has room for no more elements of theta.
-        :raises ConfigurationError: no device can have that; ``where`` leads.
+        :param where: beginning of error messages.
+        :param most_parameters: largest number of elements of theta.
+        :raises ConfigurationError: the values are no valid configuration.
         """
-        said = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
-        for key, value in said.items():
-            if not _is_possible(key, value):
+        reported = {Key(key): _shortest(value) for key, value in settings.items() if key in set(Key)}
+        for key, value in reported.items():
+            if not _is_in_range(key, value):
                 raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
         table: dict[str, Any] = {}
         kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
         for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
-            if Key[name.upper()] in said:
+            if Key[name.upper()] in reported:
                 kind = kinds[name] if kinds[name] in (int, bool) else float
-                table[name] = kind(said[Key[name.upper()]])
+                table[name] = kind(reported[Key[name.upper()]])
         words: Mapping[Key, Sequence[str]] = {
             Key.TRIGGER: [trigger.name.lower().replace("_", "-") for trigger in Trigger],
             Key.EDGE_INSTANTS: _EDGE_INSTANTS,
             Key.RESET: _RESETS,
         }
         for key, names in words.items():
-            if key in said:
-                table[key.name.lower()] = names[int(said[key])]
+            if key in reported:
+                table[key.name.lower()] = names[int(reported[key])]
         if table.get("trigger") == "none":
             table.pop("ceiling", None)
-        if Key.C1 in said:
-            table["c"] = [said.get(Key[f"C{i + 1}"], 0.0) for i in range(int(table.get("na", cls.na)))]
+        if Key.C1 in reported:
+            table["c"] = [reported.get(Key[f"C{i + 1}"], 0.0) for i in range(int(table.get("na", cls.na)))]
         made = config.build(cls, table, where)
         if made.parameters > most_parameters:
             raise ConfigurationError(f"{where}: {made.parameters} parameters, of at most {most_parameters}")
         return made
 
     def as_table(self) -> dict[str, Any]:
-        """In plain values, from which the same can be made; the ceiling instead of arl0."""
+        """Plain values, from which ``config.build`` makes the same; with the ceiling instead of arl0."""
         table = dataclasses.asdict(self) | {"c": list(self.c), "ceiling": self.statistic_ceiling, "arl0": None}
         return {key: value for key, value in table.items() if value is not None}
 
 
-def _is_possible(key: Key, value: float) -> bool:
+def _is_in_range(key: Key, value: float) -> bool:
     name = key.name.lower()
     low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
-    is_whole = name not in _IN_RANGE or name in _NOT_WHOLE or value.is_integer()
+    is_whole = isinstance(high, float) or value.is_integer()
     return low <= value <= high and is_whole
 
 
 def _shortest(value: float) -> float:
-    """Of all numbers that are this one in single precision, the one with the fewest digits."""
+    """Decimal number with the fewest digits that has the same value in single precision."""
     return float(str(np.float32(value)))

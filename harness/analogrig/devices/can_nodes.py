@@ -1,4 +1,4 @@
-"""The device in this very process, reached by CAN frames: directly, or in a thread on a bus of its own."""
+"""CAN buses with a device on them that the harness starts: in memory, in a thread, or in a child process."""
 
 from __future__ import annotations
 
@@ -8,26 +8,31 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
+from analogrig.catalogue import CATALOGUE_HASH, FirmwareId
+from analogrig.devices.child import Child
+from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, IdentityStruct, ProgressStruct, load_library
 from analogrig.errors import LinkClosed
-from analogrig.links.can_bus import CanBus
+from analogrig.links.can_bus import CanBus, WrappedBus
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import can
-from analogrig.links.wire import LIBRARY, Identity, Progress, VirtualClock, load_library
-from analogrig.protocol.catalogue import CATALOGUE_HASH, FirmwareId
+from analogrig.links.wire import VirtualClock
 
 MOST_BYTES = 64
-"""In a frame of CAN FD."""
+"""Data of the longest frame of CAN FD."""
+
+BUS_INPUT_BLOCKS = 64
+"""Input blocks of a device with a connection of its own. The system buffers more frames than these for it."""
 
 _EXTENDED, _REMOTE, _FD, _ERROR = 1, 2, 4, 8
-"""As estimator_c/device/can_frame.h has them."""
+"""Flags of estimator_c/device/can_frame.h."""
 
 _OUTPUT_N = 128
 _POLL_S = 0.05
-"""A device in a thread asks so often whether it shall end."""
+"""Time between two checks of a device's thread for its end."""
 
 
 class _Frame(ctypes.Structure):
-    """As can_frame_t of estimator_c/device/can_frame.h."""
+    """can_frame_t of estimator_c/device/can_frame.h."""
 
     _fields_ = (
         ("id", ctypes.c_uint32),
@@ -60,17 +65,18 @@ def _from_c(frame: _Frame) -> can.Message:
 
 
 class LibraryCanDevice:
-    """The C of the device behind its CAN shell."""
+    """The CAN port of the device in the shared library."""
 
     def __init__(
         self, *, is_fd: bool, input_blocks: int, catalogue_hash: int = CATALOGUE_HASH, library: Path = LIBRARY
     ) -> None:
-        """It is not booted yet; ``is_fd``: its controller understands CAN FD. Another hash makes it a stranger.
+        """Load a device with or without CAN FD; ``boot`` must follow.
 
-        :raises LinkError: the device library was not built.
+        :param catalogue_hash: another one stands for a device built from another catalogue.
+        :raises LinkError: the project's library was not built.
         """
         c = load_library(library, ("can_device_size", "can_device_init", "can_device_run"))
-        c.can_device_run.restype = Progress
+        c.can_device_run.restype = ProgressStruct
         c.can_device_size.restype = ctypes.c_size_t
         self._run, self._init = c.can_device_run, c.can_device_init
         self._is_fd, self._input_blocks, self._catalogue_hash = is_fd, input_blocks, catalogue_hash
@@ -78,12 +84,12 @@ class LibraryCanDevice:
         self._output = (_Frame * _OUTPUT_N)()
 
     def boot(self, boot_nonce: int) -> None:
-        """As if it had been switched off and on."""
-        identity = Identity(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
+        """Power-cycle the device."""
+        identity = IdentityStruct(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
         self._init(self._device, ctypes.byref(identity), ctypes.c_bool(self._is_fd))
 
     def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
-        """What it says to these."""
+        """Answers of the device to these frames."""
         waiting = [_to_c(frame) for frame in frames]
         out: list[can.Message] = []
         while True:
@@ -98,7 +104,7 @@ class LibraryCanDevice:
 
 
 class MemoryBus:
-    """A bus with nobody but a device of this process, no operating system between, and no real time."""
+    """A bus with a device in this process as its only other node, on a virtual clock."""
 
     name = "memory"
     unread_n = None
@@ -115,12 +121,12 @@ class MemoryBus:
     ) -> None:
         """Boot a device.
 
-        :raises LinkError: the device library was not built.
+        :raises LinkError: the project's library was not built.
         """
         self.is_fd = is_fd
         self.line = line
         self.clock = VirtualClock() if clock is None else clock
-        self._device = LibraryCanDevice(is_fd=is_fd, input_blocks=_ALWAYS_ROOM, catalogue_hash=catalogue_hash)
+        self._device = LibraryCanDevice(is_fd=is_fd, input_blocks=ALWAYS_ROOM, catalogue_hash=catalogue_hash)
         self._answers: deque[can.Message] = deque()
         self._device.boot(boot_nonce)
 
@@ -128,61 +134,46 @@ class MemoryBus:
         self._answers += self._device.answers([frame])
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """What the device has answered; if that is nothing, nothing will come, and the clock goes on."""
+        """The next answer. Without any, the clock advances by the whole time-out, since none can follow."""
         if self._answers:
             return self._answers.popleft()
         self.clock.advance(timeout_s)
         return None
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: nothing is held."""
 
 
-_ALWAYS_ROOM = 255
-"""Blocks that may wait in the input of a device that works while it is told."""
-
-BUS_INPUT_BLOCKS = 64
-"""Messages that may wait for a device on a bus of its own: fewer than its system keeps for it."""
-
-
-class InhabitedBus:
-    """A bus with a device of this process on it, which has a connection of its own and a thread to serve it."""
+class InhabitedBus(WrappedBus):
+    """A bus with a device in this process, which a thread serves over a connection of its own."""
 
     def __init__(self, bus: CanBus, devices_bus: CanBus, boot_nonce: int) -> None:
-        """Take over both connections to the same bus; the device boots.
+        """Take over both connections to the same bus, and boot the device.
 
-        :raises LinkError: the device library was not built.
+        :raises LinkError: the project's library was not built.
         """
-        self.name, self.clock, self.is_fd = bus.name, bus.clock, bus.is_fd
-        self.line, self.unread_n = bus.line, bus.unread_n
-        self._bus, self._devices_bus = bus, devices_bus
+        super().__init__(bus)
+        self._devices_bus = devices_bus
         self._device = LibraryCanDevice(is_fd=bus.is_fd, input_blocks=BUS_INPUT_BLOCKS)
         self._device.boot(boot_nonce)
-        self._said: dict[tuple[int, int], bytes] = {}
-        """What the device has said last in each kind of message with each sequence number."""
+        self._sent: dict[tuple[int, int], bytes] = {}
+        """Latest data from the device, by identifier and sequence number."""
         self._ends = threading.Event()
-        self._death: Exception | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._serve, name=f"device on {bus.name}", daemon=True)
         self._thread.start()
 
-    @property
-    def damaged(self) -> int:
-        return self._bus.damaged
-
-    def send(self, frame: can.Message) -> None:
-        self._bus.send(frame)
-
     def receive(self, timeout_s: float) -> can.Message | None:
-        frame = self._bus.receive(timeout_s)
-        if frame is None and self._death is not None:
-            raise LinkClosed(f"the device in this process lost its bus: {self._death}") from self._death
+        frame = super().receive(timeout_s)
+        if frame is None and self._error is not None:
+            raise LinkClosed(f"the device in this process lost its bus: {self._error}") from self._error
         return frame
 
     def close(self) -> None:
         self._ends.set()
         self._thread.join()
         self._devices_bus.close()
-        self._bus.close()
+        super().close()
 
     def _serve(self) -> None:
         try:
@@ -190,13 +181,37 @@ class InhabitedBus:
                 frame = self._devices_bus.receive(_POLL_S)
                 if frame is not None and not self._is_echo(frame):
                     for answer in self._device.answers([frame]):
-                        self._said[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
+                        self._sent[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
-        except Exception as error:  # noqa: BLE001 - whatever ends the thread is told to who waits for it
-            self._death = error
+        except Exception as error:  # noqa: BLE001 - ``receive`` reports any end of the thread
+            self._error = error
 
     def _is_echo(self, frame: can.Message) -> bool:
-        """Whether the interface shows the device what it has said itself, as udp_multicast does."""
+        """True for the device's own frame: interfaces such as udp_multicast return them to the sender."""
         if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame or not frame.data:
             return False
-        return self._said.get((frame.arbitration_id, frame.data[0])) == bytes(frame.data)
+        return self._sent.get((frame.arbitration_id, frame.data[0])) == bytes(frame.data)
+
+
+class ChildBus(WrappedBus):
+    """A bus to a child process, which ends when the bus is closed."""
+
+    def __init__(self, child: Child, bus: CanBus) -> None:
+        """Take over both."""
+        super().__init__(bus)
+        self.child = child
+
+    def send(self, frame: can.Message) -> None:
+        with self.child.reports_exit():
+            super().send(frame)
+
+    def receive(self, timeout_s: float) -> can.Message | None:
+        with self.child.reports_exit():
+            frame = super().receive(timeout_s)
+        if frame is None and self.child.has_ended:
+            raise LinkClosed(self.child.exit_report())
+        return frame
+
+    def close(self) -> None:
+        super().close()
+        self.child.end()

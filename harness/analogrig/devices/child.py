@@ -1,17 +1,19 @@
-"""A device that is a process of this computer, whatever it is: started, tethered to this process, ended, mourned.
+"""Child processes: start a device's process, end it with this one, and report why it ended.
 
-The tether is a program of its own (tether.c) between this process and the device's. It sees when this process ends, be
-it by SIGKILL, and ends the device.
+A small program, the tether (tether.c), stands between this process and the device's. It ends the device when this
+process ends, even by SIGKILL.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import select
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from analogrig.errors import LinkClosed, LinkError
 from analogrig.links.wire import Wire
@@ -23,19 +25,21 @@ END_TIMEOUT_S = 3.0
 """Longer than the tether waits before it kills."""
 
 _COMPLAINT = re.compile(r"[a-z][\w./-]*: ")
-"""As programs begin it, with their name: QEMU adds all the registers of the processor."""
+"""Beginning of an error message: the program's name. QEMU prints the processor's registers after it."""
+
+T = TypeVar("T")
 
 
 class Child:
-    """The process."""
+    """A process that ends with this one."""
 
     def __init__(self, command: Sequence[str | Path], what: str, *, inherited: Sequence[int] = ()) -> None:
-        """Start it; errors call it ``what``. Of our descriptors it has ``inherited``.
+        """Start ``command``, called ``what`` in errors; it inherits these file descriptors.
 
         :raises LinkError: the tether was not built.
         """
         self._what = what
-        self._last_words = ""
+        self._stderr = ""
         try:
             self._process = subprocess.Popen(
                 [TETHER, *command],
@@ -44,7 +48,7 @@ class Child:
                 stderr=subprocess.PIPE,
                 bufsize=0,
                 pass_fds=inherited,
-                process_group=0,  # Ctrl-C is for the harness, which then ends the device
+                process_group=0,  # Ctrl-C reaches the harness only, which then ends the device
             )
         except OSError as error:
             cure = "; run `make setup`" if isinstance(error, FileNotFoundError) else ""
@@ -58,51 +62,70 @@ class Child:
     def has_ended(self) -> bool:
         return self._process.poll() is not None
 
-    def first_line(self) -> str:
-        """What it says first.
+    def connect(self, open_line: Callable[[str], T]) -> T:
+        """Result of ``open_line``, called with the first line of output. If that fails, the process is ended.
 
-        :raises LinkError: nothing in time, or it has ended.
+        :raises LinkError: see ``first_line``.
+        """
+        try:
+            return open_line(self.first_line())
+        except BaseException:
+            self.end()
+            raise
+
+    def first_line(self) -> str:
+        """First line of its output.
+
+        :raises LinkError: none came in time, or the process has ended.
         """
         stdout, line = self._process.stdout, b""
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while not line.endswith(b"\n"):
             left_s = max(0.0, deadline_s - time.monotonic())
             if stdout is None or not select.select([stdout], [], [], left_s)[0]:
-                raise LinkError(f"{self._what} said nothing within {START_TIMEOUT_S} s of its start")
-            said = stdout.read(1)
-            if not said:
-                raise LinkClosed(self.obituary())
-            line += said
+                raise LinkError(f"{self._what} printed nothing within {START_TIMEOUT_S} s of its start")
+            received = stdout.read(1)
+            if not received:
+                raise LinkClosed(self.exit_report())
+            line += received
         return line.decode(errors="replace").strip()
 
-    def obituary(self) -> str:
-        """How it ended, with its last complaint, or whatever it said last."""
+    def exit_report(self) -> str:
+        """Exit status with the last error message, or else the last line, of its standard error."""
         try:
             status = self._process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             return f"{self._what} closed its line"
         if self._process.stderr is not None and not self._process.stderr.closed:
-            self._last_words += self._process.stderr.read().decode(errors="replace")
-        lines = self._last_words.strip().splitlines()
-        told = [line for line in lines if _COMPLAINT.match(line)] or lines
-        return f"{self._what} ended with status {status}{f': {told[-1]}' if told else ''}"
+            self._stderr += self._process.stderr.read().decode(errors="replace")
+        lines = self._stderr.strip().splitlines()
+        messages = [line for line in lines if _COMPLAINT.match(line)] or lines
+        return f"{self._what} ended with status {status}{f': {messages[-1]}' if messages else ''}"
+
+    @contextlib.contextmanager
+    def reports_exit(self) -> Iterator[None]:
+        """Replace the message of LinkClosed by the exit report."""
+        try:
+            yield
+        except LinkClosed as error:
+            raise LinkClosed(self.exit_report()) from error
 
     def end(self) -> None:
-        """The end of the tether's input is the end of both. May be called twice."""
+        """End the process by closing the tether's input. May be called twice."""
         for stream in (self._process.stdin, self._process.stdout):
             if stream is not None:
                 stream.close()
         try:
             self._process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()  # and the kernel kills what it held
+            self._process.kill()  # the kernel then kills the command
             self._process.wait()
         if self._process.stderr is not None:
             self._process.stderr.close()
 
 
 class ChildWire:
-    """A wire whose other end is a child: it ends with the wire, and its death is told for what it is."""
+    """A wire to a child process, which ends when the wire is closed."""
 
     def __init__(self, child: Child, wire: Wire) -> None:
         """Take over both."""
@@ -112,16 +135,12 @@ class ChildWire:
         self.clock = wire.clock
 
     def write(self, sent: bytes) -> None:
-        try:
+        with self.child.reports_exit():
             self._wire.write(sent)
-        except LinkClosed as error:
-            raise LinkClosed(self.child.obituary()) from error
 
     def read(self, timeout_s: float) -> bytes:
-        try:
+        with self.child.reports_exit():
             return self._wire.read(timeout_s)
-        except LinkClosed as error:
-            raise LinkClosed(self.child.obituary()) from error
 
     def close(self) -> None:
         self._wire.close()

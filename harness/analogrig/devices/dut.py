@@ -1,7 +1,6 @@
-"""The device under test: handshake, configuration, samples in and estimates out.
+"""Device under test: opening, handshake, configuration, samples in and estimates out.
 
-The device never speaks without being asked, so every exchange is a question and its answers, and what is not as it
-should be is an error, never a guess.
+The device sends nothing without a request. Any other message than the expected answer is an error.
 """
 
 from __future__ import annotations
@@ -20,20 +19,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.devices import DeviceDescription, recorded, trusted
-from analogrig.errors import (
-    CatalogueMismatch,
-    ConfigurationError,
-    DeviceError,
-    DeviceRefused,
-    LinkClosed,
-    LinkError,
-    LinkTimeout,
-    TimeLimitReached,
-)
-from analogrig.identity import DeviceFile
-from analogrig.links.link import CanListener, Link
-from analogrig.protocol.catalogue import (
+from analogrig.catalogue import (
+    BLOCK_SAMPLES,
     CATALOGUE_HASH,
     RUNS,
     Command,
@@ -49,31 +36,43 @@ from analogrig.protocol.catalogue import (
     Result,
     Status,
 )
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.registry import recorded, trusted
+from analogrig.errors import (
+    CatalogueMismatch,
+    ConfigurationError,
+    DeviceError,
+    DeviceRefused,
+    LinkClosed,
+    LinkError,
+    LinkTimeout,
+    TimeLimitReached,
+)
+from analogrig.identity import DeviceFile
+from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation
-from analogrig.protocol.estimator_config import EstimatorConfig
-from analogrig.protocol.exchange import Exchange, Packing, RaisedAlarm, Replies, most_answers
+from analogrig.protocol.exchange import Exchange, Packing, Replies, most_answers
 from analogrig.protocol.pace import Pace, check_line
 from analogrig.trust import Trust
 
 _HELLO_AGAIN_S = 0.25
-"""A board that resets when its port is opened does not hear the first call."""
+"""Time after which the handshake is repeated: a board that resets when its port is opened misses the first request."""
 
 
 @dataclass(frozen=True)
-class Identity:
-    """Who a device says it is."""
+class DeviceIdentity:
+    """DeviceIdentity of a device, from its answer to the handshake."""
 
     firmware: str
     catalogue_hash: int
     boot_nonce: int
-    """Another number after every boot."""
+    """Random number, new after every boot."""
     theta_max: int
-    """The most parameters that this build can estimate."""
+    """Largest number of parameters that this build can estimate."""
     input_blocks: int
-    """So many blocks of samples can wait in its input."""
+    """Number of blocks of samples that fit in its input buffer."""
 
-
-__all__ = ["Dut", "Identity", "RaisedAlarm", "Replies", "Stretch", "connect", "open_dut", "reopen_dut"]
 
 Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
 """Index of the first sample, force, displacement, missing."""
@@ -87,12 +86,12 @@ class Dut:
     """
 
     def __init__(self, link: Link, description: DeviceDescription) -> None:
-        """Take over ``link``; nothing is sent yet."""
+        """Take over ``link``. Nothing is sent yet."""
         self._description = description
         self._talk = Conversation(link, description.name, description.timeout_s)
-        self._identity: Identity | None = None
+        self._identity: DeviceIdentity | None = None
         self._run = secrets.randbelow(RUNS)
-        """Id of the last run: samples that the line has kept since an earlier connection have hardly the next one."""
+        """Id of the last run. It starts at random, to differ from that of samples still buffered in the line."""
         self._exchange: Exchange | None = None
         self._counted: Mapping[str, int] = {}
         self._line_s = 0.0
@@ -107,37 +106,36 @@ class Dut:
 
     @property
     def link_counters(self) -> dict[str, int]:
-        """What the line has shown since it was opened that was no message of the device, by name."""
+        """Counters of the line since it was opened, by name (``Link.counters``)."""
         return dict(self._talk.link.counters)
 
     @property
     def line_s(self) -> float:
-        """How long a line of the described speed would have taken for the samples; 0.0: none is described."""
+        """Time that the samples and answers of this run take at the line's speed [s]; 0.0 if it is unknown."""
         return self._talk.link.line_s - self._line_s
 
     @property
     def line(self) -> dict[str, int]:
-        """How samples go: its bit rates (``Line.rates``), as far as they are known; ``samples_per_message`` and
-        ``window``, the most messages that may be unanswered."""
+        """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
         line, packing = self._talk.link.line, self._packing()
         rates = {} if line is None else line.rates()
         return {**rates, "samples_per_message": packing.per_message, "window": packing.window}
 
     def limit(self, left_s: float) -> None:
-        """Wait no longer than ``left_s`` from now, whatever is asked; ``math.inf`` removes the limit.
+        """Set a time limit ``left_s`` from now; ``math.inf`` removes it.
 
-        After that, every method that waits for the device raises ``TimeLimitReached``.
+        After it, every method that waits for the device raises ``TimeLimitReached``.
         """
         self._talk.limit_s = self._talk.clock() + left_s
 
     @property
     def estimator(self) -> EstimatorConfig:
-        """How its estimator is configured."""
+        """Configuration of its estimator."""
         return self._description.estimator
 
     @property
     def parameters(self) -> int:
-        """Elements of theta."""
+        """Number of elements of theta."""
         return self._description.estimator.parameters
 
     def description(self) -> Mapping[str, Any]:
@@ -146,7 +144,7 @@ class Dut:
         return table if self._identity is None else {**table, "identity": dataclasses.asdict(self._identity)}
 
     def files(self) -> tuple[DeviceFile, ...]:
-        """Library, program or firmware that it runs on this machine, if it does."""
+        """Library, program or firmware that the device runs on this machine, if any."""
         program = self._description.program
         return () if program is None else (DeviceFile.of(self.name, program),)
 
@@ -159,21 +157,21 @@ class Dut:
         self.close()
 
     def close(self) -> None:
-        """Let go of the device; one that was started for this is ended."""
+        """Release the device, and end it if it was started for this."""
         self._talk.link.close()
 
     # ---------------------------------------------------------------------------------------- before and after the run
 
-    def handshake(self) -> Identity:
-        """Find out who is there, whatever it was doing, and reset it to a known state.
+    def handshake(self) -> DeviceIdentity:
+        """Identify the device and reset it, in any state.
 
-        :raises LinkTimeout: nobody answers.
-        :raises CatalogueMismatch: it speaks another catalogue.
+        :raises LinkTimeout: no answer came in time.
+        :raises CatalogueMismatch: the device was built from another catalogue.
         :raises ConfigurationError: the line does not carry the messages of the described exchange.
         """
         if self._description.exchange == "block" and not self._talk.link.carries_blocks:
             raise ConfigurationError(
-                f"device {self.name}: exchange: a block has 64 bytes, which a frame of classic CAN does not carry: say"
+                f"device {self.name}: exchange: a block has 64 bytes, and a frame of classic CAN carries 8: set"
                 " sample or stream, or use CAN FD (fd)"
             )
         self._identity = self._identify(starting_s=self._description.starting_s)
@@ -181,17 +179,18 @@ class Dut:
         self._control(Command.REPORT_INTERVAL, self._description.report_interval_n)
         return self._identity
 
-    def identity(self) -> Identity:
-        """Ask again who is there.
+    def identity(self) -> DeviceIdentity:
+        """Identify the device again.
 
-        :raises DeviceError: not who answered the handshake: it was reset meanwhile.
+        :raises DeviceError: it was reset since the handshake.
         """
-        return self._same(self._identify())
+        return self._check_boot(self._identify())
 
     def configure(self, estimator: EstimatorConfig | None = None) -> None:
-        """Set every field of the device's configuration, by default as described, and make sure that it took it.
+        """Set every field of the device's configuration, and check that each was applied.
 
-        :raises DeviceRefused: it did not; names the key, what was wanted and what is set.
+        :param estimator: the configuration; by default the described one.
+        :raises DeviceRefused: a field was not applied; names the field, the value sent and the value set.
         """
         if estimator is not None:
             self._description = dataclasses.replace(self._description, estimator=estimator)
@@ -205,23 +204,31 @@ class Dut:
                 )
 
     def set_force_zero(self, code: float) -> None:
-        """Tell the device which code of the force is none; errors as ``configure``."""
+        """Set the code that means zero force; errors as ``configure``."""
         self.configure(dataclasses.replace(self._description.estimator, force_zero=code))
 
     def pace(self, period_s: float) -> Pace:
-        """For a run with a sample every ``period_s``, on the clock of the line.
+        """Pace of a run in real time, with a sample every ``period_s`` on the link's clock.
 
-        :raises ConfigurationError: that does not fit the line.
+        :raises ConfigurationError: the line is too slow for it.
         """
         line = self._talk.link.line
         if line is not None:
-            check_line(self._description, line, period_s, in_blocks=self._packing().in_blocks)
+            check_line(
+                line,
+                period_s,
+                device=self.name,
+                parameters=self.parameters,
+                report_interval_n=self._description.report_interval_n,
+                in_blocks=self._packing().in_blocks,
+            )
         return Pace(self._talk.clock, period_s)
 
     def start(self, pace: Pace | None = None) -> None:
-        """Begin a run; its first sample has the index 0. With a ``pace`` none is sent before it is due.
+        """Begin a run, whose first sample has the index 0.
 
-        :raises DeviceRefused: the device cannot.
+        :param pace: no sample is sent before it is due; by default each is sent at once.
+        :raises DeviceRefused: the device cannot start.
         """
         if pace is not None:
             pace.restart()
@@ -235,35 +242,35 @@ class Dut:
             packing=self._packing(),
             run=self._run,
             report_interval_n=self._description.report_interval_n,
-            is_there=self._is_there,
+            check_device=self._check_device,
             pace=pace,
         )
         self._line_s = self._talk.link.line_s
 
     def stop(self) -> dict[str, int]:
-        """End the run and return the device's counters by name, as far as they have counted in this run.
+        """End the run, and return the device's counters of this run by name.
 
         :raises DeviceError: the device was reset during the run.
-        :raises LinkError: a message was lost, or somebody else spoke as the device.
+        :raises LinkError: a message was lost, or another node sent as the device.
         """
-        self._is_there()  # without forgetting what was heard: who spoke as the device is found out by the next message
+        self._check_device()  # keeps the expected number, so a message lost or forged at the end is noticed
         self._control(Command.STOP)
         self._exchange = None
         return {name: value - self._before_run(name) for name, value in self.status().items()}
 
     def _before_run(self, counter: str) -> int:
-        """What it had counted when the run began; the estimator's own begin with the run."""
+        """Count before the run; 0 for the estimator's own counters, which begin with the run."""
         return 0 if Counter[counter.upper()] < Counter.FRAMES_DROPPED else self._counted[counter]
 
     def _packing(self) -> Packing:
-        """No more is on its way than the device can hold, nor on its way back than the line can."""
+        """Packing whose samples fit in the device's input buffer, and whose answers fit in that of the line."""
         description, link = self._description, self._talk.link
         in_blocks = description.exchange != "sample" and link.carries_blocks
         window = description.window if description.exchange == "stream" else 1
         if self._identity is not None:
             window = min(window, self._identity.input_blocks)
         if link.unread_n is not None:
-            window = min(window, link.unread_n // most_answers(in_blocks, self.parameters))
+            window = min(window, link.unread_n // most_answers(BLOCK_SAMPLES if in_blocks else 1, self.parameters))
         return Packing(in_blocks=in_blocks, window=max(1, window))
 
     def status(self) -> dict[str, int]:
@@ -274,7 +281,7 @@ class Dut:
         for counter in Counter:
             answer = self._talk.answer(request, Status, deadline_s)
             if answer.counter != counter:
-                raise DeviceError(f"device {self.name}: the counter {counter.name} was due, {answer} came")
+                raise DeviceError(f"device {self.name}: expected the counter {counter.name}, received {answer}")
             counters[counter.name.lower()] = answer.value
         return counters
 
@@ -283,17 +290,18 @@ class Dut:
         if answer.result != Result.APPLIED:
             raise DeviceRefused(f"device {self.name}: {command.name} was refused: {_word(Result, answer.result)}")
 
-    def _is_there(self) -> None:
-        """That the device is who it was, and has said nothing that was not heard."""
+    def _check_device(self) -> None:
+        """Check that the device was not reset, and that no message of it was lost."""
         try:
-            self._same(self._call())
+            self._check_boot(self._request_identity())
         except (LinkClosed, LinkTimeout):
             raise
         except LinkError:
-            self.identity()  # if it was reset, that is why
+            self.identity()  # reports a reset, the more specific cause
             raise
 
-    def _same(self, identity: Identity) -> Identity:
+    def _check_boot(self, identity: DeviceIdentity) -> DeviceIdentity:
+        """:raises DeviceError: the identity is not that of the handshake."""
         if self._identity is not None and identity != self._identity:
             raise DeviceError(
                 f"device {self.name}: it was reset after the handshake"
@@ -301,13 +309,13 @@ class Dut:
             )
         return identity
 
-    def _identify(self, *, starting_s: float = 0.0) -> Identity:
-        """Whatever is in the line from before."""
+    def _identify(self, *, starting_s: float = 0.0) -> DeviceIdentity:
+        """DeviceIdentity of the device, after skipping messages still buffered in the line."""
         self._talk.begin()
-        return self._call(after_anything=True, starting_s=starting_s)
+        return self._request_identity(after_anything=True, starting_s=starting_s)
 
-    def _call(self, *, after_anything: bool = False, starting_s: float = 0.0) -> Identity:
-        """Ask who is there until there is an answer; what came before the first question does not matter."""
+    def _request_identity(self, *, after_anything: bool = False, starting_s: float = 0.0) -> DeviceIdentity:
+        """DeviceIdentity of the device, requested repeatedly until it answers."""
         within_s = starting_s + self._talk.timeout_s
         deadline_s = self._talk.clock() + within_s
         while True:
@@ -317,20 +325,20 @@ class Dut:
             except LinkTimeout as error:
                 if self._talk.clock() >= deadline_s:
                     if starting_s:
-                        raise LinkTimeout(f"{error}; it had {within_s:g} s to start and answer") from error
+                        raise LinkTimeout(f"{error}; the device had {within_s:g} s to start and answer") from error
                     raise
 
-    def _ask_identity(self, deadline_s: float, *, after_anything: bool) -> Identity:
+    def _ask_identity(self, deadline_s: float, *, after_anything: bool) -> DeviceIdentity:
         request = Identify(self._talk.next_seq())
         self._talk.send(request)
         hello = self._talk.answer(request, Hello, deadline_s, after_anything=after_anything)
         if hello.catalogue_hash != CATALOGUE_HASH:
             raise CatalogueMismatch(
-                f"device {self.name}: it speaks catalogue {hello.catalogue_hash:#010x}, this harness"
-                f" {CATALOGUE_HASH:#010x}: build both from the same analogrig.dbc"
+                f"device {self.name}: built from catalogue {hello.catalogue_hash:#010x}, this harness"
+                f" from {CATALOGUE_HASH:#010x}: build both from the same analogrig.dbc"
             )
         firmware = self._talk.answer(request, Firmware, deadline_s, after_anything=after_anything)
-        return Identity(
+        return DeviceIdentity(
             firmware=_word(FirmwareId, firmware.firmware_id),
             catalogue_hash=hello.catalogue_hash,
             boot_nonce=firmware.boot_nonce,
@@ -347,22 +355,22 @@ class Dut:
         displacement: NDArray[np.uint16],
         missing: NDArray[np.bool_],
     ) -> Replies:
-        """Enter n consecutive samples (codes) and collect the answers to each; all arrays are (n,).
+        """Send n consecutive samples (codes) and return the answers; all arrays are (n,).
 
-        Indices that were skipped since the last call are missing samples to the device.
+        The device takes skipped indices as missing samples.
 
-        :raises LinkTimeout: the device answers no more.
+        :raises LinkTimeout: the device does not answer any more.
         :raises LinkError: the line failed, or lost a message of the device.
-        :raises DeviceError: an answer is not the one that was due, or the device was reset.
+        :raises DeviceError: an answer is not the expected one, or the device was reset.
         :raises ValueError: the arrays differ in length, or the samples have been fed before.
         """
         (replies,) = self.play([(first_index, force, displacement, missing)])
         return replies
 
     def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        """As ``feed`` for one stretch of samples after the other, without a pause between them.
+        """Feed several stretches of samples without a pause, and yield the answers to each; errors as ``feed``.
 
-        :raises TimeLimitReached: after the answers to all samples that were answered in time, the last stretch in part.
+        :raises TimeLimitReached: after yielding all answers that came in time, those of the last stretch in part.
         """
         exchange = self._running()
         waiting: deque[tuple[int, int]] = deque()
@@ -374,9 +382,9 @@ class Dut:
                     yield exchange.take(*waiting.popleft())
             exchange.finish()
         except TimeLimitReached:
-            yield from _answered(exchange, waiting)
+            yield from _remaining(exchange, waiting)
             raise
-        yield from _answered(exchange, waiting)
+        yield from _remaining(exchange, waiting)
 
     def _running(self) -> Exchange:
         """:raises ValueError: there is no run."""
@@ -385,8 +393,8 @@ class Dut:
         return self._exchange
 
 
-def _answered(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
-    """Answers to stretches (samples, end), the last one in part if not all of its samples were answered."""
+def _remaining(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
+    """Answers to the waiting stretches (samples, end); the last may be answered in part."""
     for n, end in waiting:
         answered = min(n, exchange.ready)
         yield exchange.take(answered, end - n + answered)
@@ -417,14 +425,14 @@ def reopen_dut(
     listener: CanListener | None = None,
     **changes: Any,
 ) -> Dut:
-    """A device as in a record of ``Dut.description()`` that ``file`` holds; parameters and errors as ``open_dut``."""
+    """Open the device of a record of ``Dut.description()`` in ``file``; parameters and errors as ``open_dut``."""
     described = recorded(description).placed(Path(file).parent)
     Trust.of(allow).check(described.things, file)
     return connect(_changed(described, changes), listener)
 
 
 def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
-    """:raises ConfigurationError: a value is out of range, or such a device has none."""
+    """:raises ConfigurationError: a value is out of range, or this kind of device has no such field."""
     wanted = {key: value for key, value in changes.items() if value is not None}
     for key in wanted.keys() - {each.name for each in dataclasses.fields(description)}:
         raise ConfigurationError(f"device {description.name}: a device of the kind {description.kind} has no {key}")
@@ -435,7 +443,7 @@ def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> Devi
 
 
 def connect(description: DeviceDescription, listener: CanListener | None = None) -> Dut:
-    """Reach the device, shake hands, configure it; errors as ``open_dut``."""
+    """Open, identify and configure a device; errors as ``open_dut``."""
     link = description.open()
     if listener is not None:
         link.listen(listener)
@@ -460,10 +468,10 @@ def _handshake(dut: Dut, description: DeviceDescription) -> None:
 
 
 def _float32(value: float) -> float:
-    """The nearest number that the device can hold."""
+    """Nearest number in single precision, as the device holds it."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 def _word(kind: type[enum.IntEnum], value: int) -> str:
-    """The name of a value, or its number if it has none."""
+    """Name of a value, or its number if it has no name."""
     return kind(value).name if value in kind.__members__.values() else f"number {value}"

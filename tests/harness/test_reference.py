@@ -1,4 +1,4 @@
-"""The C estimator against its twin in plain Python: two texts of one algorithm, in float32 and in float64."""
+"""The C estimator against its reference in plain Python: two texts of one algorithm, in float32 and in float64."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.devices.estimator import Estimator, StepStatus
-from analogrig.devices.reference import Twin
+from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.devices.reference import ReferenceEstimator
 from analogrig.errors import ConfigurationError
-from analogrig.protocol.estimator_config import EstimatorConfig
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900
@@ -50,7 +50,7 @@ CASES: dict[str, EstimatorConfig] = {
 
 
 class Followed(NamedTuple):
-    """What the twin makes of a record."""
+    """Output of the reference for a record."""
 
     theta: NDArray[np.float64]
     """(n, p) after each sample."""
@@ -63,13 +63,13 @@ class Followed(NamedTuple):
 def followed(
     config: EstimatorConfig, u: NDArray[np.float64], y: NDArray[np.float64], valid: NDArray[np.bool_]
 ) -> Followed:
-    twin, theta, steps = Twin(config), [], []
+    reference, theta, steps = ReferenceEstimator(config), [], []
     for force, displacement, good in zip(u.tolist(), y.tolist(), valid.tolist(), strict=True):
-        steps.append(twin.step(force, displacement, valid=good))
-        theta.append(list(twin.theta))
+        steps.append(reference.step(force, displacement, valid=good))
+        theta.append(list(reference.theta))
     alarms = [k for k, step in enumerate(steps) if step.alarm]
     innovation = np.array([step.innovation for step in steps])
-    return Followed(np.array(theta), innovation, alarms, twin.slips, twin.refreshes)
+    return Followed(np.array(theta), innovation, alarms, reference.slips, reference.refreshes)
 
 
 @pytest.mark.parametrize("missing", [[], [100, 314, 315, 700]], ids=["whole", "gaps"])
@@ -79,16 +79,16 @@ def test_estimator_and_twin_agree(case: str, drift: float, missing: list[int]) -
     u, y = record(drift)
     valid = np.ones(N, bool)
     valid[missing] = False
-    estimator, twin = Estimator(CASES[case]), followed(CASES[case], u, y, valid)
+    estimator, reference = Estimator(CASES[case]), followed(CASES[case], u, y, valid)
     steps = estimator.run(u, y, valid)
-    assert steps.alarms.tolist() == twin.alarms
-    scale = np.maximum(np.abs(twin.theta).max(axis=0), 1e-3)
+    assert steps.alarms.tolist() == reference.alarms
+    scale = np.maximum(np.abs(reference.theta).max(axis=0), 1e-3)
     after_n = 60  # the first equations determine little, and float32 less
     settled = np.array([all(k - a > after_n for a in (0, *steps.alarms) if a <= k) for k in range(N)])
     assert settled.sum() > 200
-    assert np.abs((steps.theta - twin.theta) / scale)[settled].max() < 0.015
-    assert np.sqrt(np.mean((steps.innovation - twin.innovation)[settled] ** 2)) < 0.15
-    assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (twin.slips, twin.refreshes)
+    assert np.abs((steps.theta - reference.theta) / scale)[settled].max() < 0.015
+    assert np.sqrt(np.mean((steps.innovation - reference.innovation)[settled] ** 2)) < 0.15
+    assert (estimator.counters["slips"], estimator.counters["refreshes"]) == (reference.slips, reference.refreshes)
 
 
 def test_cases_show_what_they_are_for() -> None:

@@ -1,0 +1,61 @@
+"""Devices of the kind ``host``: a process on this machine behind a pseudo-terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from analogrig import device_program
+from analogrig.devices.child import Child, ChildWire
+from analogrig.devices.description import EitherDevice
+from analogrig.errors import LinkError
+from analogrig.links.wire import PortWire
+
+if TYPE_CHECKING:
+    from analogrig.links.can_bus import CanBus
+
+HOST_PROGRAM = device_program.PROGRAM
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostDevice(EitherDevice):
+    """The device as a process on this machine, behind a pseudo-terminal."""
+
+    kind: ClassVar[str] = "host"
+    usage: ClassVar[str] = "host[?link=slcan]"
+    summary: ClassVar[str] = "device as a process of this computer, on a pseudo-terminal"
+
+    @property
+    def program(self) -> Path:
+        return HOST_PROGRAM
+
+    def wire(self) -> ChildWire:
+        return host_wire()
+
+    def bus(self) -> CanBus:
+        from analogrig.devices.can_nodes import ChildBus
+        from analogrig.links.can_bus import PythonCanBus
+
+        child = host_child(["--slcan"])
+        return child.connect(lambda port: ChildBus(child, PythonCanBus(self.slcan(port), name="slcan")))
+
+
+def host_child(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Child:
+    """New process of the host port. Its first line of output names the terminal or bus it serves.
+
+    :raises LinkError: it cannot be started.
+    """
+    if not program.is_file():
+        raise LinkError(f"{program} is absent: run `make setup`")
+    return Child([program, *arguments], "the device process")
+
+
+def host_wire(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> ChildWire:
+    """Wire to a new process of the host port.
+
+    :raises LinkError: it cannot be started, or does not print its terminal.
+    """
+    child = host_child(arguments, program)
+    return child.connect(lambda port: ChildWire(child, PortWire(port, name="pty")))

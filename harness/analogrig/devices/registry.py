@@ -1,0 +1,100 @@
+"""Devices by name: kinds, shipped descriptions, files, and tables of plain values."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from analogrig import config
+from analogrig.devices.can import CanDevice
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.host import HostDevice
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.qemu import QemuM3, QemuM4, QemuM7
+from analogrig.devices.serial import SerialDevice
+from analogrig.errors import ConfigurationError
+from analogrig.trust import Thing, Trust, file_of, folder_of
+
+_ELF = b"\x7fELF"
+"""First bytes of libraries, programs and firmware."""
+
+KINDS: Mapping[str, type[DeviceDescription]] = {
+    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice, CanDevice)
+}
+
+
+def describe(name: str) -> DeviceDescription:
+    """Description of the device ``name``: a shipped description, a .toml file, or a kind with its parameters.
+
+    To read only. A device to be opened comes from ``trusted``, which checks what a file names.
+
+    :raises ConfigurationError: there is no such device, or its description is wrong.
+    """
+    return _read(name)[0]
+
+
+def trusted(name: str, trust: Trust) -> DeviceDescription:
+    """Description of the device ``name``, to be opened.
+
+    :raises ConfigurationError: as ``describe``, or a file names a thing that is not trusted.
+    """
+    description, file = _read(name)
+    trust.check(description.things, file or file_of(name))
+    return description
+
+
+def named_things(name: str) -> tuple[Thing, ...]:
+    """Things that ``name`` itself states, not a file that it refers to; none if it is no device."""
+    with contextlib.suppress(ConfigurationError):
+        description, file = _read(name)
+        return () if file else description.things
+    return ()
+
+
+def _read(name: str) -> tuple[DeviceDescription, str]:
+    """The description, and the file that holds it; no file if the name states everything."""
+    kind = re.split("[:?]", name, maxsplit=1)[0]
+    if kind in KINDS and name not in config.names("devices"):
+        KINDS[kind].check_place(name, name[len(kind) :].partition("?")[0])
+        return KINDS[kind].named(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
+    _check_not_compiled(name)
+    path = config.locate("devices", name)
+    return from_table({"name": path.stem, **config.read_toml(path)}, str(path)).placed(path.parent), str(path)
+
+
+def _check_not_compiled(name: str) -> None:
+    """:raises ConfigurationError: the file is a library, program or firmware, not a description."""
+    path = Path(name)
+    is_compiled = path.suffix == ".so"
+    with contextlib.suppress(OSError, ValueError):  # the reader of the description reports these
+        if path.is_file():
+            with path.open("rb") as file:
+                is_compiled = is_compiled or file.read(len(_ELF)) == _ELF
+    if is_compiled:
+        raise ConfigurationError(
+            f"{name}: is a compiled file, not a description of a device: use inproc:{name} for a library,"
+            f" qemu-m4:{name} for firmware"
+        )
+
+
+def recorded(description: Mapping[str, Any]) -> DeviceDescription:
+    """Description from the record of ``Dut.description()``.
+
+    :raises ConfigurationError: it describes no device.
+    """
+    return from_table({key: value for key, value in description.items() if key != "identity"}, "the recorded device")
+
+
+def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:
+    """Description from plain values; ``where`` begins every error message.
+
+    :raises ConfigurationError: they describe no device.
+    """
+    described = KINDS.get(str(table.get("kind")))
+    if described is None:
+        known = ", ".join(map(repr, KINDS))
+        raise ConfigurationError(f"{where}: kind: must be one of {known}, not {table.get('kind')!r}")
+    return config.build(described, {key: value for key, value in table.items() if key != "kind"}, where)
