@@ -22,9 +22,9 @@ from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.trial import play_chunk
+from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.protocol.catalogue import Change
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, number_named, number_of, one_line
 

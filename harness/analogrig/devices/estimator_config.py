@@ -45,7 +45,7 @@ MOST_CEILING = 1e9
 _VARIANCES, _CODES, _U16 = (1e-9, 1e9), (-1e6, 1e6), (0, 65535)
 _SWITCH = (0, 1)
 
-_IN_RANGE: Mapping[str, tuple[float, float]] = {
+_IN_RANGE: Mapping[str, tuple[int, int] | tuple[float, float]] = {
     "na": (1, MAX_NA),
     "nb": (1, MAX_PARAMETERS),
     "nk": (0, 255),
@@ -227,8 +227,8 @@ class EstimatorConfig:
 def _is_in_range(key: Key, value: float) -> bool:
     name = key.name.lower()
     low, high = _IN_RANGE.get(name, (-config.MOST_NUMBER, config.MOST_NUMBER))
-    is_whole = isinstance(high, float) or value.is_integer()
-    return low <= value <= high and is_whole
+    is_real = type(high) is float
+    return low <= value <= high and (is_real or value.is_integer())
 
 
 def _shortest(value: float) -> float:
