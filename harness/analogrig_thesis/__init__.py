@@ -1,4 +1,4 @@
-"""The experiments of the thesis, chapters 3 to 5, made again; ``analogrig thesis``.
+"""Reproduction of the thesis's experiments, chapters 3 to 5; ``analogrig thesis``.
 
 from analogrig_thesis import reproduce
 reproduction = reproduce()

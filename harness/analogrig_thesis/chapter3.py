@@ -1,210 +1,199 @@
-"""Chapter 3: the second-order example, Fig. 3.5 to 3.8."""
+"""Chapter 3: the second-order example of section 3.5, Fig. 3.5 to 3.8."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from analogrig.devices.estimator_config import EstimatorConfig
-from analogrig_thesis.document import Chapter, Claim, Curve, Erratum, Figure, Mark, Panel, Signal
-from analogrig_thesis.model import square
-from analogrig_thesis.schemes import FORGETTING, HOLD_N, PLAIN
-from analogrig_thesis.tracking import Track, track
+from analogrig.devices.reference import ReferenceEstimator
+from analogrig_thesis.document import Drawing, Facts, Mark, ReproducedChapter, Signal
+from analogrig_thesis.plants import square
+from analogrig_thesis.schemes import PLAIN, schemes
+from analogrig_thesis.tracking import Track, settling_n, track
 
 N = 800
 AMPLITUDE = 10.0
-CEILING = 0.3 * AMPLITUDE
-A1, A2 = 0.5, 0.8
 NOISE = 0.01 * AMPLITUDE
 SEED = 1995
+CHANGES = (200, 400)
+STRETCHES = ((199, 399), (399, N))
+"""Last sample of the old b0 to the last sample of the new one: b0(k) acts on y(k)."""
 
-NAMES = ("a1", "a2", "b0")
-INKS = ("first", "second", "third")
+BEGUN_N = 10
+"""Samples until the first estimates have settled."""
+
+SILENT = slice(200, 600)
+"""Samples without input, for the wind-up of P."""
+
+WALKS = (1.0, 1e-2, 1e-4, 1e-6, 1e-8, 0.0)
 
 PLAIN_3 = dataclasses.replace(PLAIN, nb=1)
-SCHEMES: Mapping[str, EstimatorConfig] = {
-    "rls": PLAIN_3,
-    "forgetting": dataclasses.replace(PLAIN_3, forgetting=FORGETTING),
-    "random-walk": dataclasses.replace(PLAIN_3, random_walk=1.0),
-    "prediction-error": dataclasses.replace(
-        PLAIN_3, trigger="prediction-error", ceiling=CEILING, reset="all", hold_off_n=HOLD_N, warm_up_n=10
-    ),
-}
+SCHEMES = schemes(PLAIN_3, 0.3 * AMPLITUDE, 0.3 * AMPLITUDE, BEGUN_N)
+del SCHEMES["mean-between-faults"]
 
 
-def truth(*, changing: bool) -> Signal:
-    """(N, 3) a1, a2, b0."""
-    out = np.tile((A1, A2, -0.9), (N, 1))
-    if changing:
-        out[200:400, 2] = -0.5
-    return out
+@dataclasses.dataclass(frozen=True, eq=False)
+class Example:
+    """System of section 3.5 and the estimates of each scheme."""
+
+    u: Signal
+    noise: Signal
+    steady: Signal
+    """(N, 3) a1, a2, b0 without a change."""
+    changing: Signal
+    """(N, 3) a1, a2, b0 with two changes of b0."""
+    first: Track
+    """Plain RLS without a change and without noise."""
+    clean: Mapping[str, Track]
+    """Tracks by scheme, while b0 changes, without noise."""
+    noisy: Mapping[str, Track]
+    """Tracks by scheme, while b0 changes, with noise of 1 % of the amplitude."""
 
 
-def follow(u: Signal, theta: Signal, noise: Signal | None = None) -> Signal:
-    """y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) [+ e(k)] (section 3.5), from rest."""
+def respond(u: Signal, theta: Signal, noise: Signal | None = None) -> Signal:
+    """Output y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) [+ e(k)] (n,) (section 3.5), from rest."""
     y, inputs = [0.0, 0.0], [0.0, *u.tolist()]
     for k, (a1, a2, b0) in enumerate(theta.tolist()):
         y.append(-a1 * y[-1] - a2 * y[-2] + b0 * inputs[k] + (0.0 if noise is None else float(noise[k])))
     return np.array(y[2:])
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Example:
-    """The system of section 3.5, and what each scheme makes of it."""
-
-    u: Signal
-    noise: Signal
-    steady: Signal
-    """(N, 3) the parameters if they do not change."""
-    changing: Signal
-    first: Track
-    """Plain RLS while nothing changes, without noise."""
-    clean: Mapping[str, Track]
-    """By scheme, while b0 changes; so ``noisy``."""
-    noisy: Mapping[str, Track]
-
-    @classmethod
-    def play(cls) -> Example:
-        """Deterministic."""
-        u = square(N, -AMPLITUDE, AMPLITUDE)
-        steady, changing = truth(changing=False), truth(changing=True)
-        noise = np.random.default_rng(SEED).normal(0.0, NOISE, N)
-        return cls(
-            u,
-            noise,
-            steady,
-            changing,
-            first=track(PLAIN_3, u, follow(u, steady)),
-            clean={key: track(config, u, follow(u, changing)) for key, config in SCHEMES.items()},
-            noisy={key: track(config, u, follow(u, changing, noise)) for key, config in SCHEMES.items()},
-        )
-
-
-def chapter(example: Example, claims: tuple[Claim, ...]) -> Chapter:
-    """All of it."""
-    return Chapter(
-        3,
-        "System identification and parameter estimation",
-        "The example of section 3.5, y(k) = −0.5 y(k−1) − 0.8 y(k−2) − 0.9 u(k−1), from rest and without noise. The"
-        f" text gives no amplitude and no rate: assumed are ±{AMPLITUDE:g}, 100 samples a second as in chapter 4, θ ="
-        " 0 and P = 10 I at the start. With ±1 that P is no longer vague, and the first convergence takes 62 samples"
-        " instead of 5.",
-        figures=_figures(example),
-        numbers=(),
-        errata=_ERRATA,
-        claims=claims,
+def play_example() -> Example:
+    """Simulate the system and run all schemes; deterministic."""
+    u = square(N, AMPLITUDE)
+    steady = np.tile((0.5, 0.8, -0.9), (N, 1))
+    changing = steady.copy()
+    changing[slice(*CHANGES), 2] = -0.5
+    noise = np.random.default_rng(SEED).normal(0.0, NOISE, N)
+    return Example(
+        u,
+        noise,
+        steady,
+        changing,
+        first=track(PLAIN_3, u, respond(u, steady)),
+        clean={key: track(config, u, respond(u, changing)) for key, config in SCHEMES.items()},
+        noisy={key: track(config, u, respond(u, changing, noise)) for key, config in SCHEMES.items()},
     )
 
 
-def recorded() -> dict[str, Signal]:
-    """The data, by figure."""
-    u = square(N, -AMPLITUDE, AMPLITUDE)
-    steady, changing = follow(u, truth(changing=False)), follow(u, truth(changing=True))
-    return {"fig-3.5-u": u, "fig-3.5-y": steady, "fig-3.6-u": u, "fig-3.6-y": changing}
+def simulated_data(example: Example) -> dict[str, Signal]:
+    """Input and output by figure."""
+    steady, changing = respond(example.u, example.steady), respond(example.u, example.changing)
+    return {"fig-3.5-u": example.u, "fig-3.5-y": steady, "fig-3.6-u": example.u, "fig-3.6-y": changing}
 
 
-_ERRATA = (
-    Erratum(
-        "Equ. 3.23b, d",
-        "ε(k+1) = y(k) − …, and φ(k) in the denominator of P(k+1)",
-        "y(k+1) and φ(k+1)",
-        "With R = 0 the filter must reduce to Equ. 3.19 and 3.20, as section 3.7.2 says. Those have y(k+1) in the"
-        " prediction error and φ(k+1) on both sides of the quadratic form 1 + φᵀ(k+1) P(k) φ(k+1).",
-    ),
-    Erratum(
-        "Equ. 3.23c",
-        "K(k+1) = P(k+1) φ(k+1) = P(k) φ(k+1) / (1 + φᵀ P(k) φ)",
-        "the first equality holds for R = 0 only",
-        "Equ. 3.23d gives P(k+1) φ = P(k) φ (1 − φᵀPφ / (1 + φᵀPφ)) + R φ = P(k) φ / (1 + φᵀPφ) + R φ: the two"
-        " sides differ by R φ(k+1).",
-    ),
-    Erratum(
-        "Equ. 3.26, 3.28",
-        "E(w(k)) = R",
-        "E(w(k) wᵀ(k)) = R, with E(w(k)) = 0",
-        "The mean of a vector is a vector, and R is added to the matrix P in Equ. 3.23d: it is the covariance.",
-    ),
-    Erratum(
-        "Section 3.6, the changing b0",
-        "b0 = −0.9 for k < 200, −0.5 for 200 < k < 400",
-        "−0.5 for 200 ≤ k < 400",
-        "At k = 200 and k = 400 b0 is undefined as printed; assumed here is that the new value begins there.",
-    ),
-    Erratum(
-        "Numbers of equations",
-        "the measurement y(k) = H x(k) + v(k) is Equ. 3.24b; two equations are 3.23a, two 3.24b",
-        "3.23b, or numbers of their own",
-        "The state equation before it is 3.23a, and so is the first line of the filter. Equ. 3.24b is, further down,"
-        " y(k) = φᵀ(k) x(k) + e(k) as well.",
-    ),
-    Erratum(
-        "Equ. A.2.3",
-        "φᵀ(t+1)φ(t+1) = [φᵀ(t) φ(t+1)][φ(t) φᵀ(t+1)], a product",
-        "φᵀ(t)φ(t) + φ(t+1)φᵀ(t+1), a sum",
-        "One more measurement adds a row φᵀ(t+1) to the matrix φ(t): stacked, the product of the two block matrices"
-        " is the sum. Equ. A.2.9, the inverse of P, has it right.",
-    ),
-    Erratum(
-        "Sections 3.7 and 4.4.3",
-        "the text between “…random walk modifications to the” and “It is visible from Fig. 3.8”, and between"
-        " “…when the system changes the mean” and “between detectable faults to 0.04s”",
-        "a page is lacking in each place of the text that was handed down",
-        "They would have named the ceiling and the reset of Fig. 3.8, and the exact mean of Fig. 4.9. What is"
-        " assumed in their place stands with those figures.",
-    ),
-)
+def reproduce_chapter(example: Example) -> ReproducedChapter:
+    """Figures, errata and claims of chapter 3."""
+    clean, noisy = _qualities(example.clean, example.changing), _qualities(example.noisy, example.changing)
+    times = noisy["spread"]["random-walk"] / noisy["spread"]["forgetting"]
+    facts = {"clean": clean, "noisy": noisy, "random_walk_over_forgetting": times}
+    return ReproducedChapter.load(3, facts, _drawings(example), _measure(example, clean, noisy))
 
 
-def _figures(example: Example) -> tuple[Figure, ...]:
-    u, steady, changing, clean = example.u, example.steady, example.changing, example.clean
+def _qualities(tracks: Mapping[str, Track], known: Signal) -> dict[str, dict[str, Any]]:
+    """Spread and convergence by scheme."""
+    return {
+        "spread": {key: _spread(each, known) for key, each in tracks.items()},
+        "reconverged_n": {key: _reconverged(each, known) for key, each in tracks.items()},
+    }
+
+
+def _reconverged(each: Track, known: Signal) -> list[int | None]:
+    error = each.theta / known - 1.0
+    return [settling_n(error[start + 1 : end]) for start, end in STRETCHES]
+
+
+def _spread(each: Track, known: Signal) -> float:
+    """Largest standard deviation of a parameter over its truth, in the last half of the first stretch."""
+    return float((each.theta[100:200] / known[100:200]).std(axis=0).max())
+
+
+# Figures
+
+
+def _drawings(example: Example) -> dict[str, Drawing]:
     marks = (Mark(200.0, "change", "b0 −0.9 → −0.5"), Mark(400.0, "change", "b0 −0.5 → −0.9"))
-    shown = slice(0, 400)
-    data = Panel(
-        "(a) Identification data",
-        "u, y",
-        (Curve("input u", u[shown], "third", "step"), Curve("output y", follow(u, steady)[shown], "first")),
-    )
-    alarms = tuple(Mark(float(k), "alarm") for k in clean["prediction-error"].alarms)
-    return (
-        Figure(
-            "3.5",
-            "(a) Identification data, (b) Parameter estimates using R.L.S.",
-            (data, _estimates(example.first.theta[shown], steady[shown], "(b) Parameter estimates")),
-            "The first 400 samples. The system is deterministic, and four equations determine three parameters.",
-        ),
-        Figure(
-            "3.6",
-            "Tracking of the system parameters using the forgetting factor algorithm.",
-            (_estimates(clean["forgetting"].theta, changing, f"λ = {FORGETTING:g}"),),
-            "Between two edges of the input nothing new is learned: the estimate comes nearer in steps, an edge at a"
-            " time.",
-            marks,
-        ),
-        Figure(
-            "3.7",
-            "Tracking the system parameters using the Kalman filter.",
-            (_estimates(clean["random-walk"].theta, changing, "R = identity matrix"),),
-            "Without noise the filter follows at once and does not scatter; the scatter of which the thesis speaks"
-            " comes with noise: see the claims below.",
-            marks,
-        ),
-        Figure(
-            "3.8",
-            "Estimation using simple fault detection.",
-            (_estimates(clean["prediction-error"].theta, changing, "reset by the prediction error"),),
-            "The page that describes the scheme is lost. Assumed: an alarm when the prediction error exceeds 0.3"
-            f" amplitudes, then θ = 0 and P = 10 I as in section 4.4.2, and {HOLD_N} samples without a second alarm,"
-            " while the new estimate is worked out.",
-            (*marks, *alarms),
-        ),
-    )
+    alarms = tuple(Mark(float(k), "alarm") for k in example.clean["prediction-error"].alarms)
+    half = slice(0, N // 2)
+    data = [example.u[half], respond(example.u, example.steady)[half]]
+    drawings = {"3.5": Drawing([data, [*example.steady[half].T, *example.first.theta[half].T]])}
+    for number, key in (("3.6", "forgetting"), ("3.7", "random-walk"), ("3.8", "prediction-error")):
+        both = (*marks, *alarms) if number == "3.8" else marks
+        drawings[number] = Drawing([[*example.changing.T, *example.clean[key].theta.T]], both)
+    return drawings
 
 
-def _estimates(theta: Signal, known: Signal, title: str) -> Panel:
-    curves = [Curve(f"{name} true", known[:, i], "truth", "step") for i, name in enumerate(NAMES)]
-    inks = dict(zip(NAMES, INKS, strict=True))
-    for i, name in enumerate(NAMES):
-        curves.append(Curve(name, theta[:, i], inks[name]))  # type: ignore[arg-type]  # mypy widens the literals
-    return Panel(title, "parameters", tuple(curves), shown=(-1.5, 1.5))
+# Claims
+
+
+def _measure(example: Example, clean: Facts, noisy: Facts) -> dict[str, Facts]:
+    """Values behind each claim, by identifier."""
+    late_error = example.clean["rls"].theta[399] / example.changing[399] - 1.0
+    varied, steady = (each.theta[BEGUN_N:, :2].var(axis=0) for each in (example.clean["forgetting"], example.first))
+    eager_config = dataclasses.replace(SCHEMES["prediction-error"], hold_off_n=0)
+    return {
+        "3.5-converges": {
+            "within_1_percent_after_n": settling_n(example.first.theta / example.steady - 1.0, 0.01),
+            "spread": _spread(example.first, example.steady),
+        },
+        "3.5-slow": {
+            "largest_error_200_samples_after": float(np.abs(late_error).max()),
+            "reconverged_n": clean["reconverged_n"]["rls"],
+        },
+        "3.6-sluggish": {"reconverged_n": clean["reconverged_n"]["forgetting"]},
+        "3.6-variance": {
+            "variances_of_a1_a2": varied.tolist(),
+            "variances_of_a1_a2_in_fig_3.5": steady.tolist(),
+            "spread_without_noise": clean["spread"],
+            "spread_with_noise": noisy["spread"],
+        },
+        "3.6-wind-up": _wind_up(example),
+        "3.7-quicker": {"reconverged_n": {key: clean["reconverged_n"][key] for key in ("random-walk", "forgetting")}},
+        "3.7-variance": {
+            "spread_without_noise": clean["spread"]["random-walk"],
+            "spread_with_noise": noisy["spread"]["random-walk"],
+        },
+        "3.7-equivalent": {"largest_difference_by_r": _differences_from_plain(example)},
+        "3.8-better": {
+            "reconverged_n": clean["reconverged_n"]["prediction-error"],
+            "spread_with_noise": noisy["spread"]["prediction-error"],
+            "alarms": len(example.clean["prediction-error"].alarms),
+            "alarms_without_hold_off": len(track(eager_config, example.u, respond(example.u, example.changing)).alarms),
+        },
+    }
+
+
+def _wind_up(example: Example) -> Facts:
+    u, config = example.u.copy(), SCHEMES["forgetting"]
+    u[SILENT] = 0.0
+    errors = track(config, u, respond(u, example.steady, example.noise)).theta / example.steady - 1.0
+    p = _diagonals(config, u, respond(u, example.steady))
+    late = errors[300:600]
+    return {
+        "growth_of_p_in_100": float(p[380, 0] / p[280, 0]),
+        "spread_before": float(errors[100:200].std(axis=0).max()),
+        "spread_in_silence": float(late.std(axis=0).max()),
+        "bias_in_silence": float(np.abs(late.mean(axis=0)).max()),
+    }
+
+
+def _diagonals(config: EstimatorConfig, u: Signal, y: Signal) -> Signal:
+    """Diagonal of P (N, 3), which only the estimator in Python exposes."""
+    estimator, out = ReferenceEstimator(config), []
+    for pair in zip(u.tolist(), y.tolist(), strict=True):
+        estimator.step(*pair)
+        upper = np.array(estimator.covariance.u)
+        out.append((upper**2 * estimator.covariance.d).sum(axis=1) / estimator.covariance.weight)
+    return np.array(out)
+
+
+def _differences_from_plain(example: Example) -> dict[str, float]:
+    """Largest difference of an estimate from plain RLS, by r in R = r I."""
+    y = respond(example.u, example.steady, example.noise)
+    plain = track(PLAIN_3, example.u, y).theta
+    walks = {f"{walk:g}": track(dataclasses.replace(PLAIN_3, random_walk=walk), example.u, y).theta for walk in WALKS}
+    return {key: float(np.abs(theta - plain).max()) for key, theta in walks.items()}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from analogrig.devices.estimator_config import EstimatorConfig
-from analogrig.run import Run
-from analogrig_thesis.chapter4 import CHANGE_LABELS, UNITS_PER_M, WARM_UP_N, zeta
-from analogrig_thesis.circuit import (
+from analogrig.plant import AT_REST, Plant, SampledPlant
+from analogrig.run import Run, Segment
+from analogrig_thesis.circuit_runs import (
     BATCH,
     COMPARISON,
     CUTOFFS_HZ,
@@ -19,235 +20,145 @@ from analogrig_thesis.circuit import (
     LIVE,
     MEAN_CEILING,
     NOISY,
-    QUANTISED,
     SEED,
     SKEWED,
-    TRACKING,
-    Recording,
-    conditioned,
-    conditioned_tracks,
-    play,
-    record,
-    run_codes,
-    track_codes,
+    CircuitRuns,
+    ScaledSamples,
+    TrackedRun,
+    filter_off_line,
+    filtered_schemes,
 )
-from analogrig_thesis.document import Chapter, Claim, Curve, Erratum, Figure, Mark, Number, Panel, Signal
-from analogrig_thesis.model import FRONT, SHOCK, Arx, time_varying
-from analogrig_thesis.schemes import PLAIN, schemes
-from analogrig_thesis.tracking import Track, marks, performance, track
+from analogrig_thesis.document import Drawing, Facts, ReproducedChapter, Signal
+from analogrig_thesis.plants import FRONT, PERIOD_S, PROFILE, SHOCK, Arx, damping_ratio, square, time_varying
+from analogrig_thesis.schemes import PLAIN, UNITS_PER_M, WARM_UP_N, schemes
+from analogrig_thesis.tracking import Track, assess, marks, reconverged, track
 
 PRINTED_5_4 = Arx(-1.5628, 0.0766, 0.1817e-5, 0.0766e-5)
-
-RECORDED = ("fig-5.4", "fig-5.5", "fig-5.7-quantised", "fig-5.7")
-"""Names of the recordings."""
 
 FIRST_N = 1000
 """Section 5.4: "The first 1000 samples of this data were used"."""
 
+WARM_N = 100
+"""Samples left out of the prediction error."""
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Circuit:
-    """Everything that was played."""
+SEEDS = range(20)
 
-    comparison: Run
-    identification: Run
-    quantised: Recording
-    noisy: Recording
+EARLY = 0.2
+"""Lead of the force, in samples: 10 us at 20 kHz."""
 
-    @property
-    def model(self) -> Model:
-        """What batch least squares makes of the first samples."""
-        return Model.of(self.identification)
+CEILINGS_LSB = np.geomspace(0.1, 100.0, 61)
 
-    @property
-    def recordings(self) -> dict[str, Run]:
-        """By the names of their files."""
-        runs = (self.comparison, self.identification, self.quantised.run, self.noisy.run)
-        return dict(zip(RECORDED, runs, strict=True))
+TRIGGERS = {
+    "prediction error": ("prediction-error", False),
+    "signed mean": ("mean-between-faults", False),
+    "mean of magnitudes": ("mean-between-faults", True),
+}
+"""Key of the scheme, and True for magnitudes, by name of the trigger."""
 
-
-def play_circuit() -> Circuit:
-    """Over the link, through the C estimator in a process of its own; deterministic.
-
-    :raises DeviceError, LinkError, RigError: a run failed.
-    """
-    return Circuit(
-        play(NOISY, COMPARISON, LIVE),
-        play(SKEWED, IDENTIFICATION, BATCH),
-        record(QUANTISED, TRACKING),
-        record(NOISY, TRACKING),
-    )
+Sweep = list[tuple[int, int]]
+"""Missed changes and extra alarms at each of CEILINGS_LSB."""
+Sweeps = Mapping[str, Mapping[str, Sweep]]
+"""Sweeps by data and name of the trigger."""
 
 
-def chapter(circuit: Circuit, claims: tuple[Claim, ...]) -> Chapter:
-    """All of it."""
-    model = circuit.model
-    return Chapter(
-        5,
-        "System implementation",
-        "The circuit is the emulated analogue computer, 200 times as fast as the suspension: TL07x amplifiers with"
-        " offsets within ±3 mV, a card of 12 bits at 20 kHz with 1 LSB of noise, which is 2.44 mV or 49 µm (rig"
-        f" <code>{NOISY}</code>, seed {SEED}); <code>{QUANTISED}</code> has ideal amplifiers and no noise but that of"
-        " the 12 bits. Every estimate was made by the C device in a process of its own, over a serial line, from"
-        " codes. Codes have a zero of their own, so an offset d is estimated along with θ; it takes the place of the"
-        " detrending of section 4.3, which nobody can do while the data still come.",
-        figures=(*_circuit_figures(circuit, model), *_tracking_figures(circuit.noisy, circuit.quantised)),
-        numbers=_numbers(circuit.identification, model),
-        errata=_errata(model),
-        claims=claims,
-    )
+def batch_theta(run: Run) -> Signal:
+    """Batch estimate a1, a2, b0, b1, d (5,) of the device after the first 1000 samples, in codes."""
+    return np.asarray(run.theta[FIRST_N - 1], np.float64)
 
 
-# Identification
+def identify(run: Run) -> Arx:
+    """Batch estimate of the first 1000 samples in newtons and metres."""
+    return Arx.scaled(batch_theta(run), ScaledSamples.of_run(run).b_scale)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Model:
-    """The batch estimate of a recording, in newtons and metres."""
-
-    arx: Arx
-    offset: float
-    """In codes."""
-    theta: Signal
-    """(5,) in codes"""
-
-    @classmethod
-    def of(cls, run: Run, n: int = FIRST_N) -> Model:
-        theta = run.theta[n - 1].astype(np.float64)
-        return cls.of_theta(theta, run.conditions.channels["force"].lsb, run.conditions.channels["displacement"].lsb)
-
-    @classmethod
-    def of_theta(cls, theta: Signal, n_per_code: float, m_per_code: float) -> Model:
-        a1, a2, b0, b1, d = (float(x) for x in theta)
-        return cls(Arx(a1, a2, b0 * m_per_code / n_per_code, b1 * m_per_code / n_per_code), d, theta)
-
-    def simulated(self, u: Signal, y: Signal, first: int) -> Signal:
-        """The output from sample ``first`` on, from the two samples before it; codes."""
-        a1, a2, b0, b1, d = (float(x) for x in self.theta)
-        out = [float(y[first - 2]), float(y[first - 1])]
-        for k in range(first, len(u)):
-            out.append(-a1 * out[-1] - a2 * out[-2] + b0 * float(u[k - 1]) + b1 * float(u[k - 2]) + d)
-        return np.array(out[2:])
+def simulate_from(first: int, theta: Signal, codes: ScaledSamples) -> Signal:
+    """Output in codes from sample ``first`` on, begun with the two samples before it."""
+    (a1, a2, b0, b1, d), u = theta.tolist(), codes.u.tolist()
+    out = codes.y[first - 2 : first].tolist()
+    for k in range(first, len(u)):
+        out.append(-a1 * out[-1] - a2 * out[-2] + b0 * u[k - 1] + b1 * u[k - 2] + d)
+    return np.array(out[2:])
 
 
-def _numbers(run: Run, model: Model) -> tuple[Number, ...]:
-    notes = ("", "printed: a copy of b1", "", "")
-    names = ("a1", "a2", "b0", "b1")
-    ours = zip(names, PRINTED_5_4.values, model.arx.values, notes, strict=True)
-    period_s = 1.0 / run.conditions.sample_period_s
-    return (
-        *(Number("Equ. 5.4", name, printed, value, note=note) for name, printed, value, note in ours),
-        Number("Section 5.3", "sampling at the circuit", 20000.0, period_s, "Hz"),
-        Number("Section 5.3", "sampling at the suspension", 100.0, 1.0 / run.conditions.sample_period_problem_s, "Hz"),
-        Number("Section 5.3", "time scale", 200.0, run.conditions.time_scale),
-    )
-
-
-def _errata(model: Model) -> tuple[Erratum, ...]:
-    poles = ", ".join(f"{pole.real:.2f}" for pole in PRINTED_5_4.poles)
-    a2 = (PRINTED_5_4.b0 + PRINTED_5_4.b1) * INFERRED.stiffness_n_per_m - 1.0 - PRINTED_5_4.a1
-    return (
-        Erratum(
-            "Equ. 5.4",
-            "a2 = 0.0766",
-            f"about {a2:.2f}; {model.arx.a2:.3f} here",
-            f"0.0766 is b1 once more. As printed the poles are {poles}: a simulation is a metre off after a dozen"
-            f" samples. If the static gain is 1/24500, a2 = (b0 + b1) · 24500 − 1 − a1 = {a2:.3f}.",
-        ),
-        Erratum(
-            "Section 5.3 against 5.4 and 5.5",
-            "“a 1 Hz square wave (ie. 200 Hz to the analogue)”; “a 100Hz. (1 Hz. on actual suspension system) square"
-            " wave”",
-            "100 Hz at the circuit is 0.5 Hz at the suspension",
-            "The circuit runs at 200 times the pace. Half a period has 50 samples at 200 Hz and 100 at 100 Hz;"
-            " played here is what each section prints for the circuit.",
-        ),
-        Erratum(
-            "Section 5.4",
-            "the data are scaled to be “consistent with data from the system simulation of section 4.2”",
-            "Equ. 5.4 is not the shock absorber of section 4.2",
-            f"That has a1 = {Arx.of(SHOCK).a1:.3f}; the front suspension of section 4.4.1 has {Arx.of(FRONT).a1:.3f};"
-            f" Equ. 5.4 has −1.5628. M = {INFERRED.mass_kg:g} kg, B = {INFERRED.damping_n_s_per_m:g} N s/m, K ="
-            f" {INFERRED.stiffness_n_per_m:g} N/m (ζ = {zeta(INFERRED):.2f}) comes near it: an inference, see the"
-            " claims.",
-        ),
-        Erratum(
-            "Sections 5.1, 5.2",
-            "two equations are Equ. 5.2",
-            "numbers of their own",
-            "i = C de/dt is one, M ẍ + B ẋ + K x = F the other.",
-        ),
-        Erratum(
-            "Section 5.6",
-            "“implemented in section 5.6”",
-            "section 5.5",
-            "5.6 is the section that says so; the algorithm is applied in 5.5.",
-        ),
-    )
-
-
-def _circuit_figures(circuit: Circuit, model: Model) -> tuple[Figure, ...]:
-    data = circuit.identification
-    return (_comparison_figure(circuit.comparison), _scaling_figure(data), _prediction_figure(data, model))
-
-
-def _comparison_figure(run: Run) -> Figure:
-    force, analogue, simulated = run.channel("force"), run.channel("displacement") * 1e3, simulated_mm(run)
-    both = (Curve("simulation", simulated, "truth"), Curve("analogue", analogue, "first", "dash"))
-    difference = Curve("analogue − simulation", analogue - simulated, "second")
-    return Figure(
-        "5.4",
-        "A comparison of the simulated system output and the electrical analogue output.",
-        (
-            Panel("Displacement", "x [mm]", both),
-            Panel("Difference", "difference [mm]", (difference,)),
-            Panel("Force", "F [N]", (Curve("force", force, "third", "step"),)),
-        ),
-        "The shock absorber of section 4.2, 200 Hz, 0 to 10 V; analogue: the emulated circuit through its card.",
-    )
-
-
-def _scaling_figure(data: Run) -> Figure:
-    volts = {
-        name: data.conditions.channels[name].volts(data.codes[:, i]) for i, name in enumerate(("force", "displacement"))
+def reproduce_chapter(circuit: CircuitRuns) -> ReproducedChapter:
+    """Figures, printed numbers, errata and claims of chapter 5."""
+    noisy, quantised = circuit.noisy, circuit.quantised
+    sweeps = {
+        "quantised": _sweep(quantised.codes, quantised.segments, LIVE, 1.0),
+        "noisy": _sweep(noisy.codes, noisy.segments, LIVE, 1.0),
+        "conditioned": _sweep(filter_off_line(noisy.run), noisy.segments, PLAIN, noisy.codes.m_per_unit * UNITS_PER_M),
     }
-    circuit = (Curve("input", volts["force"], "third", "step"), Curve("output", volts["displacement"], "first"))
-    displacement = Curve("displacement", data.channel("displacement") * 1e3, "second")
-    return Figure(
-        "5.5",
-        "(a) Circuit data, (b) scaled circuit/suspension data.",
-        (
-            Panel("(a) Circuit data", "volts", circuit),
-            Panel("(b) Force", "F [N]", (Curve("force", data.channel("force"), "third", "step"),)),
-            Panel("(b) Displacement", "x [mm]", (displacement,)),
+    measured = {**_measure_identification(circuit), **_measure_tracking(circuit, sweeps)}
+    return ReproducedChapter.load(5, _facts(circuit, sweeps, measured), _drawings(circuit, sweeps), measured)
+
+
+def _facts(circuit: CircuitRuns, sweeps: Sweeps, measured: Mapping[str, Facts]) -> dict[str, Any]:
+    """Values for the texts beside those behind the claims."""
+    conditions, estimate = circuit.identification.conditions, identify(circuit.identification)
+    unskewed, variances = Arx.of(INFERRED), measured["5.4-variance"]["variances"]
+    spread = measured["5.9-forgetting"]["spread_of_b_1e-6_m_per_N"]["noisy"]
+    return {
+        "estimate": estimate,
+        "shock": Arx.of(SHOCK),
+        "front": Arx.of(FRONT),
+        "rate_hz": 1.0 / conditions.sample_period_s,
+        "problem_rate_hz": 1.0 / conditions.sample_period_problem_s,
+        "time_scale": conditions.time_scale,
+        "printed_poles": PRINTED_5_4.poles,
+        "a2_from_gain": (PRINTED_5_4.b0 + PRINTED_5_4.b1) * INFERRED.stiffness_n_per_m - 1.0 - PRINTED_5_4.a1,
+        "inferred": INFERRED,
+        "inferred_zeta": damping_ratio(INFERRED),
+        "moved_by_skew": [estimate.b0 / unskewed.b0 - 1.0, estimate.b1 / unskewed.b1 - 1.0],
+        "moved_by_deviations": abs(estimate.b0 - unskewed.b0) * 1e5 / np.sqrt(variances[2]),
+        "ceiling_lsb": MEAN_CEILING / UNITS_PER_M / circuit.noisy.codes.m_per_unit,
+        "mean_alarms": len(circuit.noisy.tracks["mean-between-faults"].alarms),
+        "best": {data: {name: _best(each) for name, each in by_name.items()} for data, by_name in sweeps.items()},
+        "walk_over_forgetting": spread["random-walk"] / spread["forgetting"],
+    }
+
+
+def _rms(values: Signal) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+# Figures
+
+
+def _drawings(circuit: CircuitRuns, sweeps: Sweeps) -> dict[str, Drawing]:
+    noisy, quantised, run = circuit.noisy, circuit.quantised, circuit.noisy.run
+    ceiling, batch = MEAN_CEILING / UNITS_PER_M / noisy.codes.m_per_unit, batch_estimates(run)
+    estimates = {key: _estimate_panels(_in_si(each, noisy.codes.b_scale), batch) for key, each in noisy.tracks.items()}
+    mean, ours = noisy.tracks["mean-between-faults"], noisy.tracks["cusum"]
+    calm = quantised.tracks["mean-between-faults"]
+    calm_estimates = _estimate_panels(_in_si(calm, quantised.codes.b_scale), batch_estimates(quantised.run))
+    changes, alarms = (marks(mean, noisy.segments, with_alarms=each) for each in (False, True))
+    output_mm = run.channel("displacement") * 1e3
+    predicted_mm = output_mm - mean.innovation * noisy.codes.m_per_unit * 1e3
+    counts = [np.array(each, float).T for data in ("noisy", "conditioned") for each in sweeps[data].values()]
+    return {
+        "5.4": _comparison(circuit.comparison),
+        "5.5": _scaling(circuit.identification),
+        "5.6": _simulation_over_second_half(circuit.identification),
+        "5.7": Drawing([[run.channel("force")], [output_mm]], changes),
+        "5.8": Drawing(estimates["mean-between-faults"], alarms),
+        "5.8 A": Drawing([*calm_estimates, _statistic(calm, ceiling)], marks(calm, quantised.segments)),
+        "5.8 B": Drawing([*estimates["cusum"], _statistic(ours, float(np.log(1e5)))], marks(ours, noisy.segments)),
+        "5.8 C": Drawing(
+            [[each[row] for each in counts[first : first + 3]] for first in (0, 3) for row in (0, 1)], x=CEILINGS_LSB
         ),
-        "100 Hz, 0 to 10 V, 2000 samples. Which plant was on the computer the text does not say; this is the one"
-        f" inferred from Equ. 5.4, on the rig <code>{SKEWED}</code>.",
-    )
+        "5.8 D": _off_line(noisy, batch),
+        "5.9": Drawing([estimates[key][1] for key in ("forgetting", "random-walk")], changes),
+        "5.10": Drawing([_statistic(mean, ceiling), [output_mm, predicted_mm]], alarms),
+    }
 
 
-def _prediction_figure(data: Run, model: Model) -> Figure:
-    u, y, _, m_per_code = run_codes(data)
-    zero = data.conditions.channels["displacement"].zero
-    predicted = (model.simulated(u, y, FIRST_N) - zero) * m_per_code * 1e3
-    actual = (y[FIRST_N:] - zero) * m_per_code * 1e3
-    second = np.arange(FIRST_N, len(u), dtype=np.float64)
-    both = (Curve("circuit", actual, "truth"), Curve("simulation of G(z)", predicted, "first", "dash"))
-    difference = Curve("circuit − simulation", actual - predicted, "second")
-    return Figure(
-        "5.6",
-        "Prediction properties of the estimated analogous transfer function.",
-        (
-            Panel("Second 1000 samples", "x [mm]", both, second),
-            Panel("Difference", "difference [mm]", (difference,), second),
-        ),
-        "G(z) estimated from the first 1000 samples, simulated over the second 1000 from the force alone; only"
-        " its first two values are the circuit's.",
-    )
+def _comparison(run: Run) -> Drawing:
+    analogue, simulated = run.channel("displacement") * 1e3, _simulated_mm(run)
+    return Drawing([[simulated, analogue], [analogue - simulated], [run.channel("force")]])
 
 
-def simulated_mm(run: Run) -> Signal:
-    """The exact plant under the same nominal force."""
+def _simulated_mm(run: Run) -> Signal:
+    """Displacement of the exact plant under the same nominal force."""
     excitation = COMPARISON.excitation
     half_n = round(0.5 / (excitation.frequency_hz * run.conditions.sample_period_s))
     high = run.conditions.channels["force"].unit_per_v * excitation.high_v
@@ -255,258 +166,224 @@ def simulated_mm(run: Run) -> Signal:
     return time_varying(u, run.conditions.segments[:1]) * 1e3
 
 
-def rms(values: Signal) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def deviations(arx: Arx) -> dict[str, float]:
-    """Of the three coefficients of Equ 5.4 that can be read, relative."""
-    return {name: getattr(arx, name) / getattr(PRINTED_5_4, name) - 1.0 for name in ("a1", "b0", "b1")}
-
-
-# Tracking
-
-
-def _tracking_figures(recording: Recording, quantised: Recording) -> tuple[Figure, ...]:
-    batch = batch_estimates(recording.run)
-    m_per_code = recording.run.conditions.channels["displacement"].lsb
-    ceiling = MEAN_CEILING / UNITS_PER_M / m_per_code
-    return (
-        _data_figure(recording),
-        _estimates_figure(recording, batch, ceiling),
-        _quantised_figure(quantised, ceiling),
-        _default_figure(recording, batch),
-        _ceilings_figure(recording),
-        _conditioned_figure(recording, batch),
-        _others_figure(recording, batch),
-        _trigger_figure(recording, ceiling),
-    )
-
-
-def _changes_alone(recording: Recording) -> tuple[Mark, ...]:
-    """Where the plant changed, without anybody's alarms."""
-    track = recording.tracks["mean-between-faults"]
-    return marks(dataclasses.replace(track, alarms=track.alarms[:0]), recording.segments, CHANGE_LABELS)
-
-
-def _data_figure(recording: Recording) -> Figure:
-    run = recording.run
-    return Figure(
-        "5.7",
-        "Input/Output data from the time-varying electrical analogy.",
-        (
-            Panel("Input", "F [N]", (Curve("force", run.channel("force"), "third", "step"),)),
-            Panel("Output", "x [mm]", (Curve("displacement", run.channel("displacement") * 1e3, "first"),)),
-        ),
-        "100 Hz, 0 to 10 V. Which pots were turned when, the text does not say: assumed are the four changes of"
-        " section 4.4.1 at samples 200, 400, 600 and 800, each in the middle of a half period with the force on,"
-        " and an input whose level stays (see claim 4.9-level).",
-        _changes_alone(recording),
-    )
-
-
-def _estimates_figure(recording: Recording, batch: Signal, ceiling: float) -> Figure:
-    mean = recording.tracks["mean-between-faults"]
-    return Figure(
-        "5.8",
-        "Parameter estimates for the time-varying analogous system.",
-        _estimate_panels(mean, batch, recording.run),
-        f"Mean between faults with the printed ceiling of 500 units, {ceiling:.2f} LSB, off for the first 50"
-        " samples. Orange: the batch estimates of the stretches between the changes, as in the thesis. b1 is"
-        f" drawn 1e-6 lower, to make them distinguishable. At 1 LSB of noise the scheme raises {len(mean.alarms)}"
-        " alarms and never settles; Fig. 5.8 B shows our default on the same samples.",
-        marks(mean, recording.segments, CHANGE_LABELS),
-    )
-
-
-def _quantised_figure(quantised: Recording, ceiling: float) -> Figure:
-    calm = quantised.tracks["mean-between-faults"]
-    return Figure(
-        "5.8 A",
-        "The same without noise.",
-        (
-            *_estimate_panels(calm, batch_estimates(quantised.run), quantised.run),
-            _statistic("Triggering sequence [LSB]", calm.statistic, ceiling),
-        ),
-        "Ideal amplifiers and no noise but that of the 12 bits, the same scheme and ceiling.",
-        marks(calm, quantised.segments, CHANGE_LABELS),
-    )
-
-
-def _default_figure(recording: Recording, batch: Signal) -> Figure:
-    ours = recording.tracks["cusum"]
-    return Figure(
-        "5.8 B",
-        "The data of Fig. 5.8, our default trigger.",
-        (
-            *_estimate_panels(ours, batch, recording.run),
-            _statistic("Trigger: cumulative sum", ours.statistic, float(np.log(1e5))),
-        ),
-        "The device as it is shipped: three b's and an offset, of which those of u(k−1) and u(k−2) are drawn;"
-        " whitened equations; the ceiling is ln 100,000. After an alarm the b's, and with them M, B and K, are not"
-        " told apart before the next edge of the force, 50 samples after each change.",
-        marks(ours, recording.segments, CHANGE_LABELS),
-    )
-
-
-def _others_figure(recording: Recording, batch: Signal) -> Figure:
-    tracks, run = recording.tracks, recording.run
-    return Figure(
-        "5.9",
-        "Parameter estimates obtained using (a) forgetting factor, (b) Kalman filter.",
-        (
-            _b_panel("(a) λ = 0.97", tracks["forgetting"], batch, run),
-            _b_panel("(b) R = identity matrix", tracks["random-walk"], batch, run),
-        ),
-        "Only the b parameters, as in the thesis; b1 is drawn 1e-6 lower. What R = I means depends on the units of"
-        " u and y; here they are codes, as the device has them.",
-        _changes_alone(recording),
-    )
-
-
-def _trigger_figure(recording: Recording, ceiling: float) -> Figure:
-    run, mean = recording.run, recording.tracks["mean-between-faults"]
-    displacement = run.channel("displacement") * 1e3
-    predicted = displacement - mean.innovation * (run.conditions.channels["displacement"].lsb * 1e3)
-    return Figure(
-        "5.10",
-        "(a) The triggering sequence (b) Actual and predicted analogous system output.",
-        (
-            _statistic("(a) Triggering sequence [LSB]", mean.statistic, ceiling),
-            Panel(
-                "(b) Actual and predicted output",
-                "x [mm]",
-                (Curve("actual", displacement, "truth"), Curve("predicted", predicted, "first", "dash")),
-                shown=(-20.0, 190.0),
-            ),
-        ),
-        "Of the run of Fig. 5.8; predicted one sample ahead.",
-        marks(mean, recording.segments, CHANGE_LABELS),
-    )
-
-
-def _conditioned_figure(recording: Recording, batch: Signal) -> Figure:
-    run = recording.run
-    each = conditioned_tracks(run)["mean-of-magnitudes"]
+def _scaling(run: Run) -> Drawing:
     channels = run.conditions.channels
-    to_codes = channels["force"].lsb / (channels["displacement"].lsb * UNITS_PER_M)
-    in_codes = dataclasses.replace(each, theta=each.theta * [1.0, 1.0, to_codes, to_codes])
-    return Figure(
-        "5.8 D",
-        "The data of Fig. 5.8, filtered and detrended off line.",
-        (
-            *_estimate_panels(in_codes, batch, run),
-            _statistic("Triggering sequence: mean of magnitudes [0.1 µm]", each.statistic, MEAN_CEILING),
-        ),
-        "Conditioned as section 4.3 asks, which a live estimator cannot be: a Butterworth filter of order 2, assumed"
-        f" at {CUTOFFS_HZ[0]:g} Hz, on force and displacement, their means removed, no offset estimated, 0.1 µm. Of"
-        " the mean between faults the kinder reading, the mean of magnitudes, with the printed ceiling of 500 units.",
-        marks(each, recording.segments, CHANGE_LABELS),
+    volts = [channels[name].volts(run.codes[:, i]) for i, name in enumerate(("force", "displacement"))]
+    return Drawing([volts, [run.channel("force")], [run.channel("displacement") * 1e3]])
+
+
+def _simulation_over_second_half(run: Run) -> Drawing:
+    codes, zero = ScaledSamples.of_run(run), run.conditions.channels["displacement"].zero
+    predicted, actual = (
+        (each - zero) * codes.m_per_unit * 1e3
+        for each in (simulate_from(FIRST_N, batch_theta(run), codes), codes.y[FIRST_N:])
     )
+    samples = np.arange(FIRST_N, len(codes.u), dtype=np.float64)
+    return Drawing([[actual, predicted], [actual - predicted]], x=samples)
+
+
+def _off_line(tracked: TrackedRun, batch: Signal) -> Drawing:
+    each = filtered_schemes(tracked.run)["mean-of-magnitudes"]
+    panels = [*_estimate_panels(_in_si(each, 1.0 / UNITS_PER_M), batch), _statistic(each, MEAN_CEILING)]
+    return Drawing(panels, marks(each, tracked.segments))
+
+
+def _in_si(each: Track, b_scale: float) -> Signal:
+    """Estimates a1, a2, b0, b1 (n, 4), the b's times ``b_scale``, without a direct term."""
+    columns = [0, 1, 3, 4] if each.theta.shape[1] == 6 else [0, 1, 2, 3]
+    return np.asarray(each.theta[:, columns] * [1.0, 1.0, b_scale, b_scale])
+
+
+def _estimate_panels(estimates: Signal, batch: Signal) -> list[list[Signal]]:
+    """Batch estimates and estimates of the a's, and of the b's in 1e-6 m/N with b1 lowered by 1."""
+    known, found = (each * [1.0, 1.0, 1e6, 1e6] - [0.0, 0.0, 0.0, 1.0] for each in (batch, estimates))
+    return [[*known[:, columns].T, *found[:, columns].T] for columns in (slice(0, 2), slice(2, 4))]
+
+
+def _statistic(each: Track, ceiling: float) -> list[Signal]:
+    return [each.statistic, np.full(len(each.statistic), ceiling)]
 
 
 def batch_estimates(run: Run) -> Signal:
-    """(n, 4) a1, a2, b0, b1 [m/N]: the batch estimate of each stretch at all its samples."""
-    u, y, n_per_code, m_per_code = run_codes(run)
-    out = np.empty((run.samples, 4))
+    """Batch estimate a1, a2, b0, b1 (n, 4) [m/N] of the stretch that each sample belongs to."""
+    codes, out = ScaledSamples.of_run(run), np.empty((run.samples, 4))
     for start, end, _ in run.segments:
-        # The two samples before the first equation that has nothing but the new plant in it.
-        theta = track(BATCH, u[start + 1 : end], y[start + 1 : end]).theta[-1]
-        out[start:end] = Model.of_theta(theta, n_per_code, m_per_code).arx.values
+        # The first equation with nothing but the new plant in it begins two samples later.
+        theta = track(BATCH, codes.u[start + 1 : end], codes.y[start + 1 : end]).theta[-1]
+        out[start:end] = Arx.scaled(theta, codes.b_scale).values
     return out
 
 
-def b_of(each: Track, run: Run) -> Signal:
-    """(n, 2) b0, b1 in 1e-6 m/N: of the direct term, if there is one, nothing."""
-    channels = run.conditions.channels
-    columns = slice(3, 5) if each.theta.shape[1] == 6 else slice(2, 4)
-    return np.asarray(each.theta[:, columns] * channels["displacement"].lsb / channels["force"].lsb * 1e6)
+# Ceilings
 
 
-def _b_panel(title: str, each: Track, batch: Signal, run: Run) -> Panel:
-    b = b_of(each, run)
-    curves = (
-        Curve("b0 batch", batch[:, 2] * 1e6, "truth", "step"),
-        Curve("b1 batch − 1", batch[:, 3] * 1e6 - 1.0, "truth", "step"),
-        Curve("b0", b[:, 0], "first"),
-        Curve("b1 − 1", b[:, 1] - 1.0, "second"),
-    )
-    return Panel(title, "b [1e-6 m/N]", curves, shown=(-1.6, 2.2))
+def _sweep(
+    samples: ScaledSamples, segments: Sequence[Segment], plain: EstimatorConfig, unit: float
+) -> dict[str, Sweep]:
+    """Sweep of each trigger, by its name; ``unit`` is the least significant bit in units of the samples."""
+    out: dict[str, Sweep] = {}
+    for name, (key, absolute) in TRIGGERS.items():
+        configs = (schemes(plain, each * unit, each * unit, WARM_UP_N)[key] for each in CEILINGS_LSB.tolist())
+        tracks = (samples.track(dataclasses.replace(config, absolute=absolute)) for config in configs)
+        out[name] = [(each.missed, each.extra_alarms) for each in (assess(track, segments) for track in tracks)]
+    return out
 
 
-def _estimate_panels(each: Track, batch: Signal, run: Run) -> tuple[Panel, ...]:
-    a = (
-        Curve("a1 batch", batch[:, 0], "truth", "step"),
-        Curve("a2 batch", batch[:, 1], "truth", "step"),
-        Curve("a1", each.theta[:, 0], "first"),
-        Curve("a2", each.theta[:, 1], "second"),
-    )
-    return (
-        Panel("a parameters", "a", a, shown=(-2.2, 1.4)),
-        _b_panel("b parameters", each, batch, run),
-    )
+def _best(sweep: Sweep) -> dict[str, float]:
+    """Ceiling with the fewest missed changes, and among those with the fewest extra alarms."""
+    i = min(range(len(sweep)), key=lambda j: sweep[j])
+    return {"ceiling_lsb": float(CEILINGS_LSB[i]), "missed": sweep[i][0], "extra_alarms": sweep[i][1]}
 
 
-def _statistic(title: str, values: Signal, ceiling: float) -> Panel:
-    curves = (Curve("statistic", values, "first"), Curve("ceiling", np.full(len(values), ceiling), "truth", "dash"))
-    return Panel(title, "statistic", curves, shown=(0.0, 4.0 * ceiling))
+# Claims about the identification
 
 
-CEILINGS_LSB = np.geomspace(0.1, 100.0, 61)
+def _measure_identification(circuit: CircuitRuns) -> dict[str, Facts]:
+    """Values behind the claims of sections 5.3 and 5.4, by identifier."""
+    run, codes = circuit.comparison, ScaledSamples.of_run(circuit.identification)
+    rms_mm = _rms(run.channel("displacement") * 1e3 - _simulated_mm(run))
+    simulated = simulate_from(FIRST_N, batch_theta(circuit.identification), codes)
+    residual, span = _rms(codes.y[FIRST_N:] - simulated), float(np.ptp(codes.y))
+    force = (codes.u[:100] - codes.u.min()) * 2940.0 / float(np.ptp(codes.u))
+    return {
+        "5.3-parity": {
+            "difference_rms_mm": rms_mm,
+            "difference_rms_lsb": rms_mm / (run.conditions.channels["displacement"].lsb * 1e3),
+        },
+        "5.4-skew": _deviations_by_reading(circuit),
+        "5.4-variance": {"variances": _variances_of_batch(circuit), "printed_limit": 0.1},
+        "5.6-agreement": {
+            "rms_mm": residual * codes.m_per_unit * 1e3,
+            "of_span": residual / span,
+            "as_printed_1_m_after_n": int(np.flatnonzero(np.abs(PRINTED_5_4.response(force)) > 1.0)[0]),
+        },
+    }
 
 
-def ceiling_sweep(recording: Recording, key: str, *, absolute: bool = False) -> list[tuple[int, int]]:
-    """(missed, extra alarms) at each of CEILINGS_LSB, as the samples come."""
-    samples = run_codes(recording.run)
-    return [
-        _alarms(track_codes(_swept(LIVE, key, ceiling, absolute=absolute), samples), recording)
-        for ceiling in CEILINGS_LSB.tolist()
-    ]
+def _deviations_by_reading(circuit: CircuitRuns) -> Facts:
+    many = np.array([list(_deviations(_identify_on_card(SKEWED, INFERRED, seed)).values()) for seed in SEEDS])
+    return {
+        "deviations": _deviations(identify(circuit.identification)),
+        "seeds_within_3_percent": int((np.abs(many) <= 0.03).all(axis=1).sum()),
+        "seeds": len(SEEDS),
+        "mean_deviations": many.mean(axis=0).tolist(),
+        "deviations_with_an_early_edge": _deviations(_identify_with_early_edge()),
+        "deviations_of_other_readings": {
+            "the inferred plant without the skew": _deviations(_identify_on_card(NOISY, INFERRED, SEED)),
+            "shock absorber of section 4.2": _deviations(Arx.of(SHOCK)),
+            "front suspension of section 4.4.1": _deviations(Arx.of(FRONT)),
+            "the last plant of section 4.4.1 (M = 30)": _deviations(Arx.of(PROFILE[-1].plant)),
+        },
+    }
 
 
-def conditioned_sweep(recording: Recording, key: str, *, absolute: bool = False) -> list[tuple[int, int]]:
-    """As ``ceiling_sweep``, the data filtered and detrended off line as section 4.3 asks."""
-    u, y = conditioned(recording.run)
-    units = recording.run.conditions.channels["displacement"].lsb * UNITS_PER_M
-    return [
-        _alarms(track(_swept(PLAIN, key, ceiling * units, absolute=absolute), u, y, UNITS_PER_M), recording)
-        for ceiling in CEILINGS_LSB.tolist()
-    ]
+def _deviations(arx: Arx) -> dict[str, float]:
+    """Relative deviations from the three legible coefficients of Equ 5.4."""
+    return {name: getattr(arx, name) / getattr(PRINTED_5_4, name) - 1.0 for name in ("a1", "b0", "b1")}
 
 
-def _swept(plain: EstimatorConfig, key: str, ceiling: float, *, absolute: bool) -> EstimatorConfig:
-    config = {each.key: each for each in schemes(plain, ceiling, ceiling, WARM_UP_N)}[key].config
-    return dataclasses.replace(config, absolute=absolute)
+def _identify_on_card(rig: str, plant: Plant, seed: int) -> Arx:
+    """Batch estimate of the first 1000 samples, in this process."""
+    choice = dataclasses.replace(IDENTIFICATION.plant, **vars(plant))
+    scenario = dataclasses.replace(IDENTIFICATION, samples=FIRST_N, plant=choice)
+    codes = ScaledSamples.play(rig, scenario, seed)
+    return Arx.scaled(codes.track(BATCH).theta[-1], codes.b_scale)
 
 
-def _alarms(each: Track, recording: Recording) -> tuple[int, int]:
-    judged = performance(each, recording.segments)
-    return judged.missed, judged.extra_alarms
+def _identify_with_early_edge() -> Arx:
+    """Batch estimate if both channels are sampled at once and each edge of the force comes 10 us before."""
+    u, y, state = (square(FIRST_N, 1470.0, 200) + 1470.0), np.empty(FIRST_N), AT_REST
+    before, after = (SampledPlant.of(INFERRED, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
+    for k in range(FIRST_N):
+        state = after.next(before.next(state, float(u[k - 1]) if k else 0.0), float(u[k]))
+        y[k] = state[0]
+    y_per_m = 1e5
+    theta = np.linalg.lstsq(_equations(u, y * y_per_m), y[2:] * y_per_m, rcond=None)[0]
+    return Arx.scaled(theta, 1.0 / y_per_m)
 
 
-def _ceilings_figure(recording: Recording) -> Figure:
-    kinds = (
-        ("prediction error", "prediction-error", False),
-        ("mean between faults", "mean-between-faults", False),
-        ("mean of magnitudes", "mean-between-faults", True),
-    )
-    inks = ("first", "second", "third")
+def _equations(u: Signal, y: Signal) -> Signal:
+    """Regressors (n - 2, 5) of a1, a2, b0, b1, d."""
+    return np.stack([-y[1:-1], -y[:-2], u[1:-1], u[:-2], np.ones(len(u) - 2)], axis=1)
 
-    def panels(title: str, sweep: Callable[..., list[tuple[int, int]]]) -> Iterator[Panel]:
-        swept = {name: np.array(sweep(recording, key, absolute=absolute), float) for name, key, absolute in kinds}
-        for column, (what, of) in enumerate((("Changes missed", "of 4"), ("Extra alarms", "in 1000 samples"))):
-            curves = tuple(
-                Curve(name, each[:, column], ink)  # type: ignore[arg-type]
-                for (name, each), ink in zip(swept.items(), inks, strict=True)
-            )
-            yield Panel(f"{what}, {title}", of, curves, CEILINGS_LSB, "ceiling [LSB]", log_x=True)
 
-    filtered = f"filtered at {CUTOFFS_HZ[0]:g} Hz and detrended"
-    return Figure(
-        "5.8 C",
-        "Every ceiling on the same data.",
-        (*panels("as they come", ceiling_sweep), *panels(filtered, conditioned_sweep)),
-        "61 ceilings from 0.1 to 100 LSB on the samples of Fig. 5.7: low ones limit-cycle, since every reset of P"
-        " makes the next errors larger; high ones miss. A ceiling that serves would have both curves at zero. Below,"
-        " the same of data conditioned as section 4.3 asks, with the Butterworth filter of Fig. 5.8 D.",
-    )
+def _variances_of_batch(circuit: CircuitRuns) -> list[float]:
+    """Variances s^2 (Phi' Phi)^-1 of a1, a2, b0, b1, the last two in 1e-5 m/N."""
+    codes, theta = ScaledSamples.of_run(circuit.identification), batch_theta(circuit.identification)
+    phi = _equations(codes.u[:FIRST_N], codes.y[:FIRST_N])
+    residual = codes.y[2:FIRST_N] - phi @ theta
+    covariance = float(residual @ residual) / (len(residual) - phi.shape[1]) * np.linalg.inv(phi.T @ phi)
+    to_si = codes.b_scale * 1e5
+    variances: list[float] = (np.diag(covariance)[:4] * [1.0, 1.0, to_si**2, to_si**2]).tolist()
+    return variances
+
+
+# Claims about the tracking
+
+
+def _measure_tracking(circuit: CircuitRuns, sweeps: Sweeps) -> dict[str, Facts]:
+    """Values behind the claims of sections 5.5 and 5.6, by identifier."""
+    noisy, quantised = circuit.noisy, circuit.quantised
+    spread = {
+        name: {key: _b_spread(tracked, key) for key in tracked.tracks}
+        for name, tracked in (("noisy", noisy), ("quantised", quantised))
+    }
+    return {
+        "5.5-tracking": _alarms_and_convergence(circuit, sweeps),
+        "5.9-forgetting": {"spread_of_b_1e-6_m_per_N": spread},
+        "5.9-kalman": {
+            "reconverged_n": noisy.qualities["random-walk"].reconverged_n,
+            "spread_of_b_1e-6_m_per_N": spread["noisy"]["random-walk"],
+        },
+        "5.10-prediction": {"rms_lsb": {key: _rms(each.innovation[WARM_N:]) for key, each in noisy.tracks.items()}},
+        "5.10-spiking": {
+            "spikes": {key: each.spikes for key, each in noisy.qualities.items()},
+            "spikes_quantised": {key: each.spikes for key, each in quantised.qualities.items()},
+            "undefined": {key: each.undefined for key, each in noisy.qualities.items()},
+        },
+    }
+
+
+def _alarms_and_convergence(circuit: CircuitRuns, sweeps: Sweeps) -> Facts:
+    noisy, quantised = circuit.noisy, circuit.quantised
+    off_line = {
+        f"{hz:g} Hz": {
+            key: dataclasses.asdict(assess(each, noisy.segments))
+            for key, each in filtered_schemes(noisy.run, hz).items()
+        }
+        for hz in CUTOFFS_HZ
+    }
+    return {
+        "mean_between_faults": dataclasses.asdict(noisy.qualities["mean-between-faults"]),
+        "mean_between_faults_12_bits_without_noise": dataclasses.asdict(quantised.qualities["mean-between-faults"]),
+        "forgetting": dataclasses.asdict(noisy.qualities["forgetting"]),
+        "default": dataclasses.asdict(noisy.qualities["cusum"]),
+        "filtered_live_order_2_quantised_mean_0.2_lsb": _filtered(quantised, 2, "mean-between-faults", 0.2),
+        "filtered_live_order_4_noisy_prediction_error_2_lsb": _filtered(noisy, 4, "prediction-error", 2.0),
+        "filtered_and_detrended_off_line": off_line,
+        "theta_reconverged_n": {key: _theta_reconverged(noisy, key) for key in ("forgetting", "mean-between-faults")},
+        "best_ceilings": {
+            f"{data} {key} {'|e|' if absolute else 'e'}": _best(by_trigger[name])
+            for data, by_trigger in sweeps.items()
+            for name, (key, absolute) in TRIGGERS.items()
+        },
+    }
+
+
+def _filtered(tracked: TrackedRun, order: int, key: str, ceiling_lsb: float) -> dict[str, Any]:
+    """Quality of a scheme on data from a causal filter, as in a live estimator."""
+    config = schemes(LIVE, ceiling_lsb, ceiling_lsb, WARM_UP_N)[key]
+    return dataclasses.asdict(assess(tracked.codes.filtered(order).track(config), tracked.segments))
+
+
+def _theta_reconverged(tracked: TrackedRun, key: str) -> list[int | None]:
+    """Samples from each change until a1, a2, b0, b1 stay within 5 % of the batch estimates of the stretches."""
+    estimates = _in_si(tracked.tracks[key], tracked.codes.b_scale)
+    return reconverged(estimates / batch_estimates(tracked.run) - 1.0, tracked.segments)
+
+
+def _b_spread(tracked: TrackedRun, key: str) -> float:
+    """Pooled standard deviation of b0 and b1 in the second halves of the stretches, 1e-6 m/N."""
+    b = _in_si(tracked.tracks[key], tracked.codes.b_scale)[:, 2:] * 1e6
+    late = [b[(start + end) // 2 : end] for start, end, _ in tracked.run.segments]
+    return float(np.sqrt(np.mean([each.var(axis=0) for each in late])))

@@ -1,91 +1,81 @@
-"""What the page and ``claims.json`` are made of: figures, printed numbers, errata and claims. Data only."""
+"""Chapters of the page and of ``claims.json``: texts from TOML, numbers from the experiments."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+import string
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.config import build, read_toml
+
 Signal = NDArray[np.float64]
 """(n,)"""
 
-Ink = Literal["first", "second", "third", "truth"]
+Facts = Mapping[str, Any]
+"""Measured values by name."""
+
+T = TypeVar("T", "Chapter", "Figure", "Erratum", "Claim")
 
 Verdict = Literal["holds", "holds with a reading", "does not hold", "not reproduced"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Curve:
-    """One signal of a panel; NaN where there is nothing to draw."""
+    """Legend entry of a panel."""
 
     label: str
-    values: Signal
-    """(n,) as many as the panel's x."""
-    ink: Ink = "first"
+    ink: Literal["first", "second", "third", "truth"] = "first"
     style: Literal["line", "step", "dash"] = "line"
 
 
 @dataclass(frozen=True)
-class Mark:
-    """A vertical line in every panel of a figure."""
-
-    at: float
-    kind: Literal["change", "alarm", "false"]
-    label: str = ""
-
-
-@dataclass(frozen=True, eq=False)
 class Panel:
-    """One plot."""
+    """Axes of one plot."""
 
     title: str
     y_label: str
     curves: tuple[Curve, ...]
-    x: Signal | None = None
-    """(n,) increasing; the index of the sample when it is not given."""
     x_label: str = "sample"
     log_x: bool = False
     shown: tuple[float, float] | None = None
-    """The vertical range to begin with: transients would otherwise squash the rest."""
+    """Initial vertical range: transients would otherwise squash the rest."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Figure:
-    """One figure of the thesis, or one of ours that sets something beside it."""
+    """Texts of one figure of the thesis, or of one of ours beside it."""
 
     number: str
-    """As in the thesis; ours have a letter."""
+    """Number in the thesis; ours end in a letter."""
     title: str
-    """As in the thesis."""
-    panels: tuple[Panel, ...]
     text: str
-    """What it shows, and what had to be assumed; HTML of ours."""
-    marks: tuple[Mark, ...] = ()
+    """Explanation and assumptions; HTML, a template."""
+    panels: tuple[str, ...]
+    """Keys of ``Chapter.panels``."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """A printed number beside ours."""
+    """Printed number and the name of the fact beside it."""
 
     where: str
     name: str
-    printed: float | None
-    ours: float
+    printed: float
+    ours: str
+    """Field of the facts, e.g. ``shock.a1``."""
     unit: str = ""
     note: str = ""
-
-    @property
-    def deviation(self) -> float | None:
-        """Of ours from the printed one, relative to that."""
-        return None if not self.printed else self.ours / self.printed - 1.0
 
 
 @dataclass(frozen=True)
 class Erratum:
-    """A slip of the printed text."""
+    """Slip of the printed text; ``right`` and ``derivation`` are templates."""
 
     where: str
     printed: str
@@ -95,27 +85,106 @@ class Erratum:
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the thesis, and what became of it."""
+    """Quoted sentence of the thesis with our verdict."""
 
     ident: str
     where: str
     quote: str
     verdict: Verdict
     because: str
-    """In a sentence or two; with a reading: which. HTML of ours."""
-    measured: Mapping[str, Any]
-    """The figures behind it, in plain values."""
+    """Reason, and the reading if there is one; HTML, a template over the facts and the measured values."""
     figures: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Chapter:
-    """The experiments of one chapter."""
+    """Texts of one chapter, one TOML file."""
 
     number: int
     title: str
     introduction: str
+    panels: Mapping[str, Panel]
     figures: tuple[Figure, ...]
-    numbers: tuple[Number, ...]
     errata: tuple[Erratum, ...]
     claims: tuple[Claim, ...]
+    numbers: tuple[Number, ...] = ()
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Vertical line in every panel of a figure."""
+
+    at: float
+    kind: Literal["change", "alarm", "false"]
+    label: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Signals of one figure."""
+
+    panels: Sequence[Sequence[Signal]]
+    """Values (n,) of each curve, by panel; NaN leaves a gap."""
+    marks: Sequence[Mark] = ()
+    x: Signal | None = None
+    """(n,) increasing; the sample index if omitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReproducedChapter:
+    """One chapter with its texts filled in, its signals and its measured values."""
+
+    text: Chapter
+    drawings: Mapping[str, Drawing]
+    """By number of the figure."""
+    numbers: tuple[float, ...]
+    """Our value of each of ``text.numbers``."""
+    measured: Mapping[str, Facts]
+    """Values behind each claim, by identifier."""
+
+    @classmethod
+    def load(
+        cls, number: int, facts: Facts, drawings: Mapping[str, Drawing], measured: Mapping[str, Facts]
+    ) -> ReproducedChapter:
+        """Read ``chapterN.toml`` and fill in its texts.
+
+        :param facts: values for all templates of the chapter.
+        :raises ConfigurationError: the file has an unknown or missing key.
+        :raises KeyError: a template, figure or claim has no value.
+        """
+        path = Path(__file__).parent / f"chapter{number}.toml"
+        text = build(Chapter, read_toml(path), str(path))
+        filled = dataclasses.replace(
+            _fill(text, facts, "introduction"),
+            figures=tuple(_fill(each, facts, "text") for each in text.figures),
+            errata=tuple(_fill(each, facts, "right", "derivation") for each in text.errata),
+            claims=tuple(_fill(each, {**facts, **measured[each.ident]}, "because") for each in text.claims),
+        )
+        numbers = tuple(float(_Template().get_field(each.ours, (), facts)[0]) for each in text.numbers)
+        return cls(filled, drawings, numbers, measured)
+
+
+class _Template(string.Formatter):
+    """``str.format`` that also formats None, and sequences and mappings element by element."""
+
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Look up a fact, whose name may have dots, and then its attributes and items."""
+        head, bracket, rest = field_name.partition("[")
+        if head in kwargs:
+            return super().get_field(f"fact{bracket}{rest}", (), {"fact": kwargs[head]})
+        return super().get_field(field_name, args, kwargs)
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, Mapping):
+            return "; ".join(f"{key}: {self.format_field(each, format_spec)}" for key, each in value.items())
+        if isinstance(value, list | tuple):
+            return ", ".join(self.format_field(each, format_spec) for each in value)
+        if value is None:
+            return "–" if format_spec.endswith("%") else "never"
+        return format(value, format_spec)
+
+
+def _fill(item: T, facts: Facts, *fields: str) -> T:
+    """Return a dataclass with the named fields filled in."""
+    filled: dict[str, Any] = {name: _Template().vformat(getattr(item, name), (), facts) for name in fields}
+    return dataclasses.replace(item, **filled)

@@ -48,9 +48,9 @@
       height: isPrinting() ? PRINT_HEIGHT_PX : HEIGHT_PX,
       padding: [20, RIGHT_PX, 0, 0],
       cursor: cursor(figure.number),
-      scales: { x: { time: false, distr: panel.log ? 3 : 1 }, y: { range: range(panel.shown) } },
+      scales: { x: { time: false, distr: panel.log_x ? 3 : 1 }, y: { range: range(panel.shown) } },
       axes: [
-        axis("x", panel.x_label, 2, ink, { size: 26, labelSize: 20, ...(panel.log ? { values: wide } : {}) }),
+        axis("x", panel.x_label, 2, ink, { size: 26, labelSize: 20, ...(panel.log_x ? { values: wide } : {}) }),
         axis("y", panel.y_label, 3, ink, { size: LEFT_PX - 20, labelSize: 20 }),
       ],
       series: [{ label: panel.x_label }, ...panel.curves.map((each) => series(each, ink))],

@@ -1,4 +1,4 @@
-"""All chapters together, and the files that come of them."""
+"""Reproduction of all chapters, and its files."""
 
 from __future__ import annotations
 
@@ -13,86 +13,93 @@ from typing import Any
 import numpy as np
 
 from analogrig.storage import replacing
-from analogrig_thesis import chapter3, chapter3_claims, chapter4, chapter4_claims, chapter5, chapter5_claims
-from analogrig_thesis.comparison import Comparison, as_json, compare
-from analogrig_thesis.document import Chapter, Signal
-from analogrig_thesis.page import render
+from analogrig_thesis import chapter3, chapter4, chapter5
+from analogrig_thesis.circuit_runs import RECORDED, CircuitRuns, play_circuit
+from analogrig_thesis.document import ReproducedChapter, Signal
+from analogrig_thesis.rendering import render
+from analogrig_thesis.scheme_comparison import SchemeComparison, compare
 
 FORMAT, VERSION = "analogrig-thesis", 1
 
 PAGE, CLAIMS, RECORDINGS = "thesis.html", "claims.json", "recordings"
 
-FILES = (CLAIMS, *(f"{RECORDINGS}/{name}.npz" for name in (*chapter5.RECORDED, "simulated")))
-"""What is written beside the page."""
+FILES = (CLAIMS, *(f"{RECORDINGS}/{name}.npz" for name in (*RECORDED, "simulated")))
+"""Files beside the page."""
 
 DIGITS = 6
-"""Significant ones of every figure in claims.json: the rest is rounding."""
+"""Significant digits of every value in claims.json; the rest is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """What ``analogrig thesis`` knows in the end."""
+    """Results of ``analogrig thesis``."""
 
-    chapters: tuple[Chapter, ...]
-    comparison: Comparison
-    circuit: chapter5.Circuit
+    chapters: tuple[ReproducedChapter, ...]
+    comparison: SchemeComparison
+    circuit: CircuitRuns
     simulated: Mapping[str, Signal]
-    """The data of chapters 3 and 4, force and displacement by figure."""
+    """Force and displacement of chapters 3 and 4, by figure."""
 
     def write(self, folder: Path) -> None:
-        """The page, the claims, and the recordings; page and claims are the same bytes every time.
+        """Write the page, the claims and the recordings; page and claims are the same bytes every time.
 
         :raises RecordingError: a file cannot be written.
         """
         for name, text in ((PAGE, self.page()), (CLAIMS, self.claims())):
             with replacing(folder / name) as file:
                 file.write(text.encode())
-        for name, run in self.circuit.recordings.items():
+        for name, run in self.circuit.by_file.items():
             run.save(folder / RECORDINGS / f"{name}.npz")
         with replacing(folder / RECORDINGS / "simulated.npz") as file:
             np.savez_compressed(file, allow_pickle=False, **self.simulated)
 
     def page(self) -> str:
+        """Return the page as HTML."""
         return render(self.chapters, self.comparison)
 
     def claims(self) -> str:
-        """As JSON."""
+        """Return figures, numbers, errata, claims and the comparison as JSON."""
         table = {
             "format": FORMAT,
             "version": VERSION,
-            "figures": [figure.number for chapter in self.chapters for figure in chapter.figures],
+            "figures": [figure.number for chapter in self.chapters for figure in chapter.text.figures],
             "numbers": [
-                {**vars(number), "deviation": number.deviation}
+                {**vars(number), "ours": ours, "deviation": ours / number.printed - 1.0}
                 for chapter in self.chapters
-                for number in chapter.numbers
+                for number, ours in zip(chapter.text.numbers, chapter.numbers, strict=True)
             ],
-            "errata": [vars(erratum) for chapter in self.chapters for erratum in chapter.errata],
-            "claims": [vars(claim) for chapter in self.chapters for claim in chapter.claims],
-            "comparison": as_json(self.comparison),
+            "errata": [vars(erratum) for chapter in self.chapters for erratum in chapter.text.errata],
+            "claims": [
+                {**vars(claim), "measured": chapter.measured[claim.ident]}
+                for chapter in self.chapters
+                for claim in chapter.text.claims
+            ],
+            "comparison": vars(self.comparison),
         }
         return json.dumps(_plain(table), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def reproduce() -> Reproduction:
-    """Simulate, play, estimate, judge: some ten seconds; deterministic.
+    """Simulate, play, estimate and judge; deterministic, some ten seconds.
 
+    :raises ConfigurationError: a file of texts is not valid.
     :raises DeviceError, LinkError, RigError: the circuit could not be played.
     """
-    example, simulation, circuit = chapter3.Example.play(), chapter4.simulate(), chapter5.play_circuit()
+    example, simulation, circuit = chapter3.play_example(), chapter4.simulate(), play_circuit()
     return Reproduction(
         (
-            chapter3.chapter(example, chapter3_claims.claims(example)),
-            chapter4.chapter(simulation, chapter4_claims.claims(simulation)),
-            chapter5.chapter(circuit, chapter5_claims.claims(circuit)),
+            chapter3.reproduce_chapter(example),
+            chapter4.reproduce_chapter(simulation),
+            chapter5.reproduce_chapter(circuit),
         ),
         compare(simulation, circuit),
         circuit,
-        {**chapter3.recorded(), **chapter4.recorded(simulation)},
+        {**chapter3.simulated_data(example), **chapter4.simulated_data(simulation)},
     )
 
 
 def _plain(value: Any) -> Any:
-    """In types that JSON has; figures to so many digits as are not rounding."""
+    """Return a value in JSON types, numbers to ``DIGITS`` digits, non-finite ones as None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _plain(dataclasses.asdict(value))
     if isinstance(value, Mapping):

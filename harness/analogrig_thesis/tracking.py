@@ -1,9 +1,8 @@
-"""What an estimator made of some data, and how good that is."""
+"""Estimates over some data, and their quality against the true plants."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -13,25 +12,25 @@ from numpy.typing import NDArray
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
-from analogrig.plant import physical_parameters
+from analogrig.plant import Plant, physical_parameters
 from analogrig.run import Run, Segment
 from analogrig_thesis.document import Mark, Signal
-from analogrig_thesis.model import PERIOD_S
+from analogrig_thesis.plants import CHANGE_LABELS, PERIOD_S, stretches
 
 CONVERGED = 0.05
 """M, B and K have converged once each is, and stays, this close to the truth, relative to it."""
 
 SPIKE = 0.5
-"""Each excursion of M, B or K farther than this from the truth is a spike."""
+"""An excursion of M, B or K farther than this from the truth, relative to it, is a spike."""
 
 LARGEST_INPUT = 2.0**19
-"""The device refuses readings of more than 1e6: larger data are divided by a power of two, and P0 is multiplied by its
-square, which is the same estimator to the bit."""
+"""The device rejects readings above 1e6: larger data are divided by a power of two and P0 is multiplied by its square,
+which gives the same estimator to the bit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What came of n samples."""
+    """Output of an estimator over n samples."""
 
     theta: Signal
     """(n, p) in the units of the data."""
@@ -40,16 +39,16 @@ class Track:
     statistic: Signal
     """(n,) of the trigger."""
     alarms: NDArray[np.int64]
-    """Samples."""
+    """Sample indices."""
     parameters: Signal
     """(n, 3) M, B, K in kg, N s/m, N/m; NaN where theta describes no suspension."""
 
 
-def track(config: EstimatorConfig, u: Signal, y: Signal, y_per_m: float = 1.0) -> Track:
-    """Run the C estimator over data in any units.
+def track(config: EstimatorConfig, u: Signal, y: Signal, m_per_unit: float = 1.0, n_per_unit: float = 1.0) -> Track:
+    """Run the C estimator in this process over data in any units.
 
-    :param u: (n,) force, newtons.
-    :param y: (n,) displacement, ``y_per_m`` units to the metre, the units of the ceiling too.
+    :param u: (n,) force in units of ``n_per_unit`` newtons.
+    :param y: (n,) displacement in units of ``m_per_unit`` metres, the unit of the ceiling too.
     """
     shrunk = 2.0 ** -max(0.0, np.ceil(np.log2(max(np.abs(u).max(), np.abs(y).max()) / LARGEST_INPUT)))
     ceiling = None if config.trigger == "cusum" or config.ceiling is None else config.ceiling * shrunk
@@ -62,12 +61,12 @@ def track(config: EstimatorConfig, u: Signal, y: Signal, y_per_m: float = 1.0) -
         innovation=steps.innovation / shrunk,
         statistic=steps.statistic / codes,
         alarms=steps.alarms,
-        parameters=physical_parameters(theta, dataclasses.asdict(config), 1.0, 1.0 / y_per_m, PERIOD_S),
+        parameters=physical_parameters(theta, dataclasses.asdict(config), n_per_unit, m_per_unit, PERIOD_S),
     )
 
 
-def tracked(run: Run) -> Track:
-    """What a device answered over the link; theta in codes."""
+def track_of_run(run: Run) -> Track:
+    """Device estimates of a run; theta in codes."""
     return Track(
         theta=run.theta.astype(np.float64),
         innovation=run.innovation.astype(np.float64),
@@ -78,83 +77,80 @@ def tracked(run: Run) -> Track:
 
 
 @dataclass(frozen=True)
-class Performance:
-    """How well a track follows the truth."""
+class TrackQuality:
+    """Detection and convergence of a track, judged by the true plants."""
 
     latency_n: tuple[int | None, ...]
-    """Of each change, to the first alarm before the next one."""
+    """Samples from each change to the first alarm before the next change."""
     missed: int
     extra_alarms: int
-    """Every alarm that is not the first after a change."""
+    """Alarms that are not the first after a change."""
     reconverged_n: tuple[int | None, ...]
-    """Of each change, until M, B and K are within 5 % and stay there until the next one; None: never."""
+    """Samples from each change until M, B and K stay within 5 % up to the next change; None: never."""
     spread: tuple[float | None, ...]
     """Standard deviation of M, B, K over the truth, in the second halves of the stretches; None if one is undefined."""
     undefined: float
-    """The part of those samples at which theta describes no suspension at all."""
+    """Fraction of those samples at which theta describes no suspension."""
     spikes: int
 
 
-def performance(track: Track, segments: Sequence[Segment]) -> Performance:
-    """Judge a track by the truth; a scheme without a trigger has no latency."""
-    n = len(track.theta)
-    starts = [segment.start for segment in segments]
-    stretches = list(itertools.pairwise([*starts, n]))
-    truth = np.empty((n, 3))
-    for segment, (start, end) in zip(segments, stretches, strict=True):
-        truth[start:end] = list(segment.plant.parameters().values())
-    error = track.parameters / truth - 1.0
-    changes = stretches[1:]
-    latency = tuple(_first_alarm(track.alarms, start, end) for start, end in changes)
-    return Performance(
-        latency_n=latency,
-        missed=sum(each is None for each in latency),
-        extra_alarms=len(track.alarms) - sum(each is not None for each in latency),
-        reconverged_n=tuple(settled(error[start + 1 : end], CONVERGED) for start, end in changes),
-        spread=_spread(error, stretches),
-        undefined=float(np.concatenate([np.isnan(_late(error, *each)).any(axis=1) for each in stretches]).mean()),
-        spikes=spikes(error, changes),
+def assess(track: Track, segments: Sequence[Segment]) -> TrackQuality:
+    """Judge a track by the true plants."""
+    ranges = stretches(segments, len(track.theta))
+    error = np.concatenate(
+        [relative_errors(track, segment.plant, *each) for segment, each in zip(segments, ranges, strict=True)]
+    )
+    late = [error[(start + end) // 2 : end] for start, end in ranges]
+    spread = np.sqrt(np.mean([each.var(axis=0) for each in late], axis=0))
+    latency = [_first_alarm(track.alarms, *each) for each in ranges[1:]]
+    return TrackQuality(
+        latency_n=tuple(latency),
+        missed=latency.count(None),
+        extra_alarms=len(track.alarms) - len(latency) + latency.count(None),
+        reconverged_n=tuple(reconverged(error, segments)),
+        spread=tuple(None if np.isnan(each) else float(each) for each in spread),
+        undefined=float(np.concatenate([np.isnan(each).any(axis=1) for each in late]).mean()),
+        spikes=_spikes(error, ranges[1:]),
     )
 
 
-def settled(error: Signal, within: float) -> int | None:
-    """Samples until no row of (n, p) errors is beyond ``within`` any more, counted from 1; None if the last one is."""
+def relative_errors(track: Track, plant: Plant, start: int = 0, end: int | None = None) -> Signal:
+    """Errors (n, 3) of M, B, K in samples ``start`` to ``end``, relative to the plant."""
+    return np.asarray(track.parameters[start:end] / list(plant.parameters().values()) - 1.0)
+
+
+def settling_n(error: Signal, within: float = CONVERGED) -> int | None:
+    """Samples until all rows of (n, p) errors stay within a bound, counted from 1; None if the last row does not."""
     beyond = np.flatnonzero(~(np.abs(error) <= within).all(axis=1))
     if not len(beyond):
         return 1
     return None if beyond[-1] == len(error) - 1 else int(beyond[-1]) + 2
 
 
-def spikes(error: Signal, stretches: Iterable[tuple[int, int]]) -> int:
-    """How often an estimate that was within SPIKE of the truth, or a change, is followed by one that is not."""
-    count = 0
-    for start, end in stretches:
-        beyond: NDArray[np.bool_] = np.asarray(~(np.abs(error[start + 1 : end]) <= SPIKE).all(axis=1))
-        count += int((beyond[1:] & ~beyond[:-1]).sum())
-    return count
+def reconverged(error: Signal, segments: Sequence[Segment]) -> list[int | None]:
+    """Samples from each change until all columns of (n, p) errors stay within 5 % up to the next change."""
+    return [settling_n(error[start + 1 : end]) for start, end in stretches(segments, len(error))[1:]]
 
 
-def marks(track: Track, segments: Sequence[Segment], labels: Sequence[str] = ()) -> tuple[Mark, ...]:
-    """The changes, and the alarms: those that noticed one, and the others."""
-    starts = [segment.start for segment in segments]
-    stretches = list(itertools.pairwise([*starts, len(track.theta)]))[1:]
-    found = {start + n for start, end in stretches if (n := _first_alarm(track.alarms, start, end)) is not None}
-    names = [*labels, *[""] * len(starts)]
-    changes = [Mark(float(start), "change", names[i]) for i, start in enumerate(starts[1:])]
+def marks(track: Track, segments: Sequence[Segment], *, with_alarms: bool = True) -> tuple[Mark, ...]:
+    """Changes of the plant and, on request, alarms: the first after each change, and the others."""
+    ranges = stretches(segments, len(track.theta))[1:]
+    changes = [Mark(float(start), "change", label) for (start, _), label in zip(ranges, CHANGE_LABELS, strict=True)]
+    found = {start + n for start, end in ranges if (n := _first_alarm(track.alarms, start, end)) is not None}
     alarms = [Mark(float(k), "alarm" if int(k) in found else "false") for k in track.alarms]
-    return (*changes, *alarms)
+    return (*changes, *(alarms if with_alarms else ()))
 
 
 def _first_alarm(alarms: NDArray[np.int64], start: int, end: int) -> int | None:
-    """A pot that jumps at sample k is first felt by sample k + 1."""
+    """Latency of a change at ``start``, which acts on sample ``start + 1`` for the first time."""
     after = alarms[(alarms > start) & (alarms <= end)]
     return int(after[0]) - start if len(after) else None
 
 
-def _late(error: Signal, start: int, end: int) -> Signal:
-    return error[(start + end) // 2 : end]
-
-
-def _spread(error: Signal, stretches: Iterable[tuple[int, int]]) -> tuple[float | None, ...]:
-    variances = np.stack([_late(error, *each).var(axis=0) for each in stretches])
-    return tuple(None if np.isnan(each) else float(each) for each in np.sqrt(variances.mean(axis=0)))
+def _spikes(error: Signal, ranges: Iterable[tuple[int, int]]) -> int:
+    """Number of times that (n, 3) errors leave the bound SPIKE, or become undefined, after a change."""
+    count = 0
+    for start, end in ranges:
+        beyond = np.asarray(~(np.abs(error[start + 1 : end]) <= SPIKE).all(axis=1))
+        count += int((beyond[1:] & ~beyond[:-1]).sum())
+    return count

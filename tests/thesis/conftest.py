@@ -1,4 +1,4 @@
-"""One reproduction of the thesis for all tests of it."""
+"""Fixtures: one reproduction of the thesis for all tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from analogrig_thesis.reproduction import CLAIMS
 
 @pytest.fixture(scope="session")
 def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that ``analogrig thesis`` has written."""
+    """Return the folder written by ``analogrig thesis``."""
     folder = tmp_path_factory.mktemp("thesis")
     assert main(["thesis", "--out", str(folder)]) == 0
     return folder

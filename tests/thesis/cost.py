@@ -1,10 +1,9 @@
-"""What a sample costs with each of the thesis's schemes: instructions of the C on x86-64, counted by callgrind.
+"""Instructions a sample of each of the thesis's schemes: the C on x86-64, counted by callgrind.
 
     .venv/bin/python -m tests.thesis.cost       # some four minutes; writes harness/analogrig_thesis/cost.json
 
-Counted are the instructions of a whole process that runs the samples of Fig. 5.7 once, and of one that runs them a
-hundred times over: the difference is the estimator and some ten instructions of copying a sample. The figures depend on
-the compiler, not on the load of the machine.
+One process runs the samples of Fig. 5.7 once, another a hundred times: the difference is the estimator and some ten
+instructions for copying a sample. The figures depend on the compiler, not on the load of the machine.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from analogrig.devices.estimator import Estimator
-from analogrig_thesis.circuit import NOISY, SEED, TRACKING, circuit_schemes, codes
+from analogrig_thesis.circuit_runs import NOISY, SEED, TRACKING, ScaledSamples, circuit_schemes
 
 RESULT = Path("harness/analogrig_thesis/cost.json")
 REPEATS = 100
 
 
 def executed(key: str, repeats: int) -> int:
-    """Instructions of a whole process.
+    """Count the instructions of a whole process.
 
     :raises subprocess.CalledProcessError: valgrind failed.
     """
@@ -41,17 +40,17 @@ def executed(key: str, repeats: int) -> int:
 
 
 def run(key: str, repeats: int) -> None:
-    """What is counted."""
-    u, y, _, m_per_code = codes(NOISY, TRACKING, SEED)
-    (scheme,) = (each for each in circuit_schemes(m_per_code) if each.key == key)
-    Estimator(scheme.config).run(np.tile(u, repeats), np.tile(y, repeats))
+    """Run one scheme over the repeated samples of Fig. 5.7: the counted process."""
+    samples = ScaledSamples.play(NOISY, TRACKING, SEED)
+    config = circuit_schemes(samples.m_per_unit)[key]
+    Estimator(config).run(np.tile(samples.u, repeats), np.tile(samples.y, repeats))
 
 
 def main() -> None:
     compiler = subprocess.run(["gcc", "--version"], check=True, capture_output=True, text=True).stdout.splitlines()[0]
     once = executed("rls", 1)
     samples = (REPEATS - 1) * TRACKING.samples
-    counted = {each.key: round((executed(each.key, REPEATS) - once) / samples) for each in circuit_schemes(1e-4)}
+    counted = {key: round((executed(key, REPEATS) - once) / samples) for key in circuit_schemes(1e-4)}
     RESULT.write_text(json.dumps({"compiler": compiler, "instructions": counted}, indent=2) + "\n", encoding="utf-8")
 
 

@@ -1,4 +1,4 @@
-"""Detection over many seeds: the emulated computer and card, the C estimator in this process, the shipped settings."""
+"""Detection over many seeds: emulated computer and card, C estimator in this process, shipped settings."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from analogrig.scenario import Scenario
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What came of r runs of a scenario with t tweaks."""
+    """Results of r runs of a scenario with t pot changes."""
 
     latencies_n: NDArray[np.float64]
-    """(r, t) samples; NaN where there was no alarm."""
+    """(r, t) samples; NaN without an alarm."""
     bounds_n: NDArray[np.float64]
-    """(r, t) samples; NaN where the change could not be seen."""
+    """(r, t) samples; NaN for a change that cannot be detected."""
     errors: NDArray[np.float64]
     """(r, t + 1, 3) relative errors of M, B, K at the end of each stretch; NaN without an estimate."""
     missed: int
@@ -34,20 +34,20 @@ class Detection:
     runs: int
 
     def ratios(self) -> NDArray[np.float64]:
-        """(t,) mean latency over mean bound, where both exist."""
+        """Mean latency over mean bound (t,), over the runs with both."""
         both = np.isfinite(self.latencies_n) & np.isfinite(self.bounds_n)
         latency, bound = (np.where(both, x, 0.0).sum(axis=0) for x in (self.latencies_n, self.bounds_n))
         return np.asarray(latency / bound)
 
     def ratio_errors(self) -> NDArray[np.float64]:
-        """(t,) standard error of each ratio, by the delta method."""
+        """Standard error (t,) of each ratio, by the delta method."""
         means = np.nanmean(self.bounds_n, axis=0)
         residuals = self.latencies_n - self.ratios() * self.bounds_n
         return np.asarray(np.nanstd(residuals, axis=0, ddof=1) / np.sqrt(self.runs) / means)
 
 
 def shipped_device_in_process() -> DeviceDescription:
-    """The settings of the device `host`, in this process: the same C, the same messages, no pseudo terminal."""
+    """Device with the settings of `host` in this process: same C, same messages, no pseudo terminal."""
     with open_dut("host") as dut:
         table = dict(dut.description())
     with open_dut("inproc") as dut:
@@ -62,8 +62,8 @@ def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection
         bench = Bench(rig, dut)
         verdicts = [judge(bench.play(scenario, seed)) for seed in seeds]
     return Detection(
-        latencies_n=_table(verdicts, "latency_n"),
-        bounds_n=_table(verdicts, "bound_n"),
+        latencies_n=_by_change(verdicts, "latency_n"),
+        bounds_n=_by_change(verdicts, "bound_n"),
         errors=np.array([[_errors(segment) for segment in verdict.estimates] for verdict in verdicts]),
         missed=sum(tweak.missed for verdict in verdicts for tweak in verdict.tweaks),
         false_alarms=sum(len(verdict.false_alarms) for verdict in verdicts),
@@ -76,5 +76,5 @@ def _errors(segment: SegmentEstimate) -> list[float]:
     return [segment.error.get(name, np.nan) for name in PARAMETERS]
 
 
-def _table(verdicts: list[Verdict], what: str) -> NDArray[np.float64]:
-    return np.array([[getattr(tweak, what) for tweak in verdict.tweaks] for verdict in verdicts], dtype=np.float64)
+def _by_change(verdicts: list[Verdict], field: str) -> NDArray[np.float64]:
+    return np.array([[getattr(tweak, field) for tweak in verdict.tweaks] for verdict in verdicts], dtype=np.float64)

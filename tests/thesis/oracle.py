@@ -1,7 +1,7 @@
-"""The thesis's experiments once more, with numpy and scipy in double precision: what claims.json is held against.
+"""Thesis experiments in numpy and scipy in double precision: the reference for claims.json.
 
-Nothing of analogrig_thesis is used here, nor the C: plants come from scipy's discretisation, the recursion is Equ 3.19
-and 3.20 as they are printed, the triggers follow sections 4.4.2 and 4.4.3.
+Neither analogrig_thesis nor the C is used: scipy discretises the plants, the recursion is Equ 3.19 and 3.20 as printed,
+the triggers follow sections 4.4.2 and 4.4.3.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHANGES = (200, 400, 500, 600)
 
 
 def discrete(mass_kg: float, damping_n_s_per_m: float, stiffness_n_per_m: float) -> list[float]:
-    """a1, a2, b0, b1 by scipy's zero-order hold."""
+    """Return a1, a2, b0, b1 by scipy's zero-order hold."""
     num, den, _ = cont2discrete(([1.0], [mass_kg, damping_n_s_per_m, stiffness_n_per_m]), PERIOD_S)
     return [float(x) for x in (den[1], den[2], num[0][1], num[0][2])]
 
@@ -38,7 +38,7 @@ def square(n: int, high: float, low: float) -> Signal:
 
 
 def arx(u: Signal, theta: Sequence[float]) -> Signal:
-    """y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) + b1 u(k-2), from rest."""
+    """Return y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) + b1 u(k-2) (n,), from rest."""
     a1, a2, b0, b1 = theta
     y = np.zeros(len(u) + 2)
     past = np.concatenate([[0.0, 0.0], u])
@@ -48,7 +48,7 @@ def arx(u: Signal, theta: Sequence[float]) -> Signal:
 
 
 def suspension(u: Signal) -> Signal:
-    """The displacement of the profile's suspension: its state goes on where a parameter jumps."""
+    """Displacement (n,) over the profile; the state is continuous at a change."""
     y, state = np.empty(len(u)), np.zeros(2)
     for k in range(len(u)):
         if k in PROFILE:
@@ -59,13 +59,13 @@ def suspension(u: Signal) -> Signal:
 
 
 def state_space(mass_kg: float, damping_n_s_per_m: float, stiffness_n_per_m: float) -> tuple[Signal, ...]:
-    """Of position and velocity, driven by the force."""
+    """State space of position and velocity, driven by the force."""
     a = np.array([[0.0, 1.0], [-stiffness_n_per_m / mass_kg, -damping_n_s_per_m / mass_kg]])
     return a, np.array([[0.0], [1.0 / mass_kg]]), np.eye(2), np.zeros((2, 1))
 
 
 def lighter_for_a_while(u: Signal, at: int, apart: int, period_s: float) -> Signal:
-    """The displacement of the first plant of the profile, which from ``at`` on is the last for ``apart`` samples."""
+    """Displacement (n,) of the profile's first plant; from ``at`` on it is the last plant for ``apart`` samples."""
     first, *_, last = (cont2discrete(state_space(*plant), period_s) for plant in PROFILE.values())
     y, state = np.empty(len(u)), np.zeros(2)
     for k in range(len(u)):
@@ -76,8 +76,10 @@ def lighter_for_a_while(u: Signal, at: int, apart: int, period_s: float) -> Sign
 
 
 def kalman(u: Signal, y: Signal, walk: float, nb: int) -> Signal:
-    """The filter of a state theta(k+1) = theta(k) + w(k), E(w w') = walk I, measured by phi' theta with noise 1, in its
-    textbook form: time update, gain, measurement update by Joseph's formula. (n, p) estimates."""
+    """Kalman estimates (n, p) of a state theta(k+1) = theta(k) + w(k), E(w w') = walk I, with measurement noise 1.
+
+    Textbook form: gain, measurement update by Joseph's formula, time update.
+    """
     n = 2 + nb
     theta, p = np.zeros(n), 10.0 * np.eye(n)
     out = np.zeros((len(u), n))
@@ -92,7 +94,7 @@ def kalman(u: Signal, y: Signal, walk: float, nb: int) -> Signal:
 
 
 class Rls:
-    """Equ 3.19 and 3.20, with the forgetting factor, the random walk, the reset and the triggers of the thesis."""
+    """Recursion of Equ 3.19 and 3.20 with the thesis's forgetting factor, random walk, reset and triggers."""
 
     def __init__(
         self,
@@ -111,7 +113,7 @@ class Rls:
         self.errors: Signal = np.empty(0)
 
     def run(self, u: Signal, y: Signal) -> tuple[Signal, list[int]]:
-        """The estimates (n, p) and the samples with an alarm; ``errors`` are those of prediction (n,)."""
+        """Return the estimates (n, p) and the samples with an alarm; set ``errors``, the prediction errors (n,)."""
         p0 = np.diag([10.0] * (2 + self.nb) + [1e6] * self.offset)
         theta, p = np.zeros(len(p0)), p0
         out, alarms = np.zeros((len(u), len(p0))), []
@@ -120,7 +122,7 @@ class Rls:
         for k in range(len(u)):
             out[k] = theta
             if k < begin:
-                continue  # the equation reaches back by two samples, to none of before an alarm
+                continue  # An equation covers two past samples and must not mix samples from before and after an alarm.
             inputs = [u[k - 1 - i] for i in range(self.nb)]
             phi = np.array([-y[k - 1], -y[k - 2], *inputs, *[1.0] * self.offset])
             error = self.errors[k] = y[k] - phi @ theta
@@ -143,7 +145,7 @@ class Rls:
 
 
 def physical(theta: Signal, y_per_m: float, u_per_n: float = 1.0) -> Signal:
-    """M, B, K (n, 3) of a1, a2, b0, b1 (n, 4): the poles' logarithms and the static gain; NaN without a suspension."""
+    """M, B, K (n, 3) from the poles and the static gain of a1, a2, b0, b1 (n, 4); NaN without a suspension."""
     out = np.full((len(theta), 3), np.nan)
     for row, (a1, a2, b0, b1) in zip(out, theta[:, :4], strict=True):
         poles = np.roots([1.0, a1, a2]).astype(complex)
@@ -159,7 +161,7 @@ def physical(theta: Signal, y_per_m: float, u_per_n: float = 1.0) -> Signal:
 
 
 def errors_of(parameters: Signal, starts: Sequence[int]) -> Signal:
-    """(n, 3) relative errors of M, B, K, the plants of the profile beginning at ``starts``."""
+    """Relative errors (n, 3) of M, B, K; the plants of the profile begin at ``starts``."""
     truth = np.empty_like(parameters)
     for start, plant in zip(starts, PROFILE.values(), strict=True):
         truth[start:] = plant
@@ -167,7 +169,7 @@ def errors_of(parameters: Signal, starts: Sequence[int]) -> Signal:
 
 
 def reconverged(error: Signal, starts: Sequence[int], within: float = 0.05) -> list[int | None]:
-    """Samples from each change until all errors stay within; the sample of the change itself is the old plant's."""
+    """Samples from each change until all errors stay within a bound; the sample of the change is the old plant's."""
     out: list[int | None] = []
     for start, end in zip(starts, [*starts[1:], len(error)], strict=True):
         after = next((k for k in range(start + 1, end) if (np.abs(error[k:end]) <= within).all()), None)
@@ -176,7 +178,7 @@ def reconverged(error: Signal, starts: Sequence[int], within: float = 0.05) -> l
 
 
 def excursions(error: Signal, starts: Sequence[int], beyond: float = 0.5) -> int:
-    """How often an estimate leaves the truth by so much, NaN being out."""
+    """Number of times that an estimate leaves the bound around the truth; NaN is outside."""
     count = 0
     for start, end in zip(starts, [*starts[1:], len(error)], strict=True):
         good = np.asarray((np.abs(error[start + 1 : end]) <= beyond).all(axis=1))
@@ -185,14 +187,14 @@ def excursions(error: Signal, starts: Sequence[int], beyond: float = 0.5) -> int
 
 
 def late_scatter(values: NDArray[np.floating], starts: Sequence[int]) -> Signal:
-    """Of each column: the root of the mean variance in the second halves of the stretches."""
+    """Root mean variance of each column in the second halves of the stretches."""
     values = values.astype(np.float64)
     stretches = zip(starts, [*starts[1:], len(values)], strict=True)
     return np.asarray(np.sqrt(np.mean([values[(a + b) // 2 : b].var(axis=0) for a, b in stretches], axis=0)))
 
 
 def latencies(alarms: Sequence[int], n: int) -> list[int | None]:
-    """Of each change, to the first alarm before the next."""
+    """Samples from each change to the first alarm before the next."""
     ends = [*CHANGES[1:], n]
     return [
         next((k - start for k in alarms if start < k <= end), None) for start, end in zip(CHANGES, ends, strict=True)
@@ -204,6 +206,6 @@ def damping_ratio(mass_kg: float, damping_n_s_per_m: float, stiffness_n_per_m: f
 
 
 def least_squares(u: Signal, y: Signal) -> Signal:
-    """a1, a2, b0, b1, d from all equations at once (Equ 3.17)."""
+    """Batch estimate a1, a2, b0, b1, d from all equations at once (Equ 3.17)."""
     phi = np.stack([-y[1:-1], -y[:-2], u[1:-1], u[:-2], np.ones(len(u) - 2)], axis=1)
     return np.asarray(np.linalg.lstsq(phi, y[2:], rcond=None)[0])

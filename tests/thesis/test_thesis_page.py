@@ -1,4 +1,4 @@
-"""The page of the thesis in a real browser."""
+"""Thesis page in a real browser."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DRAWN = """(canvas) => {
 }"""
 
 SIGNALS = {0x0072B2, 0xCC79A7, 0x009E73}
-"""First, second and third, one of which every plot has; its axes have none of them."""
+"""Colours of the curves: every plot has at least one of them, the axes have none."""
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def opened(browser: Browser, reproduced: Path) -> Watched:
     return watched
 
 
-def test_every_figure_is_drawn_without_a_complaint_or_a_request(opened: Watched, claims: dict[str, Any]) -> None:
+def test_every_figure_is_drawn_without_an_error_or_a_request(opened: Watched, claims: dict[str, Any]) -> None:
     figures = opened.page.locator("figure").all()
     captions = [figure.locator("figcaption").inner_text().split(" ", 1)[1] for figure in figures]
     assert all(caption.startswith(number) for caption, number in zip(captions, claims["figures"], strict=True))
@@ -44,13 +44,13 @@ def test_every_figure_is_drawn_without_a_complaint_or_a_request(opened: Watched,
     assert [url.rpartition("/")[2] for url in opened.requests] == [PAGE]
 
 
-def test_page_is_less_than_5_mb_and_asks_for_nothing(reproduced: Path) -> None:
+def test_page_is_below_5_mb_and_loads_nothing(reproduced: Path) -> None:
     page = (reproduced / PAGE).read_text(encoding="utf-8")
     assert len(page.encode()) < 5_000_000
     assert "default-src 'none'" in page
 
 
-def test_every_claim_and_every_number_stands_on_the_page(opened: Watched, claims: dict[str, Any]) -> None:
+def test_page_shows_every_claim_and_every_number(opened: Watched, claims: dict[str, Any]) -> None:
     shown = opened.page.locator(".claim").all()
     assert [each.get_attribute("id") for each in shown] == [f"claim-{each['ident']}" for each in claims["claims"]]
     rows = [opened.page.locator(f"#{name}-{chapter} + .scroll tbody tr").count() for name, chapter in _TABLES]
@@ -60,7 +60,7 @@ def test_every_claim_and_every_number_stands_on_the_page(opened: Watched, claims
 _TABLES = (("errata", 3), ("numbers", 4), ("errata", 4), ("numbers", 5), ("errata", 5))
 
 
-def test_drag_zooms_the_plots_of_one_figure_and_no_other(opened: Watched) -> None:
+def test_drag_zooms_the_plots_of_one_figure_only(opened: Watched) -> None:
     own, other = "#fig-4\\.6", "#fig-4\\.7"
     whole = opened.images(own), opened.images(other)
     opened.drag(0, 0.2, 0.4, within=own)
