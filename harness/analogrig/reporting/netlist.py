@@ -32,7 +32,7 @@ def _turns(setup: SetUp, samples: int) -> list[PotChange]:
     """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
     dials = setup.computer.dials
     turns: list[PotChange] = []
-    for sample, goals, ramp_n in setup.computer.planned(setup.changes, samples):
+    for sample, goals, ramp_n in setup.computer.plan(setup.changes, samples):
         for k in range(min(ramp_n, samples - sample)):
             part = (k + 0.5) / ramp_n
             between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}

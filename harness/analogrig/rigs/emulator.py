@@ -23,7 +23,6 @@ from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
     COMPONENTS,
-    IDEAL,
     OP_AMP_GRADES,
     PROGRAMS,
     Capacitor,
@@ -86,15 +85,18 @@ class MeasuredValues:
     def put_in(self, stock: Components) -> Components:
         """The machine, of components that are otherwise those of the stock."""
         given = {**self.deviation, **self.offset_v}
-        return dataclasses.replace(stock.undrawn(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew)
+        return dataclasses.replace(
+            stock.without_draws(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew
+        )
 
 
 @functools.cache
 def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Of the resistors, capacitors and pots, and of the amplifiers, of all programs, in the order of their diagrams."""
-    elements = [each for program in PROGRAMS.values() for each in program.netlist([IDEAL] * program.amplifiers)]
-    parts = dict.fromkeys(each.name for each in elements if isinstance(each, Resistor | Capacitor | Pot))
-    return tuple(parts), tuple(dict.fromkeys(each.name for each in elements if isinstance(each, OpAmp)))
+    programs = PROGRAMS.values()
+    parts = [name for program in programs for name in program.element_names(Resistor, Capacitor, Pot)]
+    amplifiers = [name for program in programs for name in program.element_names(OpAmp)]
+    return tuple(dict.fromkeys(parts)), tuple(dict.fromkeys(amplifiers))
 
 
 @dataclass(frozen=True)
