@@ -16,13 +16,12 @@ from analogrig.hardware.dating.jump import Instant, NoInstant, Problem, colour, 
 from analogrig.hardware.dating.turn import TurnInstants, date_turn
 from analogrig.hardware.dating.two_filter import (
     ANYWHERE,
-    Backwards,
-    Columns,
+    BackwardFilter,
     EdgePlace,
-    Forwards,
+    ForwardFilter,
     PlantModel,
     Signals,
-    joined,
+    join,
 )
 from analogrig.plant import Plant, SampledPlant
 from analogrig_emulator import COMPONENTS, Excitation, PotChange, SuspensionComputer
@@ -220,7 +219,7 @@ def test_change_just_behind_the_range_is_not_taken_for_one_in_it() -> None:
     ("search", "said"),
     [
         (range(400, 500), "the plant seems to have changed before or after the samples 400 to 499"),
-        (range(700, 800), "what a plant that changes once leaves of the samples has"),
+        (range(700, 800), "the residuals of a plant that changes once have"),
     ],
     ids=["long before it", "long after it"],
 )
@@ -259,14 +258,14 @@ def test_place_that_only_the_samples_after_the_range_tell_is_not_taken_for_noise
     for seed in range(16):
         signals = simulated([(0, SOFT), (300, FRONT), (550, SOFT)], 800, seed, place=0.3, half_n=100)
         problem = Problem.of(signals, FRONT, SOFT, range(350, 750), range(301, 800))
-        ratios.append(problem.fit().left * (problem.signals.noise_m / signals.noise_m) ** 2)
+        ratios.append(problem.fit().noise_ratio * (problem.signals.noise_m / signals.noise_m) ** 2)
     assert 0.85 < np.mean(ratios) < 1.15
 
 
 def test_samples_of_something_else_are_refused() -> None:
     signals = simulated([(0, FRONT), (600, SOFT)], 1200, seed=19)
     turned_round = dataclasses.replace(signals, displacement_m=signals.displacement_m[::-1].copy())
-    assert "times the variance of their noise" in reason(turned_round, SOFT, range(400, 800))
+    assert "times the noise variance" in reason(turned_round, SOFT, range(400, 800))
 
 
 @pytest.mark.parametrize("search", [range(0), range(400, 1300), range(-5, 100), range(400, 800, 2)])
@@ -371,9 +370,9 @@ def test_two_filters_give_the_likelihood_of_all_samples_at_once() -> None:
 
 def cost_of_each_instant(signals: Signals, old: PlantModel, new: PlantModel) -> NDArray[np.float64]:
     still = np.zeros((len(signals), 2))
-    before = Forwards.of(old, signals, Columns.of(old, signals, still, (0.0, 0.0)))
-    after = Backwards.of(new, signals, Columns.of(new, signals, still, (0.0, 0.0)))
-    form, log = joined(before.state, before.covariance, after.vector, after.information)
+    before = ForwardFilter.of(old, signals, still, (0.0, 0.0))
+    after = BackwardFilter.of(new, signals, still, (0.0, 0.0))
+    form, log = join(before.state, before.covariance, after.vector, after.information)
     return np.asarray((form + before.misfit + after.misfit)[:, 0, 0] + log + before.log + after.log)
 
 

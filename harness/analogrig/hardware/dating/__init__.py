@@ -1,1 +1,1 @@
-"""When a pot was turned, learned from the samples: a jump, or a turn that takes its time."""
+"""Dating of pot changes by the samples: of a jump, and of a turn that takes time."""

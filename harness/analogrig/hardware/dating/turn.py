@@ -1,9 +1,9 @@
-"""A pot that a hand turns, slowly: when it began to turn and when it stood, learned from the samples.
+"""Dates of a pot change that takes time: the instants at which the pot began and ceased to turn.
 
-As ``jump``, but that between the two instants the plant is on its way. How a hand goes nobody knows: it may
-turn evenly, or begin and end gently (least jerk; Flash and Hogan 1985). Both are tried, and the intervals are those of
-whatever the samples do not refuse. Two pots that jump one after the other are such a turn too, with a plant between
-them that is known. The plants at both ends are those that the samples before and after the range tell.
+Between the two instants the plant is on a path from the old values to the new ones. The course of a hand is unknown: it
+may turn evenly, or begin and end gently (least jerk; Flash and Hogan 1985). Both shapes are tried, and the intervals
+cover each shape that the samples do not reject. Two pots that jump in succession are such a turn as well, with a known
+plant in between. The plants at both ends are fitted to the samples before and after the search range.
 """
 
 from __future__ import annotations
@@ -15,45 +15,45 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.dating.jump import CONFIDENCE, Guess, Instant, NoInstant, Problem, beside, doubt, interval
-from analogrig.hardware.dating.two_filter import Array, Backwards, EdgePlace, Forwards, PlantModel, Signals, joined
+from analogrig.hardware.dating.jump import (
+    CONFIDENCE,
+    Guess,
+    Instant,
+    NoInstant,
+    Problem,
+    deviate,
+    interval,
+    overdispersion,
+)
+from analogrig.hardware.dating.two_filter import Array, BackwardFilter, ForwardFilter, PlantModel, Signals, join
 from analogrig.plant import PARAMETERS, Plant
 
 Indices = NDArray[np.int64]
 
-_PARTS = 33
-"""Of the way, at which the plant is worked out; between them it is interpolated."""
+_POINTS = 33
+"""Points of the path at which the plant is computed; values between them are interpolated."""
 _GRID_N = 16
-"""Instants that are tried at a time, for begin and end each."""
+"""Instants per grid, for begin and end each."""
 _ZOOMS = 12
 _LIKELY = 12.0
-"""Twice the logarithm of the likelihood ratio to the best, up to which a pair of instants is looked at more closely."""
-_BESIDE = 0.03
-"""Of the time of a turn: its instants may lie so far beside, since the way is not quite one of the shapes; the pots'
-load alone makes it 2 %."""
+"""Largest cost difference to the best pair of instants that the next, finer grid covers."""
+_SHAPE_ERROR = 0.03
+"""Part of the turn's duration that is added to each interval, since no path has exactly one of the shapes. The load of
+the pots alone makes it 2 %."""
 _FINE_N = 8
-"""Instants within an interval that show its ends well enough."""
+"""Grid points within an interval that resolve its ends."""
 
 
 @dataclass(frozen=True)
 class TurnInstants:
-    """From the last sample that cannot tell of it to the first at which the plant has become another one."""
+    """Last sample before the turn has an effect, and first sample at which the plant is the new one."""
 
     begin: Instant
     end: Instant
 
-    def wider(self, search: range, part: float) -> TurnInstants:
-        """By a part of the time that it takes, within the range."""
-        more = round(part * (self.end.sample - self.begin.sample))
-        begin, end = (
-            Instant(each.sample, max(each.low - more, search.start), min(each.high + more, search.stop - 1))
-            for each in (self.begin, self.end)
-        )
-        return TurnInstants(begin, end)
-
 
 Shape = Callable[[Array], Array]
-"""Of a way: the part of it that is gone after a part of the time."""
+"""Part of the path that is done after a part of the time."""
 
 
 def date_turn(
@@ -66,86 +66,83 @@ def date_turn(
     within: range | None = None,
     confidence: float = CONFIDENCE,
 ) -> TurnInstants | NoInstant:
-    """When a pot began to turn and when it stood, both in ``search``; other arguments as of
-    ``analogrig.hardware.dating.onset``.
+    """Estimate the instants, both in ``search``, at which a pot began and ceased to turn.
 
-    :param middle: two pots jumped, one after the other, and between the two the plant was this one.
-    :raises ValueError: the range is empty, or leaves the record or ``within``.
+    Other parameters and errors as for ``analogrig.hardware.dating.jump.date_jump``.
+
+    :param middle: plant between the jumps of two pots; None: one pot turns.
     """
-    problem, guess = Problem.of(signals, before, after, search, within).fitted()
-    ways = _Ways.of(problem, guess) if middle is None else _Ways.stopping(problem, guess, middle)
-    shapes = (_evenly, _gently) if middle is None else (_evenly,)
-    every = [_zoomed(ways, shape, problem.candidates, confidence) for shape in shapes]
-    every.sort(key=lambda tried: float(tried.cost.min()))
+    problem, guess = Problem.of(signals, before, after, search, within).start()
+    path = _Path.of(problem, guess, middle)
+    every = [
+        _zoom(path, shape, problem.candidates, confidence)
+        for shape in ((_even, _least_jerk) if middle is None else (_even,))
+    ]
+    every.sort(key=lambda pairs: float(pairs.cost.min()))
     best = every[0]
     at = int(best.cost.argmin())
     unexplained = float(best.fit[at]) / max(1, int(problem.signals.valid.sum()))
     if objection := problem.objection(float(best.cost[at]), unexplained, guess):
         return objection
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
-        return NoInstant(f"the turn seems to go on beyond the samples {search.start} to {search.stop - 1}")
-    doubted = doubt(guess, max(unexplained, float(best.on_the_way[at])))
-    likely = [tried for tried in every if tried.cost.min() - best.cost[at] <= _LIKELY * doubted]
+        return NoInstant(f"the turn seems to go on beyond the samples {problem.searched}")
+    divisor = overdispersion(guess, max(unexplained, float(best.path_misfit[at])))
+    likely = [pairs for pairs in every if pairs.cost.min() - best.cost[at] <= _LIKELY * divisor]
+    begins = [_estimate(pairs.begin, pairs.cost / divisor, confidence) for pairs in likely]
+    ends = [_estimate(pairs.end, pairs.cost / divisor, confidence) for pairs in likely]
+    wider_n = round(_SHAPE_ERROR * (ends[0].sample - begins[0].sample)) if middle is None else 0
     shift = search.start - problem.candidates.start
-    found = TurnInstants(
-        _over([_instant(tried.begin, tried.cost / doubted, confidence) for tried in likely], shift),
-        _over([_instant(tried.end, tried.cost / doubted, confidence) for tried in likely], shift),
-    )
-    return found.wider(search, _BESIDE if middle is None else 0.0)
+    return TurnInstants(*(_union(instants, shift, wider_n, search) for instants in (begins, ends)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
-    """Pairs (p,) of instants and what the samples say of them."""
+class _Pairs:
+    """p pairs of instants and their likelihood; all arrays (p,)."""
 
     begin: Indices
     end: Indices
     cost: Array
-    """Twice the negative logarithm of the likelihood."""
+    """Twice the negative log-likelihood."""
     fit: Array
-    """What is left of the samples."""
-    on_the_way: Array
-    """... of those between the two, of each on average."""
+    """Sum of the squared residuals of all samples, in units of their noise."""
+    path_misfit: Array
+    """Mean square of those between the two instants."""
 
 
-def _zoomed(ways: _Ways, shape: Shape, candidates: slice, confidence: float) -> _Tried:
-    """Pairs that lie closer and closer about the likeliest, until they show the intervals."""
+def _zoom(path: _Path, shape: Shape, candidates: slice, confidence: float) -> _Pairs:
+    """Evaluate ever finer grids about the most likely pair until they resolve both intervals."""
     spans = [(candidates.start, candidates.stop - 1)] * 2
     for _ in range(_ZOOMS):
-        begins, ends = (_instants(*span) for span in spans)
-        tried = ways.tried(begins, ends, shape)
-        if all(_fine(each, tried.cost, confidence) for each in (tried.begin, tried.end)):
+        grids = [np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans]
+        pairs = path.evaluate(*grids, shape)
+        if all(_is_fine(each, pairs.cost, confidence) for each in (pairs.begin, pairs.end)):
             break
-        likely = tried.cost - tried.cost.min() <= _LIKELY
+        likely = pairs.cost - pairs.cost.min() <= _LIKELY
         spans = [
             _around(each[likely], 2 * _step(grid), candidates)
-            for each, grid in ((tried.begin, begins), (tried.end, ends))
+            for each, grid in zip((pairs.begin, pairs.end), grids, strict=True)
         ]
-    return tried
-
-
-def _instants(first: int, last: int) -> Indices:
-    return np.unique(np.linspace(first, last, _GRID_N).round().astype(np.int64))
+    return pairs
 
 
 def _step(instants: Indices) -> int:
     return int(np.diff(instants).max(initial=1))
 
 
-def _around(instants: Indices, beside: int, candidates: slice) -> tuple[int, int]:
-    low, high = int(instants.min()) - beside, int(instants.max()) + beside
+def _around(instants: Indices, margin: int, candidates: slice) -> tuple[int, int]:
+    low, high = int(instants.min()) - margin, int(instants.max()) + margin
     return max(low, candidates.start), min(high, candidates.stop - 1)
 
 
 def _marginal(instants: Indices, cost: Array) -> tuple[Indices, Array]:
-    """The instants that are tried, each once, and the cost of each over all its pairs."""
+    """Distinct instants and the marginal cost of each over all its pairs."""
     once, at = np.unique(instants, return_inverse=True)
     likelihood = np.zeros(len(once))
     np.add.at(likelihood, at, np.exp(-0.5 * (cost - cost.min())))
     return once, -2.0 * np.log(np.maximum(likelihood, np.finfo(np.float64).tiny))
 
 
-def _fine(instants: Indices, cost: Array, confidence: float) -> bool:
+def _is_fine(instants: Indices, cost: Array, confidence: float) -> bool:
     once, marginal = _marginal(instants, cost)
     if _step(once) == 1:
         return True
@@ -153,54 +150,56 @@ def _fine(instants: Indices, cost: Array, confidence: float) -> bool:
     return int(((once >= found.low) & (once <= found.high)).sum()) >= _FINE_N
 
 
-def _instant(instants: Indices, cost: Array, confidence: float) -> Instant:
-    """With an interval that reaches to the next instants that were tried and refused."""
+def _estimate(instants: Indices, cost: Array, confidence: float) -> Instant:
+    """Best instant; the interval extends to the next instants of the grid that are rejected."""
     once, marginal = _marginal(instants, cost)
     found, between = interval(marginal, once, confidence), _step(once) - 1
     return Instant(int(instants[cost.argmin()]), found.low - between, found.high + between)
 
 
-def _over(found: Sequence[Instant], shift: int) -> Instant:
-    """Over all shapes, the likeliest one first."""
-    return Instant(
-        found[0].sample + shift, min(each.low for each in found) + shift, max(each.high for each in found) + shift
-    )
+def _union(instants: Sequence[Instant], shift: int, wider_n: int, search: range) -> Instant:
+    """First instant, with an interval that covers those of all; shifted, widened and kept within ``search``."""
+    low, high = min(each.low for each in instants) + shift, max(each.high for each in instants) + shift
+    return Instant(instants[0].sample + shift, max(low - wider_n, search.start), min(high + wider_n, search.stop - 1))
 
 
 @dataclass(frozen=True, eq=False)
-class _Ways:
-    """All that is needed to go from the one plant to the other, between any two instants."""
+class _Path:
+    """Plants between the old one and the new one, and the filters at both ends."""
 
     signals: Signals
-    old: Forwards
-    new: Backwards
+    old: ForwardFilter
+    new: BackwardFilter
     offset: float
-    """Of the displacement, in the rms of its noise."""
-    parts: Array
-    """(_PARTS, 12): transition, response and edge, covariance of the edge, offset of the force, along the way."""
+    """Offset of the displacement, in rms of its noise."""
+    points: Array
+    """(_POINTS, 12): transition, response and edge, covariance of the edge, offset of the force."""
 
     @classmethod
-    def of(cls, problem: Problem, guess: Guess) -> Self:
-        old, new = beside(problem.before, guess.old), beside(problem.after, guess.new)
-        parts = np.linspace(0.0, 1.0, _PARTS).tolist()
-        offsets = np.linspace(guess.old[0], guess.new[0], _PARTS).tolist()
-        rows = [
-            _row(problem.signals, old.on_the_way(new, part), guess.edges, offset)
-            for part, offset in zip(parts, offsets, strict=True)
-        ]
+    def of(cls, problem: Problem, guess: Guess, middle: Plant | None) -> Self:
+        """Path of one pot, or that of two which stays at ``middle``."""
+        if middle is None:
+            old, new = deviate(problem.before, guess.old), deviate(problem.after, guess.new)
+            parts, offsets = np.linspace([0.0, guess.old[0]], [1.0, guess.new[0]], _POINTS).T.tolist()
+            plants = [old.on_the_way(new, part) for part in parts]
+        else:
+            # Each parameter of the middle plant has its old or its new deviation.
+            changed = problem.before.changes_to(middle)
+            own = [guess.new[1 + i] if name in changed else guess.old[1 + i] for i, name in enumerate(PARAMETERS)]
+            offsets = [0.5 * float(guess.old[0] + guess.new[0])] * _POINTS
+            plants = [deviate(middle, np.array([0.0, *own]))] * _POINTS
+        rows = []
+        for plant, offset in zip(plants, offsets, strict=True):
+            model = PlantModel.of(plant, guess.edges, problem.signals)
+            covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
+            rows.append(np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]]))
         return cls(problem.signals, *problem.filters(guess), guess.offset, np.array(rows))
 
-    @classmethod
-    def stopping(cls, problem: Problem, guess: Guess, middle: Plant) -> Self:
-        """All the way the plant is one that has of each parameter the old or the new value."""
-        turned = problem.before.changes_to(middle)
-        own = [guess.new[1 + i] if name in turned else guess.old[1 + i] for i, name in enumerate(PARAMETERS)]
-        offset = 0.5 * float(guess.old[0] + guess.new[0])
-        row = _row(problem.signals, beside(middle, np.array([offset, *own])), guess.edges, offset)
-        return cls(problem.signals, *problem.filters(guess), guess.offset, np.tile(row, (_PARTS, 1)))
+    def evaluate(self, begins: Indices, ends: Indices, shape: Shape) -> _Pairs:
+        """Evaluate every pair with its end after its begin, the longest first.
 
-    def tried(self, begins: Indices, ends: Indices, shape: Shape) -> _Tried:
-        """Every pair in which the end is after the begin; those that take longest first."""
+        A Kalman filter runs along the path of all pairs at once; only the pairs that last so long are updated.
+        """
         begin, end = (each.ravel() for each in np.meshgrid(begins, ends, indexing="ij"))
         begin, end = begin[begin < end], end[begin < end]
         longest_first = np.argsort(begin - end, kind="stable")
@@ -212,7 +211,7 @@ class _Ways:
         lengths, own = end - begin, np.zeros(len(begin))
         for k in range(int(lengths.max())):
             on = slice(0, int((lengths > k).sum()))
-            a, b, c, d, gx, gv, ex, ev, exx, exv, evv, offset = self._at(shape((k + 0.5) / lengths[on]))
+            a, b, c, d, gx, gv, ex, ev, exx, exv, evv, offset = self._interpolate(shape((k + 0.5) / lengths[on]))
             at = begin[on] + k
             force, edge = self.signals.force_n[at] + offset * self.signals.noise_n, self.signals.edges_n[at]
             x[on], v[on] = (
@@ -236,29 +235,21 @@ class _Ways:
             p[on], q[on], r[on] = p[on] - gain * p[on], q[on] - gain * q[on], r[on] - other * q[on]
         state = np.stack([x, v], axis=1)[:, :, None]
         covariance = np.stack([p, q, q, r], axis=1).reshape(-1, 2, 2)
-        form, met = joined(state, covariance, self.new.vector[end][:, :, :1], self.new.information[end])
+        form, met = join(state, covariance, self.new.vector[end][:, :, :1], self.new.information[end])
         fit = fit + own + form[:, 0, 0] + self.new.misfit[end, 0, 0]
-        return _Tried(begin, end, fit + log + met + self.new.log[end], fit, own / lengths)
+        return _Pairs(begin, end, fit + log + met + self.new.log[end], fit, own / lengths)
 
-    def _at(self, part: Array) -> Array:
-        """(12, p): the columns of ``parts`` at these parts of the way."""
-        place = part * (_PARTS - 1)
-        lower = np.minimum(place.astype(np.int64), _PARTS - 2)
+    def _interpolate(self, part: Array) -> Array:
+        """(12, p) columns of ``points`` at p parts of the path."""
+        place = part * (_POINTS - 1)
+        lower = np.minimum(place.astype(np.int64), _POINTS - 2)
         beyond = (place - lower)[:, None]
-        return np.asarray((self.parts[lower] * (1.0 - beyond) + self.parts[lower + 1] * beyond).T)
+        return np.asarray((self.points[lower] * (1.0 - beyond) + self.points[lower + 1] * beyond).T)
 
 
-def _row(signals: Signals, plant: Plant, edges: EdgePlace, offset: float) -> Array:
-    """(12,) of ``_Ways.parts``."""
-    model = PlantModel.of(plant, edges, signals)
-    covariance = model.edge_covariance[[0, 0, 1], [0, 1, 1]]
-    return np.concatenate([model.transition.ravel(), model.response, model.edge, covariance, [offset]])
-
-
-def _evenly(part: Array) -> Array:
+def _even(part: Array) -> Array:
     return part
 
 
-def _gently(part: Array) -> Array:
-    """With the least jerk."""
+def _least_jerk(part: Array) -> Array:
     return part**3 * (10.0 - 15.0 * part + 6.0 * part**2)

@@ -1,11 +1,11 @@
-"""The likelihood of a change of the plant at every sample at once: a Kalman filter with the plant as it was runs
-forwards, an information filter with the plant as it then is runs backwards, and at each instant they are joined by the
-state (displacement and velocity), which goes through a change without a jump (two filters; Fraser and Potter 1969).
+"""Likelihood of a plant change at every sample, by two filters (Fraser and Potter 1969).
 
-What is not known enters linearly, about its best value so far, and is carried along in columns: the offset of the
-displacement and the place of the edges, which both plants share, and of each plant the offset of the force and the
-logarithms of M, B, K. The sampled force does not tell where between two samples an edge came: beside its mean place,
-how far it may be off is noise that disturbs the state there.
+A Kalman filter with the plant before the change runs forwards; an information filter with the plant after it runs
+backwards. At each instant both are join by the state (displacement and velocity), which is continuous at a change.
+
+Unknowns enter linearly, about their best values so far, as columns that the filters carry. Both plants share the offset
+of the displacement and the place of the edges; each has its own offset of the force and logarithms of M, B, K. The
+sampled force does not show where between two samples an edge lies: the deviation from its mean place is process noise.
 """
 
 from __future__ import annotations
@@ -25,41 +25,37 @@ from analogrig.run import CHANNELS, MEASURED, Channel, missing_to_device
 Array = NDArray[np.float64]
 
 COMMON, OWN = 2, 4
-"""Unknowns that both plants share, and those of each: a filter has 1 + COMMON + OWN columns, the first one known."""
+"""Number of unknowns that both plants share, and of each. A filter has 1 + COMMON + OWN columns; the first is known."""
 
 _EDGE = 30.0
-"""A step of the force is an edge, in rms of its noise."""
+"""Smallest step of the force that counts as an edge, in rms of its noise."""
 _DIFFUSE = 1e6
-"""Variance of the state at the first sample, in that of the noise."""
-_VANISHED = 1e-14
+"""Variance of the state at the first sample, in units of the noise variance."""
+_NEGLIGIBLE = 1e-14
 _STEP = 1e-4
-"""Of a logarithm of M, B or K, for a derivative; of a place in a sample period it is a hundred times that."""
+"""Step in a logarithm of M, B or K for its derivative; a place in a sample period moves by a hundred times that."""
 _PLACES = (np.arange(8) + 0.5) / 4.0 - 1.0
-"""Over a range of half width 1: the middles of eight parts."""
+"""Middles of eight parts of the range -1..1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """n consecutive samples, without a gap in time, of force and displacement."""
+    """Force and displacement of n consecutive samples without a gap; noise is rms, quantisation included."""
 
-    force_n: Array
-    """(n,) newtons."""
-    displacement_m: Array
-    """(n,) metres."""
+    force_n: Array  # (n,) newtons
+    displacement_m: Array  # (n,) metres
     valid: NDArray[np.bool_]
-    """(n,): the displacement was measured, not clipped or lost."""
+    """(n,): False where the displacement is clipped or lost."""
     period_s: float
     """Problem time between samples."""
     noise_n: float
-    """rms of the noise of the force, quantisation included."""
     noise_m: float
-    """rms of the noise of the displacement, quantisation included."""
 
     @classmethod
     def of(
         cls, codes: NDArray[np.uint16], clipped: NDArray[np.bool_], channels: Mapping[str, Channel], period_s: float
     ) -> Self:
-        """Of codes and clipped (n, 4), columns as CHANNELS."""
+        """Signals from ``codes`` and ``clipped``, both (n, 4) with columns as CHANNELS."""
         columns = {name: channels[name].physical(codes[:, CHANNELS.index(name)]) for name in MEASURED}
         noise_n, noise_m = (
             (channels[name].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(channels[name].lsb)
@@ -69,12 +65,10 @@ class Signals:
         return cls(columns["force"], columns["displacement"], valid, period_s, noise_n, noise_m)
 
     def part(self, first: int, end: int) -> Signals:
-        """The samples first <= k < end."""
+        """Return the samples first <= k < end."""
+        kept = slice(first, end)
         return replace(
-            self,
-            force_n=self.force_n[first:end],
-            displacement_m=self.displacement_m[first:end],
-            valid=self.valid[first:end],
+            self, force_n=self.force_n[kept], displacement_m=self.displacement_m[kept], valid=self.valid[kept]
         )
 
     def __len__(self) -> int:
@@ -82,14 +76,14 @@ class Signals:
 
     @functools.cached_property
     def edges_n(self) -> Array:
-        """(n,) newtons: the step of the force in the period after each sample, where it is an edge, otherwise 0."""
+        """(n,) newtons: step of the force in the period after each sample; 0 where it is no edge."""
         steps = np.append(np.diff(self.force_n), 0.0)
         return np.where(np.abs(steps) < _EDGE * self.noise_n, 0.0, steps)
 
 
 @dataclass(frozen=True)
 class EdgePlace:
-    """Where in a sample period the edges of the force come: around a mean place (0..1), evenly within a half width."""
+    """Place of the force's edges in a sample period (0..1): uniform within ``half_width`` of ``mean``."""
 
     mean: float
     half_width: float
@@ -100,31 +94,23 @@ ANYWHERE = EdgePlace(0.5, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class PlantModel:
-    """One plant from sample to sample. Displacement in the rms of its noise, velocity in that per sample.
+    """Motion of one plant over one sample period, with derivatives by the logarithms of M, B, K (first axis).
 
-    Derivatives are by the logarithms of M, B, K.
+    State: displacement in rms of its noise, velocity in that per sample.
     """
 
-    transition: Array
-    """(2, 2)"""
-    response: Array
-    """(2,) per newton that is held."""
-    edge: Array
-    """(2,) per newton of an edge, on average over its places."""
-    edge_covariance: Array
-    """(2, 2) of that."""
-    edge_by_place: Array
-    """(2,)"""
-    transition_by: Array
-    """(3, 2, 2)"""
-    response_by: Array
-    """(3, 2)"""
-    edge_by: Array
-    """(3, 2)"""
+    transition: Array  # (2, 2)
+    response: Array  # (2,) per newton of held force
+    edge: Array  # (2,) per newton of an edge, mean over its places
+    edge_covariance: Array  # (2, 2) of the same
+    edge_by_place: Array  # (2,)
+    transition_by: Array  # (3, 2, 2)
+    response_by: Array  # (3, 2)
+    edge_by: Array  # (3, 2)
 
     @classmethod
     def of(cls, plant: Plant, edges: EdgePlace, signals: Signals) -> Self:
-        """For the period and the noise of ``signals``."""
+        """Model for the period and the noise of ``signals``."""
         transition, response = _sampled(plant, 1.0, signals)
         places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0)
         late = np.array([_sampled(plant, 1.0 - place, signals)[1] for place in places.tolist()])
@@ -145,21 +131,21 @@ class PlantModel:
         )
 
     def inputs(self, signals: Signals, offset: float) -> Array:
-        """(n, 2): what the force does to the state in the period after each sample.
+        """(n, 2) effect of the force on the state in the period after each sample.
 
-        :param offset: of the force, in the rms of its noise.
+        :param offset: offset of the force, in rms of its noise.
         """
         force = (signals.force_n + offset * signals.noise_n)[:, None]
         return np.asarray(self.response * force + self.edge * signals.edges_n[:, None])
 
     def disturbances(self, signals: Signals) -> Array:
-        """(n, 2, 2): covariance of what is not known of that."""
+        """(n, 2, 2) covariance of the error of ``inputs``."""
         noise = signals.noise_n**2 * np.outer(self.response, self.response)
         return np.asarray(noise + signals.edges_n[:, None, None] ** 2 * self.edge_covariance)
 
 
 def _sampled(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]:
-    """Transition (2, 2) and response (2,) over a part of a sample period."""
+    """Transition (2, 2) and response (2,) over ``part`` (0..1) of a sample period."""
     if part <= 0.0:
         return np.eye(2), np.zeros(2)
     period_s = signals.period_s
@@ -169,124 +155,118 @@ def _sampled(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]
     return transition, np.array([xf, vf * period_s]) / signals.noise_m
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """What drives a filter and what it is to explain; c columns, the first known, the others per unit of an unknown."""
+Offsets = tuple[float, float]
+"""Offsets of displacement and force, in rms of their noise."""
 
-    inputs: Array
-    """(n, 2, c): of the state, in the period after each sample."""
-    measured: Array
-    """(n, c): the displacement."""
 
-    @classmethod
-    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: tuple[float, float]) -> Self:
-        """About a course of the state (n, 2) and offsets of displacement and force, in the rms of their noise."""
-        n = len(signals)
-        force = (signals.force_n + offsets[1] * signals.noise_n)[:, None]
-        edges = signals.edges_n[:, None]
-        inputs = np.zeros((n, 2, 1 + COMMON + OWN))
-        inputs[:, :, 0] = model.inputs(signals, offsets[1])
-        inputs[:, :, 2] = model.edge_by_place * edges
-        inputs[:, :, 3] = model.response * signals.noise_n
-        for i in range(len(PARAMETERS)):
-            own = course @ model.transition_by[i].T + model.response_by[i] * force
-            inputs[:, :, 4 + i] = own + model.edge_by[i] * edges
-        measured = np.zeros((n, 1 + COMMON + OWN))
-        measured[:, 0] = signals.displacement_m / signals.noise_m - offsets[0]
-        measured[:, 1] = -1.0
-        return cls(inputs, measured)
+def _columns(model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> tuple[Array, Array]:
+    """Inputs (n, 2, c) of the state after each sample, and measurements (n, c), about a course of the state (n, 2).
+
+    The first of the c columns is known; the others are per unit of an unknown.
+    """
+    n = len(signals)
+    force = (signals.force_n + offsets[1] * signals.noise_n)[:, None]
+    edges = signals.edges_n[:, None]
+    inputs = np.zeros((n, 2, 1 + COMMON + OWN))
+    inputs[:, :, 0] = model.inputs(signals, offsets[1])
+    inputs[:, :, 2] = model.edge_by_place * edges
+    inputs[:, :, 3] = model.response * signals.noise_n
+    for i in range(len(PARAMETERS)):
+        own = course @ model.transition_by[i].T + model.response_by[i] * force
+        inputs[:, :, 4 + i] = own + model.edge_by[i] * edges
+    measured = np.zeros((n, 1 + COMMON + OWN))
+    measured[:, 0] = signals.displacement_m / signals.noise_m - offsets[0]
+    measured[:, 1] = -1.0
+    return inputs, measured
 
 
 @dataclass(frozen=True, eq=False)
-class Forwards:
-    """What the samples up to each one say, itself included."""
+class ForwardFilter:
+    """State at each sample given the samples up to and including it, in c columns."""
 
-    state: Array
-    """(n, 2, c): the columns of the state's mean."""
-    covariance: Array
-    """(n, 2, 2)"""
+    state: Array  # (n, 2, c): mean
+    covariance: Array  # (n, 2, 2)
     misfit: Array
-    """(n, c, c): the quadratic form of what is left of the samples, in their noise."""
+    """(n, c, c): quadratic form of the residuals up to each sample, in units of their noise."""
     log: Array
-    """(n,): sum of the logarithms of the innovations' variances."""
+    """(n,): cumulative sum of the logarithms of the innovation variances."""
     innovation: Array
-    """(n, c): in their standard deviation; 0 for a sample that is none."""
+    """(n, c): in standard deviations; 0 where the sample is not valid."""
 
     @classmethod
-    def of(cls, model: PlantModel, signals: Signals, columns: Columns) -> Self:
-        """A Kalman filter that begins with any state."""
+    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> Self:
+        """Run a Kalman filter with a diffuse initial state; ``course`` and ``offsets`` as for ``_columns``."""
+        inputs, measured = _columns(model, signals, course, offsets)
         weight = signals.valid.astype(np.float64)
         gain, size, covariance = _gains(model, weight, model.disturbances(signals))
         kept = np.tile(np.eye(2), (len(signals), 1, 1))
         kept[:, :, 0] -= gain
-        entering = _after_first(columns.inputs[:-1])
-        taken = gain[:, :, None] * columns.measured[:, None, :]
-        state = scan(kept @ model.transition, kept @ entering + taken)
-        predicted = _after_first(model.transition @ state[:-1]) + entering
-        innovation = columns.measured - predicted[:, 0, :]
+        entering = _zero_first(inputs[:-1])
+        corrected = gain[:, :, None] * measured[:, None, :]
+        state = scan(kept @ model.transition, kept @ entering + corrected)
+        predicted = _zero_first(model.transition @ state[:-1]) + entering
+        innovation = measured - predicted[:, 0, :]
         innovation *= np.sqrt(weight / size)[:, None]
         misfit = np.cumsum(innovation[:, :, None] * innovation[:, None, :], axis=0)
         return cls(state, covariance, misfit, np.cumsum(np.log(size)), innovation)
 
 
 @dataclass(frozen=True, eq=False)
-class Backwards:
-    """What the samples after each one say of the state there, itself not included: x' information x - 2 x' vector."""
+class BackwardFilter:
+    """Cost of the state at each sample given the samples after it: x' information x - 2 x' vector + misfit + log."""
 
-    vector: Array
-    """(n, 2, c)"""
-    information: Array
-    """(n, 2, 2)"""
-    misfit: Array
-    """(n, c, c)"""
-    log: Array
-    """(n,)"""
+    vector: Array  # (n, 2, c)
+    information: Array  # (n, 2, 2)
+    misfit: Array  # (n, c, c)
+    log: Array  # (n,)
 
     @classmethod
-    def of(cls, model: PlantModel, signals: Signals, columns: Columns) -> Self:
-        """An information filter that begins, at the end, knowing nothing."""
+    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> Self:
+        """Run an information filter from zero information after the last sample; parameters as for ForwardFilter."""
+        inputs, measured = _columns(model, signals, course, offsets)
         weight = signals.valid.astype(np.float64)
         disturbances = model.disturbances(signals)[:-1]
-        known = _informations(model, weight, disturbances)  # at the sample after each, that one included
+        known = _information(model, weight, disturbances)
         inner = np.eye(2) + known @ disturbances
         softened = disturbances @ np.linalg.inv(inner)
         back = model.transition.T @ (np.eye(2) - known @ softened)
-        inputs, measured = columns.inputs[:-1], columns.measured[1:]
+        inputs, measured = inputs[:-1], measured[1:]
         pushed = known @ inputs
         own = np.zeros_like(pushed)
         own[:, 0, :] = weight[1:, None] * measured
         vector = scan(back[::-1], (back @ (own - pushed))[::-1])[::-1]
-        whole = _before_last(vector[1:]) + own
-        cross = _turned(whole) @ inputs
+        whole = _zero_last(vector[1:]) + own
+        cross = _transpose(whole) @ inputs
         left = whole - pushed
         squares = weight[1:, None, None] * measured[:, :, None] * measured[:, None, :]
-        squares += _turned(inputs) @ pushed - cross - _turned(cross) - _turned(left) @ softened @ left
+        squares += _transpose(inputs) @ pushed - cross - _transpose(cross) - _transpose(left) @ softened @ left
         return cls(
-            _before_last(vector),
-            _before_last(back @ known @ model.transition),
-            _before_last(np.cumsum(squares[::-1], axis=0)[::-1]),
-            _before_last(np.cumsum(np.log(np.linalg.det(inner))[::-1])[::-1]),
+            _zero_last(vector),
+            _zero_last(back @ known @ model.transition),
+            _zero_last(np.cumsum(squares[::-1], axis=0)[::-1]),
+            _zero_last(np.cumsum(np.log(np.linalg.det(inner))[::-1])[::-1]),
         )
 
 
-def joined(state: Array, covariance: Array, vector: Array, information: Array) -> tuple[Array, Array]:
-    """What the two filters say of each other where they meet: the quadratic form (m, c, c) and the logarithm (m,).
+def join(state: Array, covariance: Array, vector: Array, information: Array) -> tuple[Array, Array]:
+    """Cost of joining both filters at m instants: quadratic form (m, c, c) and logarithm of the determinant (m,).
 
-    state, vector (m, 2, c) over the columns of both; covariance, information (m, 2, 2).
+    :param state: (m, 2, c) over the columns of both plants, as is ``vector``.
+    :param covariance: (m, 2, 2), as is ``information``.
     """
     inner = np.eye(2) + information @ covariance
     left = vector - information @ state
-    cross = _turned(state) @ vector
-    form = _turned(state) @ information @ state - cross - _turned(cross)
-    form -= _turned(left) @ covariance @ np.linalg.inv(inner) @ left
+    cross = _transpose(state) @ vector
+    form = _transpose(state) @ information @ state - cross - _transpose(cross)
+    form -= _transpose(left) @ covariance @ np.linalg.inv(inner) @ left
     return form, np.log(np.linalg.det(inner))
 
 
 def scan(factors: Array, terms: Array) -> Array:
-    """s(k) = factors(k) s(k-1) + terms(k) from s(-1) = 0; (n, 2, 2) and (n, 2, c) to (n, 2, c). By doubling."""
+    """Solve s(k) = factors(k) s(k-1) + terms(k), s(-1) = 0, by doubling; (n, 2, 2) and (n, 2, c) give (n, 2, c)."""
     factors, sums, shift = factors.copy(), terms.copy(), 1
     factors[:1] = 0.0
-    while shift < len(sums) and np.abs(factors).max() > _VANISHED:
+    while shift < len(sums) and np.abs(factors).max() > _NEGLIGIBLE:
         sums[shift:] += factors[shift:] @ sums[:-shift]
         factors[shift:] = factors[shift:] @ factors[:-shift]
         factors[:shift] = 0.0
@@ -295,9 +275,9 @@ def scan(factors: Array, terms: Array) -> Array:
 
 
 def _gains(model: PlantModel, weight: Array, disturbances: Array) -> tuple[Array, Array, Array]:
-    """Of each sample the gain (n, 2), the innovation's variance (n,), and the covariance with it taken in (n, 2, 2).
+    """Kalman gain (n, 2), innovation variance (n,) and updated covariance (n, 2, 2) at each sample.
 
-    In plain floats, since a 2 x 2 product takes numpy ten times as long.
+    Plain floats: numpy takes ten times as long for a 2 x 2 product.
     """
     (a, b), (c, d) = model.transition.tolist()
     p, q, r = _DIFFUSE, 0.0, _DIFFUSE
@@ -312,12 +292,12 @@ def _gains(model: PlantModel, weight: Array, disturbances: Array) -> tuple[Array
             a * c * p + (a * d + b * c) * q + b * d * r + pq,
             c * c * p + 2.0 * c * d * q + d * d * r + qq,
         )
-    table = np.array(rows)
-    return table[:, :2], table[:, 2], table[:, 3:].reshape(-1, 2, 2)
+    steps = np.array(rows)
+    return steps[:, :2], steps[:, 2], steps[:, 3:].reshape(-1, 2, 2)
 
 
-def _informations(model: PlantModel, weight: Array, disturbances: Array) -> Array:
-    """(n - 1, 2, 2): what the samples from the next one on say of the state at that next one."""
+def _information(model: PlantModel, weight: Array, disturbances: Array) -> Array:
+    """(n - 1, 2, 2) information on the state at each sample but the first, from that sample on."""
     (a, b), (c, d) = model.transition.tolist()
     p = q = r = 0.0
     rows = []
@@ -336,13 +316,14 @@ def _informations(model: PlantModel, weight: Array, disturbances: Array) -> Arra
     return np.array(rows[::-1]).reshape(-1, 2, 2)
 
 
-def _turned(matrices: Array) -> Array:
+def _transpose(matrices: Array) -> Array:
+    """Transpose each of the matrices (m, r, c)."""
     return np.swapaxes(matrices, 1, 2)
 
 
-def _after_first(rows: Array) -> Array:
+def _zero_first(rows: Array) -> Array:
     return np.concatenate([np.zeros_like(rows[:1]), rows])
 
 
-def _before_last(rows: Array) -> Array:
+def _zero_last(rows: Array) -> Array:
     return np.concatenate([rows, np.zeros_like(rows[:1])])
