@@ -18,10 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analogrig.hardware.calibration.check import seen_lsb
 from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
 from analogrig.hardware.calibration.plan import Program, scenarios
-from analogrig.hardware.calibration.recordings import DISPLACEMENT, record
+from analogrig.hardware.calibration.recordings import DISPLACEMENT, noise_free_lsb, record
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.scenario import PlantChoice, Scenario, Tweak
 from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
@@ -112,7 +111,7 @@ def truth(rig: DrawnRig) -> dict[str, float]:
 
 def rms_lsb(rig: DrawnRig, twin: EmulatorDescription, scenario: Scenario) -> float:
     """Of the difference between the displacements of rig and twin over the whole scenario, without noise."""
-    difference = seen_lsb(rig.description, scenario, 0) - seen_lsb(twin, scenario, 0)
+    difference = noise_free_lsb(rig.description, scenario, 0) - noise_free_lsb(twin, scenario, 0)
     return float(np.sqrt(np.mean(difference[:, DISPLACEMENT] ** 2)))
 
 

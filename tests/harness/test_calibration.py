@@ -19,16 +19,16 @@ from analogrig.cli import main
 from analogrig.cli.calibrate import _said
 from analogrig.errors import ConfigurationError, RigError
 from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
-from analogrig.hardware.calibration.model import EmulatorModel, _taken_late
+from analogrig.hardware.calibration.model import EmulatorModel, _late_displacement
 from analogrig.hardware.calibration.plan import check_scenario, scenarios
 from analogrig.hardware.calibration.recordings import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,
-    averaged,
-    noise_of,
+    average_phases,
+    estimate_noise,
     record,
-    rounding,
+    rounding_variance,
 )
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
@@ -91,7 +91,7 @@ def test_noise_is_told_from_rounded_samples(noise_lsb: float) -> None:
     rng = np.random.default_rng(5)
     levels = np.tile(rng.uniform(1000.0, 2000.0, 100), 100)
     codes = np.floor(levels + noise_lsb * rng.standard_normal(len(levels)) + 0.5)
-    found, error = noise_of([made(codes)], DISPLACEMENT)
+    found, error = estimate_noise([made(codes)], DISPLACEMENT)
     assert abs(found - noise_lsb) <= 4.0 * error
     assert error < 0.05 or noise_lsb == 0.0
 
@@ -103,24 +103,24 @@ def test_rounding_leaves_that_variance_in_a_mean(noise_lsb: float) -> None:
     steps = np.arange(-8, 9) + 0.5
     beyond = (levels[:, None] - steps[None]) / (math.sqrt(2.0) * max(noise_lsb, 1e-9))
     mean_code = -8 + 0.5 * (1.0 + np.vectorize(math.erf)(beyond)).sum(axis=1)
-    assert rounding(noise_lsb) == pytest.approx(np.mean((mean_code - levels) ** 2), rel=0.01, abs=1e-6)
+    assert rounding_variance(noise_lsb) == pytest.approx(np.mean((mean_code - levels) ** 2), rel=0.01, abs=1e-6)
 
 
 def test_phases_with_a_clipped_sample_are_left_out() -> None:
     codes = np.full(1400, 1500.0)
     clipped = np.zeros(1400, np.bool_)
     clipped[[703, 1207]] = True
-    average = averaged(made(codes, clipped=clipped), FORCE, 0.5)
+    average = average_phases(made(codes, clipped=clipped), FORCE, 0.5)
     assert set(range(100)) - set(average.phases.tolist()) == {3, 7}
 
 
-def test_the_displacement_taken_late_is_that_of_a_card_with_that_skew() -> None:
+def test_the_displacement_late_displacement_is_that_of_a_card_with_that_skew() -> None:
     """By moving the force, and by a machine of four times the rate; they begin apart by less than a sample."""
     card = Card(skew_s=(0.0, 12.5e-6, 0.0, 0.0))
     fast = SuspensionComputer("front", sample_rate_hz=card.rate_hz * probes_per_sample(card))
     wave = Excitation(frequency_hz=400.0)
     expected = np.concatenate(list(acquired(fast, card, wave, 300, rng=np.random.default_rng(1))))[:, DISPLACEMENT]
-    taken = _taken_late(SuspensionComputer("front"), wave, 300, 0.25)
+    taken = _late_displacement(SuspensionComputer("front"), wave, 300, 0.25)
     np.testing.assert_allclose(taken[100:], expected[100:], rtol=0, atol=1e-6)
 
 
@@ -166,8 +166,8 @@ def otherwise(recordings: list[SquareWaveRecording], **changes: Any) -> list[Squ
 @pytest.mark.parametrize(
     ("codes", "message"),
     [
-        (lambda each: each.codes[:, ::-1].copy(), "the emulator does not become like the recordings"),
-        (lambda each: np.full_like(each.codes, 500), "the emulator does not become like the recordings"),
+        (lambda each: each.codes[:, ::-1].copy(), "no emulator fits the recordings"),
+        (lambda each: np.full_like(each.codes, 500), "no emulator fits the recordings"),
         (lambda each: np.roll(each.codes, 1, axis=0), "the displacement is taken .* us before the edges of the force"),
     ],
     ids=["swapped leads", "silence", "edges a sample late"],
@@ -180,7 +180,7 @@ def test_recordings_that_no_computer_makes_end_in_one_line(
 
 
 def test_too_few_recordings_are_told_apart_from_enough(recordings: list[SquareWaveRecording]) -> None:
-    with pytest.raises(RigError, match="do not tell what is to be fitted|does not settle"):
+    with pytest.raises(RigError, match="do not determine the values to fit|does not converge"):
         calibrate(recordings[:1], stocks=("nominal",), pots=("coefficient",))
 
 
@@ -224,7 +224,7 @@ class Troubled:
             Troubled({}, ("the rig's self-test: skew",)),
             "scenario calibration-1: the rig's self-test: skew: nothing",
         ),
-        (Troubled({}, records=(0, 1)), "scenario calibration-1: was not recorded without a gap"),
+        (Troubled({}, records=(0, 1)), "scenario calibration-1: the samples have a gap"),
     ],
 )
 def test_overloaded_and_broken_recordings_are_not_fitted(rig: Troubled, message: str) -> None:

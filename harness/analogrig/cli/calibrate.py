@@ -66,8 +66,8 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError, RigError
-    from analogrig.hardware.calibration.check import difference_lsb
     from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate
+    from analogrig.hardware.calibration.recordings import difference_lsb
     from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
     from analogrig.storage import replacing
@@ -148,13 +148,13 @@ def _said(found: Calibration, check_lsb: float) -> list[str]:
 
 
 def _why_kept(found: Calibration) -> str:
-    from analogrig.hardware.calibration.fit import OUT_OF_THE_QUESTION
+    from analogrig.hardware.calibration.fit import LEAST_GAIN_OF_DIALS
 
     if found.is_least:
         return "of those tried the least chi-square"
     return (
         "the least chi-square but for dials, which have three unknowns more and gain less than"
-        f" {OUT_OF_THE_QUESTION:g} times what is left per degree of freedom"
+        f" {LEAST_GAIN_OF_DIALS:g} times what is left per degree of freedom"
     )
 
 

@@ -1,1 +1,1 @@
-"""Calibration: the emulator fitted to the recordings of a rig, so that it becomes the twin of that very rig."""
+"""Calibration: fits the emulator to recordings of a rig, which makes it the twin of that rig."""

@@ -1,6 +1,6 @@
-"""The fit: recordings in, a description of the emulator and its covariance out.
+"""Fit of the emulator to recordings: returns a description of the twin and the covariance of what was fitted.
 
-The weighted squares of the differences between the averages of the recordings and those of the emulator are minimised
+Minimises the weighted squares of the differences between the averages of the recordings and those of the emulator
 (Gauss-Newton; Bates and Watts, Nonlinear Regression Analysis, 2.2).
 """
 
@@ -20,81 +20,96 @@ from analogrig.hardware.calibration.recordings import (
     FORCE,
     SquareWaveRecording,
     Vector,
-    averaged,
-    noise_of,
-    rounding,
+    average_phases,
+    estimate_noise,
+    rounding_variance,
 )
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
 from analogrig.run import CHANNELS
 
 Stock = Literal["nominal", "polyester", "polypropylene"]
 Pots = Literal["coefficient", "dial"]
+Kind = tuple[Stock, Pots]
 
 STOCKS: tuple[Stock, ...] = ("polypropylene", "polyester", "nominal")
 POTS: tuple[Pots, ...] = ("coefficient", "dial")
 
+LEAST_GAIN_OF_DIALS = 30.0
+"""Least decrease in chi-square, per residual variance, for which dials are chosen: their three unknowns more gain this
+by chance with a probability of 1e-6."""
+
 _UNMEASURED_RANGE_V = (-12.5, 12.5)
 
-_ALIKE, _UNSEEN = 0.95, 0.8
-
+_ALIKE = 0.95
+"""Least correlation of two values that the recordings hardly separate."""
+_UNSEEN = 0.8
+"""Least standard error, in prior standard deviations, of a value that the recordings hardly show."""
 _MOST_DEVIATIONS = 5.0
-"""Of a chi-square that is left to chance, in its standard deviations."""
-
+"""Largest excess of a chi-square over its expectation that is chance, in its standard deviations."""
 _FINE_SKEW = 1e-3
-"""Of a sample period: closer than this the twin's skew need not be."""
+"""Accuracy of the twin's skew, in sample periods."""
+
+_DOUBTS_LSB = (30.0, 3.0)
+"""Added to the standard deviations of the first steps, while the model is not linear, so that the priors dominate."""
+_MOST_STEPS = 20
+_CONVERGED, _FAR = 0.02, 10.0
+"""Step lengths in standard errors: of the last step, and beyond which derivatives are computed anew."""
 
 
 @dataclass(frozen=True)
 class FittedValue:
-    """A fitted value with its standard error."""
+    """Fitted value with its standard error."""
 
     name: str
     value: float
     standard_error: float
     unit: str
     stands_for: str
-    """What acts in the same way and cannot be told from it."""
+    """Quantities with the same effect, which the value includes."""
     known_to: float = math.inf
-    """Its standard error before anything was recorded."""
+    """Prior standard deviation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig's twin, and how well it is known."""
+    """Twin of a rig with its uncertainty."""
 
     twin: EmulatorDescription
     estimates: tuple[FittedValue, ...]
     covariance: Vector
-    """Of those of the estimates that were fitted to the displacement together, which come first."""
+    """Covariance of the first estimates, which were fitted to the displacement jointly."""
     residual_lsb: float
     """rms between the averages of the recordings and of the twin."""
-    chi_squares: Mapping[tuple[Stock, Pots], float]
-    """Of the kinds of machine that can be fitted at all, of those that were tried."""
+    chi_squares: Mapping[Kind, float]
+    """Chi-square of each kind of machine whose fit converged."""
     freedom: int
-    """Its expectation."""
+    """Degrees of freedom: the expectation of the chi-square."""
 
     def estimate(self, name: str) -> FittedValue:
-        """:raises KeyError: none is called so."""
+        """Return the estimate of this name.
+
+        :raises KeyError: there is none.
+        """
         return {each.name: each for each in self.estimates}[name]
 
     @property
     def chi_square(self) -> float:
-        """Of the kind that the twin is of."""
+        """Chi-square of the twin's kind."""
         return self.chi_squares[self.twin.computer.components, self.twin.computer.pots]
 
     @property
     def is_least(self) -> bool:
-        """Whether no other kind has a smaller chi-square; see ``_likeliest``."""
+        """True if no other kind has a smaller chi-square; see ``_choose``."""
         return self.chi_square <= min(self.chi_squares.values())
 
     @property
     def explains_all(self) -> bool:
-        """Whether what is left of the recordings is no more than their noise."""
+        """True if noise alone explains the residuals."""
         return self.chi_square <= self.freedom + _MOST_DEVIATIONS * math.sqrt(2.0 * self.freedom)
 
     @property
     def alike(self) -> list[tuple[str, str, float]]:
-        """Pairs that the recordings hardly tell apart, with their correlation."""
+        """Pairs of values that the recordings hardly separate, with their correlation."""
         errors = np.sqrt(np.diag(self.covariance))
         correlation = self.covariance / np.outer(errors, errors)
         pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > _ALIKE, 1)), strict=True)
@@ -102,7 +117,7 @@ class Calibration:
 
     @property
     def unseen(self) -> list[str]:
-        """Those of which the recordings say little beyond the datasheet."""
+        """Names of values that are known little better than by the datasheet."""
         return [each.name for each in self.estimates if each.standard_error > _UNSEEN * each.known_to]
 
 
@@ -114,20 +129,33 @@ def calibrate(
     pots: Sequence[Pots] = POTS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Calibration:
-    """The twin of the rig that made the recordings, of the kind that explains them best.
+    """Fit the twin of the rig that made the recordings, of the kind that explains them best.
 
     :param recordings: those of ``plan.scenarios`` of one program.
-    :param op_amp: what the rig's amplifiers are.
-    :param stocks: what its other components may be; one or more.
-    :param pots: what its pots may be set by; one or both.
-    :param progress: told how many kinds of machine have been tried, and of how many.
-    :raises RigError: no emulator is like it: the fit does not settle, or the displacement comes before the force.
+    :param op_amp: type of the rig's amplifiers.
+    :param stocks: candidate types of its other components; one or more.
+    :param pots: candidate quantities that its pots are set by; one or both.
+    :param progress: called with the number of kinds fitted, and of all kinds.
+    :raises RigError: no fit converges, or the displacement precedes the force.
     :raises ConfigurationError: half a period is no whole number of samples.
     """
-    noise_lsb, noise_error = noise_of(recordings, DISPLACEMENT)
-    kinds = [[ComputerDescription(op_amp=op_amp, components=stock, pots=set_by) for stock in stocks] for set_by in pots]
-    fits = _fits([[EmulatorModel(recordings, machine, noise_lsb) for machine in alike] for alike in kinds], progress)
-    best = _likeliest(fits)
+    noise_lsb, noise_error = estimate_noise(recordings, DISPLACEMENT)
+    fits: dict[Kind, _EmulatorFit] = {}
+    problems: list[RigError] = []
+    for set_by in pots:
+        start: Vector | None = None  # kinds of the same pots have the same unknowns
+        for stock in stocks:
+            machine = ComputerDescription(op_amp=op_amp, components=stock, pots=set_by)
+            try:
+                fit = fits[stock, set_by] = _minimise(EmulatorModel(recordings, machine, noise_lsb), start)
+                start = fit.x
+            except RigError as error:
+                problems.append(error)
+            if progress is not None:
+                progress(len(fits) + len(problems), len(pots) * len(stocks))
+    if not fits:
+        raise problems[0]
+    best = _choose(fits)
     noise = FittedValue("displacement noise", noise_lsb, noise_error, "LSB", "white, rms, before rounding")
     estimates = (*best.estimates(), noise, *_force_channel(recordings))
     computer = best.model.computer(best.model.by_name(best.x))
@@ -141,59 +169,24 @@ def calibrate(
     )
 
 
-def _fits(
-    models: Sequence[Sequence[EmulatorModel]], progress: Callable[[int, int], None] | None
-) -> dict[tuple[Stock, Pots], _EmulatorFit]:
-    """Of every kind that can be fitted at all; those that have the same unknowns are in one row.
+def _choose(fits: Mapping[Kind, _EmulatorFit]) -> _EmulatorFit:
+    """Fit with the least chi-square; pots set by coefficients are preferred unless dials gain much.
 
-    :raises RigError: none can; that of the first.
+    With dials the tracks are unknowns too, and three unknowns more always explain a little more.
     """
-    fits: dict[tuple[Stock, Pots], _EmulatorFit] = {}
-    problems: list[RigError] = []
-    for alike in models:
-        start: Vector | None = None
-        for model in alike:
-            try:
-                fit = _fitted(model, start)
-            except RigError as error:
-                problems.append(error)
-            else:
-                fits[model.nominal.components, model.nominal.pots], start = fit, fit.x
-            if progress is not None:
-                progress(len(fits) + len(problems), sum(map(len, models)))
-    if not fits:
-        raise problems[0]
-    return fits
-
-
-def _likeliest(fits: Mapping[tuple[Stock, Pots], _EmulatorFit]) -> _EmulatorFit:
-    """The one with the least chi-square; but pots are set by coefficients unless that is out of the question, for
-    tracks that are unknowns too explain a bit more of anything."""
     kinds = sorted(fits, key=lambda kind: fits[kind].chi_square)
     least = fits[kinds[0]]
     simple = next((fits[kind] for kind in kinds if kind[1] == "coefficient"), least)
-    excess = (simple.chi_square - least.chi_square) / max(1.0, least.chi_square / least.freedom)
-    return least if excess > OUT_OF_THE_QUESTION else simple
-
-
-OUT_OF_THE_QUESTION = 30.0
-"""Three unknowns more gain this by chance with a probability of 1e-6."""
+    gain = (simple.chi_square - least.chi_square) / max(1.0, least.chi_square / least.freedom)
+    return least if gain > LEAST_GAIN_OF_DIALS else simple
 
 
 # ---- Gauss-Newton
 
-_DOUBTS_LSB = (30.0, 3.0)
-"""Added to the standard deviations at first, when the model is not yet linear: until then what is known holds."""
-
-_MOST_STEPS = 20
-
-_SETTLED, _FAR = 0.02, 10.0
-"""In standard errors: a step that is the last, and one after which the slopes are others."""
-
 
 @dataclass(frozen=True, eq=False)
 class _EmulatorFit:
-    """Where the squares are least."""
+    """Minimum of the squares."""
 
     model: EmulatorModel
     x: Vector
@@ -210,7 +203,7 @@ class _EmulatorFit:
 
     @property
     def covariance(self) -> Vector:
-        """Of the unknowns but for the pots' settings; wider where more is left than the noise explains."""
+        """Covariance of the unknowns but for the pots' settings, scaled up if noise does not explain the residuals."""
         n = len(self.model.unknowns)
         return self.covariance_of_all[:n, :n] * max(1.0, self.chi_square / self.freedom)
 
@@ -222,54 +215,51 @@ class _EmulatorFit:
         ]
 
 
-def _fitted(model: EmulatorModel, x: Vector | None) -> _EmulatorFit:
-    """From x, or from nominal. The last slopes are kept while steps are short.
+def _minimise(model: EmulatorModel, x: Vector | None) -> _EmulatorFit:
+    """Minimise from ``x``, or from nominal values; derivatives are kept while steps are short.
 
-    :raises RigError: it does not settle.
+    :raises RigError: the fit does not converge.
     """
-    x = _approached(model) if x is None else x
-    slopes, covariance = _linear(model, x)
+    if x is None:
+        x = np.zeros(len(model.known_to))
+        for doubt_lsb in _DOUBTS_LSB:
+            slopes, covariance = _linearise(model, x, doubt_lsb)
+            x = x - covariance @ slopes.T @ model.residuals(x, doubt_lsb)
+    slopes, covariance = _linearise(model, x)
     for _ in range(_MOST_STEPS):
         residuals = model.residuals(x)
         step = covariance @ slopes.T @ residuals
         length = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
-        if length <= _SETTLED:
+        if length <= _CONVERGED:
             return _EmulatorFit(model, x, residuals, covariance)
         x = x - step
         if length > _FAR:
-            slopes, covariance = _linear(model, x)
-    raise RigError("the emulator does not become like the recordings: the fit does not settle")
+            slopes, covariance = _linearise(model, x)
+    raise RigError("no emulator fits the recordings: the fit does not converge")
 
 
-def _approached(model: EmulatorModel) -> Vector:
-    x = np.zeros(len(model.known_to))
-    for doubt_lsb in _DOUBTS_LSB:
-        slopes, covariance = _linear(model, x, doubt_lsb)
-        x = x - covariance @ slopes.T @ model.residuals(x, doubt_lsb)
-    return x
-
-
-def _linear(model: EmulatorModel, x: Vector, doubt_lsb: float = 0.0) -> tuple[Vector, Vector]:
-    """The slopes of the residuals, and the covariance that they give."""
+def _linearise(model: EmulatorModel, x: Vector, doubt_lsb: float = 0.0) -> tuple[Vector, Vector]:
+    """Derivative of the residuals at ``x`` and the covariance that it gives."""
     slopes = model.jacobian(x, doubt_lsb)
     return slopes, _inverse(slopes.T @ slopes)
 
 
 def _inverse(normal: Vector) -> Vector:
-    """Of a symmetric matrix whose rows are in units of their own.
+    """Inverse of a symmetric matrix whose rows have different units.
 
-    :raises RigError: there is none.
+    :raises RigError: it is singular.
     """
-    own, untold = np.diag(normal), "the recordings do not tell what is to be fitted: are there enough, and of a signal?"
+    own = np.diag(normal)
+    singular = RigError("the recordings do not determine the values to fit: check their number and their signals")
     if not (own > 0.0).all():
-        raise RigError(untold)
+        raise singular
     units = np.sqrt(np.outer(own, own))
     try:
         inverse = np.linalg.inv(normal / units) / units
     except np.linalg.LinAlgError as error:
-        raise RigError(untold) from error
+        raise singular from error
     if not (np.diag(inverse) > 0.0).all():
-        raise RigError(untold)
+        raise singular
     return np.asarray(inverse)
 
 
@@ -277,8 +267,8 @@ def _inverse(normal: Vector) -> Vector:
 
 
 def _force_channel(recordings: Sequence[SquareWaveRecording]) -> list[FittedValue]:
-    """Offset, gain error and noise of the channel of the force, whose levels are known: a weighted line."""
-    noise_lsb, noise_error = noise_of(recordings, FORCE)
+    """Offset, gain error and noise of the force's channel: a weighted line through its known levels."""
+    noise_lsb, noise_error = estimate_noise(recordings, FORCE)
     levels = [level for recording in recordings for level in _levels(recording, noise_lsb)]
     volts, errors_lsb, variances = np.array(levels).T
     design = np.stack([np.ones(len(volts)), volts], axis=1) / np.sqrt(variances)[:, None]
@@ -293,10 +283,10 @@ def _force_channel(recordings: Sequence[SquareWaveRecording]) -> list[FittedValu
 
 
 def _levels(recording: SquareWaveRecording, noise_lsb: float) -> list[tuple[float, float, float]]:
-    """Of both levels of the force: the level and by how much its mean code is off, both in LSB, and the variance."""
-    average = averaged(recording, FORCE, noise_lsb)
+    """Both levels of the force: level and error of its mean code, both in LSB, and the variance of the latter."""
+    average = average_phases(recording, FORCE, noise_lsb)
     channel, wave, half_n = recording.channels["force"], recording.scenario.excitation, recording.period_n // 2
-    left, levels = rounding(noise_lsb), []
+    left, levels = rounding_variance(noise_lsb), []
     for level_v, first in ((wave.high_v, 0), (wave.low_v, half_n)):
         # The sample at the edge itself may show either level.
         here = (average.phases > first) & (average.phases < first + half_n)
@@ -308,29 +298,36 @@ def _levels(recording: SquareWaveRecording, noise_lsb: float) -> list[tuple[floa
 
 
 def _card(recordings: Sequence[SquareWaveRecording], estimates: Sequence[FittedValue]) -> CardDescription:
+    """Card of the twin.
+
+    :raises RigError: the displacement precedes the force.
+    """
     by_name = {each.name: each for each in estimates}
     value = {name: each.value for name, each in by_name.items()}
     period_s, skew = recordings[0].sample_period_s, by_name[SKEW]
     if skew.value < -3.0 * skew.standard_error - _FINE_SKEW * period_s:
         raise RigError(
-            f"the displacement is taken {-1e6 * skew.value:.2f} us before the edges of the force, as no card does:"
-            " do these come later than at the samples at which the scenario has them?"
+            f"the displacement is taken {-1e6 * skew.value:.2f} us before the edges of the force, which no card does:"
+            " check that the edges are at the samples that the scenario sets"
         )
+    bits = _bits(recordings)
+    channels = recordings[0].channels
+    measured = {name: (each.low_v, each.low_v + (1 << bits) * each.lsb_v) for name, each in channels.items()}
     return CardDescription(
-        range_v=_ranges(recordings),
-        bits=_bits(recordings),
+        range_v={name: measured.get(name, _UNMEASURED_RANGE_V) for name in CHANNELS},
+        bits=bits,
         rate_hz=1.0 / period_s,
         noise_lsb={**dict.fromkeys(CHANNELS, value["displacement noise"]), "force": value["force noise"]},
         faults={
-            "skew_s": (0.0, _coarse(max(skew.value, 0.0) / period_s) * period_s, 0.0, 0.0),
+            "skew_s": (0.0, _round_skew(max(skew.value, 0.0) / period_s) * period_s, 0.0, 0.0),
             "gain_error": (value["force gain"], 0.0, 0.0, 0.0),
             "offset_lsb": (value["force offset"], value[OFFSET], 0.0, 0.0),
         },
     )
 
 
-def _coarse(late_n: float) -> float:
-    """The fraction of least denominator that is near enough: the emulator is the faster, the coarser the grid."""
+def _round_skew(late_n: float) -> float:
+    """Fraction of least denominator close to ``late_n``: on a coarser grid the emulator is faster."""
     return next(
         round(late_n * parts) / parts
         for parts in range(1, 1001)
@@ -339,13 +336,7 @@ def _coarse(late_n: float) -> float:
 
 
 def _bits(recordings: Sequence[SquareWaveRecording]) -> int:
-    """The least even number of bits, from 12 on, that has the code of 0 V and all that came."""
+    """Least of 12, 14, 16 bits that hold the code of 0 V and all codes recorded."""
     zeros = [channel.zero for recording in recordings for channel in recording.channels.values()]
     most = max([*zeros, *(float(recording.codes.max()) for recording in recordings)])
     return next(bits for bits in (12, 14, 16) if most < 1 << bits or bits == 16)
-
-
-def _ranges(recordings: Sequence[SquareWaveRecording]) -> dict[str, tuple[float, float]]:
-    channels, codes = recordings[0].channels, 1 << _bits(recordings)
-    measured = {name: (channel.low_v, channel.low_v + codes * channel.lsb_v) for name, channel in channels.items()}
-    return {name: measured.get(name, _UNMEASURED_RANGE_V) for name in CHANNELS}

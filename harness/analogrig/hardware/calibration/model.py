@@ -1,14 +1,14 @@
-"""The emulator with its unknowns: what it says the displacement is, and how that changes with each of them.
+"""Emulator as a function of the unknowns of a rig: mean codes of the displacement, and their derivatives.
 
-From force and displacement alone not every resistor can be told. What acts on them:
+Force and displacement do not identify every component. They identify:
 
     x'' = k_M (g_F F - g_B k_B x' - g_K k_K x)        three gains, as deviations of RF, C1 and C2; other parts nominal
     at rest: x = F / K + c + (a1 + a2 / k_M + a4 k_B) / k_K        offsets of U1, U2, U4, and c of the card
-    bandwidth and slew rate of U1        weakly seen: the datasheet's spread is one more measurement of them
+    bandwidths, and the slew rate of U1        weakly; the datasheet's spread is their prior
     the skew of the displacement
 
-Each pot misses its setting by a little, differently at each (it rests on a winding): for each setting there is one more
-unknown, with the resolution of the pots as its spread.
+Each pot misses its setting a little, differently at each, since the wiper rests on a winding. So each setting has one
+more unknown, whose prior is the resolution of the pots.
 """
 
 from __future__ import annotations
@@ -16,13 +16,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from analogrig.errors import RigError
-from analogrig.hardware.calibration.recordings import DISPLACEMENT, SquareWaveRecording, Vector, averaged, periods
+from analogrig.hardware.calibration.recordings import (
+    DISPLACEMENT,
+    SquareWaveRecording,
+    Vector,
+    average_phases,
+    split_periods,
+)
 from analogrig.rigs.emulator import (
     CardDescription,
     ComputerDescription,
@@ -35,90 +41,68 @@ from analogrig.scenario import PlantChoice
 from analogrig_emulator import OP_AMP_GRADES, TICKS_PER_SAMPLE, Edges, Excitation, SuspensionComputer
 
 POT_RESOLUTION = 1.0 / 5000.0
-"""Of a ten-turn pot, as part of its track: a wiper rests up to half of it beside its setting."""
+"""Resolution of a ten-turn pot, as part of its track; a wiper rests up to half of it from its setting."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is fitted."""
+    """Parameter of the fit."""
 
     name: str
     unit: str
     step: float
-    """For difference quotients: seen, and small enough to be linear."""
+    """Step of its difference quotient."""
     stands_for: str
     table: str = ""
-    """Of MeasuredValues, if it is an element's."""
+    """Field of MeasuredValues that it belongs to, if any."""
     element: str = ""
     known_to: float = math.inf
-    """Its standard deviation beforehand, around 0."""
+    """Prior standard deviation about 0."""
 
 
 _TRACKS_KNOWN_TO = 0.05 / math.sqrt(3.0)
 
 _GAINS = ("RF", "C1", "C2")
-"""The first unknowns: g_F = 1 / (RF C1 C2), g_B = 1 / C1, g_K = 1 / (C1 C2) of their nominal values."""
+"""First unknowns: g_F = 1 / (RF C1 C2), g_B = 1 / C1, g_K = 1 / (C1 C2) of their nominal values."""
+
+_POWERS = np.array([[0.0, -1.0, 0.0], [0.0, -1.0, 1.0], [1.0, 0.0, -1.0]])
+"""Row of a pot (M, B, K): powers of its coefficient that act as factors of RF, C1, C2."""
 
 SKEW, OFFSET = "skew", "displacement offset"
 
 
-def _unknowns(computer: ComputerDescription) -> tuple[Unknown, ...]:
-    gains = {
-        "RF": "RF R5 / (RK R5FB), over the gain of the displacement's channel",
-        "C1": "R1 C1 RB R4 / (RFB R4FB)",
-        "C2": "R2 C2 RK R4FB / (RB R4)",
-    }
-    offsets = {"U1": "its offset", "U2": "its offset", "U4": "its offset less half that of U3"}
-    return (
-        *(Unknown(name, "", 1e-4, what, "deviation", name) for name, what in gains.items()),
-        *(Unknown(f"{name} offset", "V", 1e-3, what, "offset_v", name) for name, what in offsets.items()),
-        *_rates(computer.op_amp),
-        *_tracks(computer),
-        Unknown(SKEW, "s", 2e-7, "displacement after force, less the delay of U5"),
-        Unknown(OFFSET, "LSB", 1.0, "offset of the displacement's channel, and of U5"),
-    )
-
-
-def _rates(op_amp: str) -> list[Unknown]:
-    """Bandwidths and the slew rate that is felt, of amplifiers that have them."""
-    grade = OP_AMP_GRADES.get(op_amp)
-    if grade is None or not grade.bandwidth:
-        return []
-    bandwidth, slew = (spread / math.sqrt(3.0) for spread in (grade.bandwidth, grade.slew))
-    within = [
-        Unknown(f"U{i} bandwidth", "", 0.02, "its bandwidth", "bandwidth", f"U{i}", bandwidth) for i in range(1, 5)
-    ]
-    return [*within, Unknown("U1 slew", "", 0.02, "its slew rate", "slew", "U1", slew)]
-
-
-def _tracks(computer: ComputerDescription) -> list[Unknown]:
-    """They matter where pots are set by their dials."""
-    if computer.pots == "coefficient":
-        return []
-    what = "its track over its load"
-    return [Unknown(f"{pot} track", "", 1e-3, what, "deviation", pot, _TRACKS_KNOWN_TO) for pot in "MBK"]
+def _unknowns(computer: ComputerDescription) -> Iterator[Unknown]:
+    """Unknowns of a kind of machine, but for those of the pots' settings."""
+    yield Unknown("RF", "", 1e-4, "RF R5 / (RK R5FB), over the gain of the displacement's channel", "deviation", "RF")
+    yield Unknown("C1", "", 1e-4, "R1 C1 RB R4 / (RFB R4FB)", "deviation", "C1")
+    yield Unknown("C2", "", 1e-4, "R2 C2 RK R4FB / (RB R4)", "deviation", "C2")
+    for name, what in (("U1", "its offset"), ("U2", "its offset"), ("U4", "its offset less half that of U3")):
+        yield Unknown(f"{name} offset", "V", 1e-3, what, "offset_v", name)
+    grade = OP_AMP_GRADES.get(computer.op_amp)
+    if grade is not None and grade.bandwidth:
+        bandwidth, slew = (spread / math.sqrt(3.0) for spread in (grade.bandwidth, grade.slew))
+        for name in ("U1", "U2", "U3", "U4"):
+            yield Unknown(f"{name} bandwidth", "", 0.02, "its bandwidth", "bandwidth", name, bandwidth)
+        yield Unknown("U1 slew", "", 0.02, "its slew rate", "slew", "U1", slew)
+    if computer.pots == "dial":
+        for pot in "MBK":
+            yield Unknown(f"{pot} track", "", 1e-3, "its track over its load", "deviation", pot, _TRACKS_KNOWN_TO)
+    yield Unknown(SKEW, "s", 2e-7, "displacement after force, less the delay of U5")
+    yield Unknown(OFFSET, "LSB", 1.0, "offset of the displacement's channel, and of U5")
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """What the pot of a parameter (M, B, K: 0, 1, 2) was set to, and by which part of it its coefficient may be off."""
+    """Setting of one pot, whose coefficient has an unknown relative error."""
 
-    parameter: int
+    parameter: int  # M, B, K: 0, 1, 2
     value: float
     known_to: float
 
-    @property
-    def powers(self) -> Vector:
-        """With which power of the coefficient each of the gains' elements goes that acts as it does."""
-        return np.asarray(_POWERS[self.parameter])
-
-
-_POWERS = np.array([[0.0, -1.0, 0.0], [0.0, -1.0, 1.0], [1.0, 0.0, -1.0]])
-
 
 @dataclass(frozen=True)
-class _Late(Excitation):
-    """An excitation whose edges come so many ticks later."""
+class _LateExcitation(Excitation):
+    """Excitation whose edges are ``ticks`` later."""
 
     ticks: int = 0
 
@@ -128,110 +112,109 @@ class _Late(Excitation):
 
 
 class EmulatorModel:
-    """What the emulator says the averages of the displacement are, for any values of the unknowns."""
+    """Averages of the displacement that the emulator predicts for given unknowns x (unknowns,)."""
 
     def __init__(
         self, recordings: Sequence[SquareWaveRecording], computer: ComputerDescription, noise_lsb: float
     ) -> None:
-        self.recordings = recordings
-        self.unknowns = _unknowns(computer)
+        self.unknowns = tuple(_unknowns(computer))
         self.nominal = computer
-        self._averages = [averaged(recording, DISPLACEMENT, noise_lsb) for recording in recordings]
-        self._settings = tuple(dict.fromkeys(setting for each in recordings for setting in self._settings_of(each)))
-        self.known_to = np.array([each.known_to for each in self.unknowns] + [each.known_to for each in self._settings])
+        self._pairs = [(each, average_phases(each, DISPLACEMENT, noise_lsb)) for each in recordings]
+        self._settings = tuple(dict.fromkeys(setting for each in recordings for setting in _settings_of(each)))
+        self.known_to = np.array([each.known_to for each in (*self.unknowns, *self._settings)])
 
     def residuals(self, x: Vector, doubt_lsb: float = 0.0) -> Vector:
-        """In standard deviations: those of the averages, with the doubt, and of what is known beforehand; (m,)."""
+        """(m,) residuals of the averages and of the priors, in standard deviations.
+
+        :param doubt_lsb: added in quadrature to the standard deviation of each average.
+        """
         known = np.isfinite(self.known_to)
         return np.concatenate([self.misses(x) / self._deviations(doubt_lsb), -x[known] / self.known_to[known]])
 
     def misses(self, x: Vector) -> Vector:
-        """By how much the averages lie above the emulator's, LSB."""
-        pairs = zip(self.recordings, self._averages, strict=True)
-        return np.concatenate([average.means - self.codes(x, each)[average.phases] for each, average in pairs])
+        """Averages of the recordings less those of the emulator, LSB."""
+        return np.concatenate([average.means - self.codes(x, each)[average.phases] for each, average in self._pairs])
 
     def jacobian(self, x: Vector, doubt_lsb: float = 0.0) -> Vector:
-        """Of ``residuals``: (m, unknowns)."""
-        pairs = zip(self.recordings, self._averages, strict=True)
-        slopes = np.concatenate([self._slopes(x, each)[average.phases] for each, average in pairs])
+        """(m, unknowns) derivative of ``residuals``."""
+        slopes = np.concatenate([self._slopes(x, each)[average.phases] for each, average in self._pairs])
         known = np.isfinite(self.known_to)
         return np.concatenate([-slopes / self._deviations(doubt_lsb)[:, None], -np.diag(1.0 / self.known_to)[known]])
 
     def _deviations(self, doubt_lsb: float) -> Vector:
-        each = [np.full(len(average.phases), average.variance) for average in self._averages]
-        return np.sqrt(np.concatenate(each) + doubt_lsb**2)
+        variances = [np.full(len(average.phases), average.variance) for _, average in self._pairs]
+        return np.sqrt(np.concatenate(variances) + doubt_lsb**2)
 
     def codes(self, x: Vector, recording: SquareWaveRecording) -> Vector:
-        """The mean code of each phase of the period, not rounded: (phases,)."""
+        """(phases,) mean code of each phase of the period, not rounded."""
         values = self.by_name(x)
         channel = recording.channels["displacement"]
+        factors = np.ones(len(_GAINS))
+        for column, setting in self._columns_of(recording):
+            factors *= (1.0 + x[column]) ** _POWERS[setting.parameter]
         rig = EmulatorRig(
             EmulatorDescription(
                 card=CardDescription(dict.fromkeys(CHANNELS, (-10.0, 10.0)), rate_hz=1.0 / recording.sample_period_s),
-                computer=self.computer(values, self._missed(x, recording)),
+                computer=self.computer(values, dict(zip(_GAINS, factors.tolist(), strict=True))),
             )
         )
         computer, wave, _ = rig.set_up(recording.scenario, 0)
-        volts = _taken_late(computer, wave, len(recording.codes), values[SKEW] / recording.sample_period_s)
-        return np.asarray((periods(recording, volts).mean(axis=0) - channel.low_v) / channel.lsb_v + values[OFFSET])
+        volts = _late_displacement(computer, wave, len(recording.codes), values[SKEW] / recording.sample_period_s)
+        return np.asarray(
+            (split_periods(recording, volts).mean(axis=0) - channel.low_v) / channel.lsb_v + values[OFFSET]
+        )
 
     def by_name(self, x: Vector) -> dict[str, float]:
-        """The unknowns but for those of the settings."""
+        """Values of the unknowns, but for those of the settings."""
         return {unknown.name: float(value) for unknown, value in zip(self.unknowns, x, strict=False)}
 
-    def computer(self, values: Mapping[str, float], missed: Mapping[str, float] | None = None) -> ComputerDescription:
-        """With these values of the unknowns.
+    def computer(self, values: Mapping[str, float], factors: Mapping[str, float] | None = None) -> ComputerDescription:
+        """Machine with these values of the unknowns.
 
-        :param missed: what pots that miss their setting are like: factors of the elements of the gains.
+        :param factors: of RF, C1, C2, for pots that miss their settings.
         :raises RigError: no machine has such values.
         """
         tables: dict[str, dict[str, float]] = {"deviation": {}, "offset_v": {}, "bandwidth": {}, "slew": {}}
         for unknown in self.unknowns:
             if unknown.table:
                 tables[unknown.table][unknown.element] = values[unknown.name]
-        for gain, factor in (missed or {}).items():
+        for gain, factor in (factors or {}).items():
             tables["deviation"][gain] = (1.0 + tables["deviation"][gain]) * factor - 1.0
         try:
             return dataclasses.replace(self.nominal, values=MeasuredValues(**tables))
         except ValueError as error:
-            raise RigError(f"the emulator does not become like the recordings: {error}") from error
-
-    def _missed(self, x: Vector, recording: SquareWaveRecording) -> dict[str, float]:
-        factors = np.ones(len(_GAINS))
-        for column, setting in self._columns_of(recording):
-            factors *= (1.0 + x[column]) ** setting.powers
-        return dict(zip(_GAINS, factors.tolist(), strict=True))
+            raise RigError(f"no emulator fits the recordings: {error}") from error
 
     def _slopes(self, x: Vector, recording: SquareWaveRecording) -> Vector:
-        """Of ``codes``: (phases, unknowns)."""
+        """(phases, unknowns) derivative of ``codes``."""
         here = self.codes(x, recording)
         slopes = np.zeros((len(here), len(x)))
         for column, unknown in enumerate(self.unknowns):
             if unknown.name == OFFSET:
                 slopes[:, column] = 1.0
                 continue
-            beside = x.copy()
-            beside[column] += unknown.step
-            slopes[:, column] = (self.codes(beside, recording) - here) / unknown.step
+            moved = x.copy()
+            moved[column] += unknown.step
+            slopes[:, column] = (self.codes(moved, recording) - here) / unknown.step
+        gains = slice(len(_GAINS))
         for column, setting in self._columns_of(recording):
-            gains = slice(len(_GAINS))
-            slopes[:, column] = slopes[:, gains] @ ((1.0 + x[gains]) * setting.powers)
+            slopes[:, column] = slopes[:, gains] @ ((1.0 + x[gains]) * _POWERS[setting.parameter])
         return slopes
 
     def _columns_of(self, recording: SquareWaveRecording) -> list[tuple[int, _Setting]]:
         first = len(self.unknowns)
-        return [(first + self._settings.index(setting), setting) for setting in self._settings_of(recording)]
+        return [(first + self._settings.index(setting), setting) for setting in _settings_of(recording)]
 
-    def _settings_of(self, recording: SquareWaveRecording) -> list[_Setting]:
-        plant = recording.scenario.plant.plant()
-        errors = _pot_errors(recording.scenario.plant)
-        values = zip(plant.parameters().values(), errors, strict=True)
-        return [_Setting(i, value, error) for i, (value, error) in enumerate(values)]
+
+def _settings_of(recording: SquareWaveRecording) -> list[_Setting]:
+    choice = recording.scenario.plant
+    values = zip(choice.plant().parameters().values(), _pot_errors(choice), strict=True)
+    return [_Setting(i, value, error) for i, (value, error) in enumerate(values)]
 
 
 @functools.cache
 def _pot_errors(plant: PlantChoice) -> tuple[float, ...]:
-    """By which part of their coefficients the pots M, B, K miss them, rms: a dial that is evenly off by half a step."""
+    """Relative errors of the coefficients of pots M, B, K, rms, for dial errors uniform within half a step."""
     computer = SuspensionComputer(plant.set, opamp="ideal")
     program = computer.program
     computer.set(**dict(zip(program.values, plant.plant().parameters().values(), strict=False)))
@@ -241,11 +224,11 @@ def _pot_errors(plant: PlantChoice) -> tuple[float, ...]:
     return tuple((coefficients[pot] - missed[pot]) / (math.sqrt(12.0) * coefficients[pot]) for pot in dials)
 
 
-def _taken_late(computer: SuspensionComputer, wave: Excitation, samples: int, late_n: float) -> Vector:
-    """The displacement at every sample and ``late_n`` samples after it, V: (samples,).
+def _late_displacement(computer: SuspensionComputer, wave: Excitation, samples: int, late_n: float) -> Vector:
+    """(samples,) displacement ``late_n`` samples after each sample, V.
 
-    Instead of the samples the force is moved, one sample less late_n later: at any instant, at no cost.
+    The force moves instead of the samples, by one sample less ``late_n``: the emulator then needs no finer grid.
     """
-    moved = _Late(**dataclasses.asdict(wave), ticks=round((1.0 - late_n) * TICKS_PER_SAMPLE))
-    volts = np.concatenate(list(computer.play(moved, samples + 1)))
+    late = _LateExcitation(**dataclasses.asdict(wave), ticks=round((1.0 - late_n) * TICKS_PER_SAMPLE))
+    volts = np.concatenate(list(computer.play(late, samples + 1)))
     return np.asarray(volts[1:, CHANNELS.index("displacement")])

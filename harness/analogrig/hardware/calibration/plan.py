@@ -1,4 +1,4 @@
-"""What is played on a rig to calibrate it: square waves, each with pots, levels and a frequency of its own."""
+"""Scenarios of a calibration: square waves, each with its own pots, levels and frequency."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Program = Literal["front", "shock"]
 SAMPLES = 1400
 
 RATE_HZ = 20e3
-"""Of the card: the periods below are whole numbers of its samples."""
+"""Sample rate of the card. The periods below are whole numbers of its samples."""
 
 _Plant = tuple[float, float, float]
 _Wave = tuple[float, float, int]
@@ -48,7 +48,7 @@ _PLANTS: Mapping[Program, tuple[_Plant, ...]] = {
         (4.0, 835.0, 8250.0),
     ),
 }
-"""kg, N s/m, N/m: pots over their ranges."""
+"""M (kg), B (N s/m), K (N/m), which cover the ranges of the pots."""
 
 _WAVES: tuple[_Wave, ...] = (
     (0.1, 9.9, 50),
@@ -64,20 +64,21 @@ _WAVES: tuple[_Wave, ...] = (
     (0.1, 8.5, 10),
     (1.2, 6.9, 25),
 )
-"""V, V, samples of half a period, of each of those: no amplifier is overloaded, and x stays within -1..9 V."""
+"""Low and high level (V) and half period (samples), one for each plant. No amplifier is overloaded, and the
+displacement stays within -1..9 V."""
 
 _CHECK_PLANTS: Mapping[Program, _Plant] = {"front": (95.0, 2700.0, 22500.0), "shock": (1.8, 980.0, 11000.0)}
 _CHECK_WAVE: _Wave = (2.0, 8.2, 64)
 
 
 def scenarios(program: Program) -> tuple[Scenario, ...]:
-    """What is played on a rig to calibrate it."""
+    """Scenarios that the twin is fitted to."""
     rows = zip(_PLANTS[program], _WAVES, strict=True)
     return tuple(_scenario(program, f"calibration-{i}", *row) for i, row in enumerate(rows, start=1))
 
 
 def check_scenario(program: Program) -> Scenario:
-    """One more, to compare rig and twin on: its pots, levels and frequency are none of those of ``scenarios``."""
+    """Scenario to validate the twin; its pots, levels and frequency differ from all ``scenarios``."""
     return _scenario(program, "calibration-check", _CHECK_PLANTS[program], _CHECK_WAVE)
 
 
