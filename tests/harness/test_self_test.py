@@ -17,10 +17,10 @@ from scipy.stats import chi2
 
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RigError, SelfTestError
+from analogrig.hardware.self_test.checks import Check, Findings
 from analogrig.hardware.self_test.conduct import self_test
-from analogrig.hardware.self_test.findings import Check, Findings
 from analogrig.hardware.self_test.response import SecondOrder
-from analogrig.hardware.self_test.timing import EdgeTimes, Levels, SeenEdges, averaged_n, lateness
+from analogrig.hardware.self_test.square_wave import EdgeTimes, Levels, SeenEdges, delay
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
@@ -82,7 +82,7 @@ class Altered:
 
 
 def wrong(rig: Rig, program: str = "front", seed: int = 1) -> list[str]:
-    return [check.title for check in self_test(rig, seed, program).having("wrong")]
+    return [check.title for check in self_test(rig, seed, program).in_state("wrong")]
 
 
 def value(findings: Findings, title: str) -> Check:
@@ -245,7 +245,7 @@ def test_swapped_leads_are_told_from_one_signal_on_both() -> None:
 
     found = {}
     for alter in (swapped, both):
-        (check,) = self_test(Altered(emulated(), alter), 1, "shock").having("wrong")
+        (check,) = self_test(Altered(emulated(), alter), 1, "shock").in_state("wrong")
         assert check.title == "identity"
         found[alter] = check.advice
     assert "swapped" in found[swapped]
@@ -264,8 +264,8 @@ def test_an_error_of_the_generator_is_told_from_one_of_the_input() -> None:
         wave = dataclasses.replace(played.excitation, low_v=0.515, high_v=9.785)
         return dataclasses.replace(played, excitation=wave)
 
-    generator = self_test(Altered(emulated(), play=louder), 1).having("wrong")
-    card = self_test(emulated(gain_error=[0.03, 0, 0, 0]), 1).having("wrong")
+    generator = self_test(Altered(emulated(), play=louder), 1).in_state("wrong")
+    card = self_test(emulated(gain_error=[0.03, 0, 0, 0]), 1).in_state("wrong")
     assert [check.title for check in (*generator, *card)] == ["gain of force"] * 2
     assert "generator" in generator[0].advice
     assert "generator" not in card[0].advice
@@ -325,7 +325,7 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
-        found_n, error_n = lateness(codes, levels, edges, numbered(line, edges), 0.0)
+        found_n, error_n = delay(codes, levels, edges, numbered(line, edges), 0.0)
         assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
 
 
@@ -336,8 +336,8 @@ def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
         codes = square_wave(line, late_n, averaged)
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
-        assert averaged_n(edges) == pytest.approx(averaged, abs=0.03)
-        found_n, _ = lateness(codes, levels, edges, numbered(line, edges), 0.0)
+        assert edges.averaging_n() == pytest.approx(averaged, abs=0.03)
+        found_n, _ = delay(codes, levels, edges, numbered(line, edges), 0.0)
         assert found_n == pytest.approx(late_n, abs=5e-3)
 
 
@@ -357,9 +357,9 @@ def square_wave(line: EdgeTimes, late_n: float, averaged: float) -> Codes:
 
 def numbered(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
     """The same line, its instants those next to the middle edge as the edges have them."""
-    turns = np.rint((edges.line().rising_n - line.rising_n) / line.period_n)
+    turns = np.rint((edges.times().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
-    turns = np.rint((edges.line().falling_n - line.falling_n) / line.period_n)
+    turns = np.rint((edges.times().falling_n - line.falling_n) / line.period_n)
     return EdgeTimes(line.period_n, rising, line.falling_n + turns * line.period_n)
 
 
@@ -393,7 +393,7 @@ def test_rig_that_averages_over_its_sample_period_has_no_skew_by_that() -> None:
     shifted = Averaging(
         later, lambda codes: averages(np.stack([codes[:, 0], np.roll(codes[:, 1], -2), *codes.T[2:]], 1))
     )
-    assert [check.title for check in self_test(shifted, 1).having("wrong")] == ["skew"]
+    assert [check.title for check in self_test(shifted, 1).in_state("wrong")] == ["skew"]
 
 
 # ------------------------------------------------------------------------------------ what it says, and when it cannot
@@ -545,5 +545,5 @@ def test_card_that_is_too_fast_for_the_self_test_is_told_so() -> None:
 def test_what_cannot_be_measured_is_said() -> None:
     """Noise of 60 LSB: the skew is known to no more than some hundredths of a sample. But noise is what is wrong."""
     findings = self_test(emulated(noise_lsb=60.0), 1)
-    assert {check.title for check in findings.having("wrong")} == {"noise of force", "noise of displacement"}
-    assert "skew" in {check.title for check in findings.having("not measured")}
+    assert {check.title for check in findings.in_state("wrong")} == {"noise of force", "noise of displacement"}
+    assert "skew" in {check.title for check in findings.in_state("not measured")}

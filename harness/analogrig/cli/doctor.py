@@ -10,7 +10,7 @@ from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trus
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
 
 if TYPE_CHECKING:
-    from analogrig.hardware.self_test.findings import Check, Findings
+    from analogrig.hardware.self_test.checks import Check, Findings
 
 
 def add(commands: Any) -> None:
@@ -49,19 +49,19 @@ def _run(arguments: argparse.Namespace) -> int:
         show_result(_as_json(findings, arguments.seed), arguments)
     else:
         show(_text(findings))
-    if findings.having("wrong"):
+    if findings.in_state("wrong"):
         return FAILED
     return PASSED if findings.well else INCONCLUSIVE
 
 
 def _text(findings: Findings) -> str:
-    wrong, unmeasured = (len(findings.having(state)) for state in ("wrong", "not measured"))
+    wrong, unmeasured = (len(findings.in_state(state)) for state in ("wrong", "not measured"))
     counts = [f"{count} {what}" for count, what in ((wrong, "WRONG"), (unmeasured, "NOT MEASURED")) if count]
     lines = [f"self-test of {findings.rig}, program {findings.program}: {', '.join(counts) or 'all well'}", ""]
     for check in findings.checks:
         lines.append(_line(check))
         if check.state != "well":
-            lines.append(f"{'':16}{check.what_to_do}")
+            lines.append(f"{'':16}{check.remedy}")
     return "\n".join(lines)
 
 

@@ -1,8 +1,8 @@
-"""Two rigs against each other: the same scenario on both, how far their signals differ, and whether verdicts do.
+"""Comparison of two rigs: the same scenario on both, the difference of their signals, and that of their verdicts.
 
-The signals are compared in codes of the first rig, play by play. Both have noise, which is not a difference: how much
-there is of it shows in what differs from one sample to the next, and its square is taken off. The verdicts are compared
-as those of two builds of a device are (``analogrig.campaigns.comparison``), paired by seed.
+Signals are compared in codes of the first rig, play by play. Noise is no difference: its variance is estimated from the
+differences between neighbouring samples, and subtracted. Verdicts are compared as those of two builds of a device are
+(``analogrig.campaigns.comparison``), paired by seed.
 """
 
 from __future__ import annotations
@@ -24,62 +24,62 @@ from analogrig.scenario import Scenario
 
 _THIRD_DIFFERENCE = (1.0, -3.0, 3.0, -1.0)
 _NORMAL_MAD = 1.482602
-"""Standard deviation over median absolute deviation, of normal noise."""
+"""Standard deviation over median absolute deviation of normal noise."""
 _KEPT_SIGMAS, _KEPT_VARIANCE = 3.0, 0.973337
-"""What is further out is no noise; the variance of a standard normal number that is not."""
+"""Largest deviation that counts as noise, and the variance of a standard normal number within it."""
 
 _SMOOTHED_N = 5
-"""Over so many samples a difference is averaged before the largest is looked for."""
+"""Samples over which a difference is averaged before its largest value is found."""
 
 _EDGE_PART = 0.25
-"""A step of the force from one sample to the next that is more than this part of its range is an edge."""
+"""Smallest step of the force between neighbouring samples that is an edge, in parts of its range."""
 
 
 @dataclass(frozen=True)
 class SignalDifference:
-    """How far a channel of the second rig is from that of the first, in LSB of the first, without noise."""
+    """Difference of one channel between two rigs, in LSB of the first, without noise."""
 
     channel: str
     rms_lsb: float
     rms_most_lsb: float
-    """Upper bound, with the confidence of the comparison, of the mean over plays like these."""
+    """Upper confidence bound of the mean over such plays."""
     mean_lsb: float
-    """An offset between the two."""
+    """Offset between the rigs."""
     largest_lsb: float
-    """Of all means over 5 samples, in any play."""
+    """Largest mean over 5 samples in any play."""
     largest_at: int
-    """Its sample."""
+    """Sample of the largest mean."""
     largest_noise_lsb: float
-    """What the largest of so many means would be by noise alone."""
+    """Expected largest of so many means from noise alone."""
     noise_lsb: float
-    """rms of both together, quantisation included; it is taken off."""
+    """rms noise of both rigs together, quantisation included, which is subtracted."""
     edges_apart: int
-    """Samples about an edge of the force that only one of the two has at its new level, in all plays; left out."""
+    """Samples of all plays, next to an edge of the force, at which only one rig has the new level; left out."""
 
 
 @dataclass(frozen=True)
 class LatencyDifference:
-    """Latencies on the second rig less those on the first, in samples; the unit is the seed."""
+    """Latencies on the second rig less those on the first, in samples; seeds are the statistical unit."""
 
     mean_n: float
     least_n: float
     most_n: float
-    """Bounds of the mean."""
+    """Confidence bounds of the mean."""
     seeds: int
     changes: int
-    """Noticed on both, in all plays."""
+    """Changes detected on both rigs, in all plays."""
     unequal: int
-    """So many of them with another latency."""
+    """Number of these whose latencies differ."""
     within_n: float
-    """Bound of the mean's size: the larger of both bounds, and of what as many latencies would allow that differ by one
-    sample now and then, since a few that are all equal vary by nothing."""
+    """Bound of the mean's magnitude: the larger of both bounds, and at least the upper bound of the rate of unequal
+    latencies. The latter keeps a few equal latencies from giving a bound of 0."""
     quantiles_n: tuple[tuple[float, ...], tuple[float, ...]]
-    """Of all latencies on the first and on the second rig: median, 95 %, largest."""
+    """Median, 95 % quantile and maximum of all latencies, on the first and on the second rig."""
 
 
 @dataclass(frozen=True)
 class FalseAlarms:
-    """Of one rig, per sample."""
+    """False alarms of one rig, with bounds of their rate per sample."""
 
     alarms: int
     samples: int
@@ -89,23 +89,25 @@ class FalseAlarms:
 
 @dataclass(frozen=True)
 class RigComparison:
+    """Difference between two rigs in signals and verdicts."""
+
     a: str
     b: str
     scenario: str
     confidence: float
     plays: int
-    """On each rig, valid on both."""
+    """Plays on each rig that are valid on both."""
     invalid: tuple[str, ...]
-    """Why others are not."""
+    """Reason of each invalid play."""
     signals: tuple[SignalDifference, ...]
     latency: LatencyDifference | None
-    """None if no change was noticed on both."""
+    """None if fewer than two seeds have a change detected on both rigs."""
     false_alarms: tuple[FalseAlarms, FalseAlarms]
     verdicts: Comparison
 
     @property
     def sentence(self) -> str:
-        """What a lab book needs."""
+        """Summary in one sentence."""
         displacement = next(each for each in self.signals if each.channel == "displacement")
         latency = "an unknown number of" if self.latency is None else f"{self.latency.within_n:.2g}"
         shown = [f"{each.quantity} is {each.word}" for each in self.verdicts.differences if each.shown]
@@ -116,22 +118,6 @@ class RigComparison:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """One play on both rigs."""
-
-    a: Run
-    b: Run
-    rows: tuple[Row, Row]
-
-    @property
-    def why_invalid(self) -> str:
-        for run, each in zip((self.a, self.b), self.rows, strict=True):
-            if each["outcome"] == "inconclusive":
-                return f"{run.conditions.rig['name']}, seed {each['seed']}: {each.get('why', 'inconclusive')}"
-        return ""
-
-
 def compare_rigs(
     a: Bench,
     b: Bench,
@@ -140,38 +126,38 @@ def compare_rigs(
     confidence: float = 0.95,
     progress: Callable[[int, int], None] | None = None,
 ) -> RigComparison | tuple[str, ...]:
-    """Play a scenario with every seed on both, in turn; ``b`` against ``a``.
+    """Play a scenario with every seed on both rigs in turn, and compare ``b`` with ``a``.
 
-    Where fewer than two plays are valid on both, the answer is why they are not.
+    Return the reasons why plays are invalid if fewer than two are valid on both.
 
-    :raises ConfigurationError: it cannot be played on one of them.
+    :raises ConfigurationError: one of the rigs cannot play it.
     :raises DeviceError, LinkError, RigError: before a first sample.
     """
-    pairs = []
-    for done, seed in enumerate(seeds):
-        runs = uninterrupted(a.play(scenario, seed)), uninterrupted(b.play(scenario, seed))
-        pairs.append(_Pair(*runs, rows=(row(runs[0], judge(runs[0])), row(runs[1], judge(runs[1])))))
+    runs: list[tuple[Run, Run]] = []
+    rows: list[tuple[Row, Row]] = []
+    invalid = []
+    for done, seed in enumerate(seeds, start=1):
+        pair = uninterrupted(a.play(scenario, seed)), uninterrupted(b.play(scenario, seed))
+        judged = row(pair[0], judge(pair[0])), row(pair[1], judge(pair[1]))
+        why = [_why_invalid(*each) for each in zip(pair, judged, strict=True) if each[1]["outcome"] == "inconclusive"]
+        if why:
+            invalid.append(why[0])
+        else:
+            runs.append(pair)
+            rows.append(judged)
         if progress is not None:
-            progress(done + 1, len(seeds))
-    valid = [pair for pair in pairs if not pair.why_invalid]
-    invalid = tuple(pair.why_invalid for pair in pairs if pair.why_invalid)
-    if len(valid) < 2:
-        return invalid or ("two plays at least are needed",)
-    return _compared(valid, invalid, scenario.name, confidence)
-
-
-def _compared(pairs: Sequence[_Pair], invalid: tuple[str, ...], scenario: str, confidence: float) -> RigComparison:
-    rows_a, rows_b = zip(*(pair.rows for pair in pairs), strict=True)
-    keyed_a, keyed_b = ([((scenario, each["seed"]), each) for each in rows] for rows in (rows_a, rows_b))
-    runs = [(pair.a, pair.b) for pair in pairs]
-    first = pairs[0]
+            progress(done, len(seeds))
+    if len(runs) < 2:
+        return tuple(invalid) or ("two plays at least are needed",)
+    rows_a, rows_b = zip(*rows, strict=True)
+    keyed_a, keyed_b = ([((scenario.name, each["seed"]), each) for each in rows] for rows in (rows_a, rows_b))
     return RigComparison(
-        a=str(first.a.conditions.rig["name"]),
-        b=str(first.b.conditions.rig["name"]),
-        scenario=scenario,
+        a=str(runs[0][0].conditions.rig["name"]),
+        b=str(runs[0][1].conditions.rig["name"]),
+        scenario=scenario.name,
         confidence=confidence,
-        plays=len(pairs),
-        invalid=invalid,
+        plays=len(runs),
+        invalid=tuple(invalid),
         signals=tuple(signal_difference(runs, name, confidence) for name in MEASURED),
         latency=_latency(rows_a, rows_b, confidence),
         false_alarms=(_false_alarms(rows_a, confidence), _false_alarms(rows_b, confidence)),
@@ -179,22 +165,27 @@ def _compared(pairs: Sequence[_Pair], invalid: tuple[str, ...], scenario: str, c
     )
 
 
+def _why_invalid(run: Run, row: Row) -> str:
+    return f"{run.conditions.rig['name']}, seed {row['seed']}: {row.get('why', 'inconclusive')}"
+
+
 # --------------------------------------------------------------------------------------------------------- the signals
 
 
 def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence: float) -> SignalDifference:
-    """Of one channel in two plays or more; clipped samples, and those at edges of the force, are left out."""
+    """Difference of one channel in two plays or more, without clipped samples and those at edges of the force."""
     differences, compared, apart = zip(*(_difference(a, b, channel) for a, b in runs), strict=True)
+    pairs = list(zip(differences, compared, strict=True))
     noise = math.sqrt(float(np.mean([_noise_variance(each) for each in differences])))
-    squares = np.array([np.mean(np.square(each[use])) for each, use in zip(differences, compared, strict=True)])
+    squares = np.array([np.mean(np.square(each[use])) for each, use in pairs])
     mean_square, _, most_square = mean_interval(squares - noise**2, 2.0 * confidence - 1.0)
-    largest, at = max((_largest(each, use) for each, use in zip(differences, compared, strict=True)), key=_size)
+    largest, at = max((_largest(each, use) for each, use in pairs), key=lambda found: abs(found[0]))
     count = int(sum(use.sum() for use in compared))
     return SignalDifference(
         channel=channel,
         rms_lsb=math.sqrt(max(mean_square, 0.0)),
         rms_most_lsb=math.sqrt(max(most_square, noise**2 * math.sqrt(2.0 / count))),
-        mean_lsb=float(np.mean([each[use].mean() for each, use in zip(differences, compared, strict=True)])),
+        mean_lsb=float(np.mean([each[use].mean() for each, use in pairs])),
         largest_lsb=largest,
         largest_at=at,
         largest_noise_lsb=noise * math.sqrt(2.0 * math.log(count / _SMOOTHED_N + 2.0) / _SMOOTHED_N),
@@ -204,28 +195,27 @@ def signal_difference(runs: Sequence[tuple[Run, Run]], channel: str, confidence:
 
 
 def _difference(a: Run, b: Run, channel: str) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
-    """(n,) LSB of a; which samples count; how many do not since edges lie apart there."""
+    """Difference (n,) in LSB of a; mask (n,) of the samples compared; number of samples at edges that lie apart."""
     column, samples = CHANNELS.index(channel), min(a.samples, b.samples)
     of_a, of_b = a.conditions.channels[channel], b.conditions.channels[channel]
     volts = of_b.volts(b.codes[:samples, column]) - of_a.volts(a.codes[:samples, column])
     counted = ~(a.clipped[:samples, column] | b.clipped[:samples, column])
     apart = 0
     if channel == "force":
-        edge_a, edge_b = _at_edges(a, samples), _at_edges(b, samples)
-        apart = int((np.abs(volts[edge_a | edge_b]) > _EDGE_PART * _swing(a)).sum())
-        counted &= ~(edge_a | edge_b)
+        edges = _at_edges(a, samples) | _at_edges(b, samples)
+        apart = int((np.abs(volts[edges]) > _EDGE_PART * np.ptp(_force_v(a))).sum())
+        counted &= ~edges
     return volts / of_a.lsb_v, counted, apart
 
 
-def _swing(run: Run) -> float:
-    volts = run.conditions.channels["force"].volts(run.codes[:, CHANNELS.index("force")])
-    return float(np.ptp(volts))
+def _force_v(run: Run) -> NDArray[np.float64]:
+    return run.conditions.channels["force"].volts(run.codes[:, CHANNELS.index("force")])
 
 
 def _at_edges(run: Run, samples: int) -> NDArray[np.bool_]:
-    """(samples,): next to a jump of the force, where a small part of a sample decides on which side one is."""
-    volts = run.conditions.channels["force"].volts(run.codes[:samples, CHANNELS.index("force")])
-    jump = np.flatnonzero(np.abs(np.diff(volts)) > _EDGE_PART * _swing(run))
+    """(samples,): True next to an edge, where a small part of a sample period decides the level."""
+    volts = _force_v(run)
+    jump = np.flatnonzero(np.abs(np.diff(volts[:samples])) > _EDGE_PART * np.ptp(volts))
     near = np.zeros(samples, np.bool_)
     for beside in (-1, 0, 1, 2):
         near[np.clip(jump + beside, 0, samples - 1)] = True
@@ -233,8 +223,7 @@ def _at_edges(run: Run, samples: int) -> NDArray[np.bool_]:
 
 
 def _noise_variance(difference: NDArray[np.float64]) -> float:
-    """Of white noise on something smooth: third differences have 20 times its variance, but for those, left out, where
-    it is not smooth."""
+    """Variance of white noise on a smooth signal: a 20th of that of its third differences, without outliers."""
     third = np.convolve(difference, _THIRD_DIFFERENCE, mode="valid")
     sigma = _NORMAL_MAD * float(np.median(np.abs(third)))
     kept = third[np.abs(third) <= _KEPT_SIGMAS * sigma]
@@ -242,7 +231,7 @@ def _noise_variance(difference: NDArray[np.float64]) -> float:
 
 
 def _largest(difference: NDArray[np.float64], counted: NDArray[np.bool_]) -> tuple[float, int]:
-    """The largest mean over consecutive samples that all count, and the sample in the middle of them."""
+    """Largest mean over consecutive samples that are all compared, and the middle one of them."""
     window = np.ones(_SMOOTHED_N)
     whole = np.convolve(counted, window, mode="valid") == _SMOOTHED_N
     means = np.where(whole, np.convolve(difference, window / _SMOOTHED_N, mode="valid"), 0.0)
@@ -250,15 +239,11 @@ def _largest(difference: NDArray[np.float64], counted: NDArray[np.bool_]) -> tup
     return float(means[at]), at + _SMOOTHED_N // 2
 
 
-def _size(largest: tuple[float, int]) -> float:
-    return abs(largest[0])
-
-
 # -------------------------------------------------------------------------------------------------------- the verdicts
 
 
 def _latency(a: Sequence[Row], b: Sequence[Row], confidence: float) -> LatencyDifference | None:
-    """Of changes that were noticed on both."""
+    """Difference of the latencies of changes detected on both rigs."""
     both = [
         [(before.latency_n, after.latency_n) for before, after in zip(changes(mine), changes(other), strict=True)
          if before.latency_n is not None and after.latency_n is not None]

@@ -121,7 +121,9 @@ class EmulatorModel:
         self.nominal = computer
         self._pairs = [(each, average_phases(each, DISPLACEMENT, noise_lsb)) for each in recordings]
         self._settings = tuple(dict.fromkeys(setting for each in recordings for setting in _settings_of(each)))
-        self.known_to = np.array([each.known_to for each in (*self.unknowns, *self._settings)])
+        self.known_to = np.array(
+            [*(each.known_to for each in self.unknowns), *(each.known_to for each in self._settings)]
+        )
 
     def residuals(self, x: Vector, doubt_lsb: float = 0.0) -> Vector:
         """(m,) residuals of the averages and of the priors, in standard deviations.

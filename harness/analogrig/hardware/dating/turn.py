@@ -113,14 +113,14 @@ def _zoom(path: _Path, shape: Shape, candidates: slice, confidence: float) -> _P
     """Evaluate ever finer grids about the most likely pair until they resolve both intervals."""
     spans = [(candidates.start, candidates.stop - 1)] * 2
     for _ in range(_ZOOMS):
-        grids = [np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans]
-        pairs = path.evaluate(*grids, shape)
+        begins, ends = (np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans)
+        pairs = path.evaluate(begins, ends, shape)
         if all(_is_fine(each, pairs.cost, confidence) for each in (pairs.begin, pairs.end)):
             break
         likely = pairs.cost - pairs.cost.min() <= _LIKELY
         spans = [
             _around(each[likely], 2 * _step(grid), candidates)
-            for each, grid in zip((pairs.begin, pairs.end), grids, strict=True)
+            for each, grid in ((pairs.begin, begins), (pairs.end, ends))
         ]
     return pairs
 

@@ -1,1 +1,1 @@
-"""The self-test of a rig: what is wrong with it, before any device is judged by it."""
+"""Self-test of a rig: finds its faults before any device is judged on it."""

@@ -1,4 +1,4 @@
-"""One record of the self-test: what was commanded, and what came in on force and displacement."""
+"""Record of a self-test: the scenario played, and the samples of force and displacement."""
 
 from __future__ import annotations
 
@@ -16,52 +16,51 @@ from analogrig.scenario import PLANTS, PlantChoice, Scenario
 from analogrig_emulator import Excitation
 
 SAMPLES = 16_384
-"""As many as an instrument of the class of a Red Pitaya takes without a gap."""
+"""Samples that an instrument of the class of a Red Pitaya takes without a gap."""
 
 LOW_V, HIGH_V = 0.5, 9.5
-"""At the computer's input. Nothing in a healthy computer comes near its limits, nor below 0 V."""
+"""Levels at the computer's input. No signal of a healthy computer comes near its limits, or falls below 0 V."""
 
 FREQUENCY_HZ = 823 * 125e6 / 2**30
-"""95.81 Hz: half periods of 104 samples, after which nothing moves any more. It is a multiple of what the 30 bits of a
-Red Pitaya's generator resolve, and the edges of 0.8 s fall on all parts of a sample, no two parts more than 0.017 apart
-(at 20 kHz)."""
+"""95.81 Hz: half periods of 104 samples, after which all signals have settled. It is a multiple of the resolution of a
+Red Pitaya's generator (30 bits). At 20 kHz the edges of 0.8 s sample all parts of a sample period, at most 0.017
+apart."""
 
 LEAST_PERIODS = 13
-"""In the record: with fewer edges their instants cannot be told, nor the noise."""
+"""Fewest periods in the record that determine the timing of the edges and the noise."""
 
 PROGRAMS = ("front", "shock")
 
 
 def scenario(program: str) -> Scenario:
-    """What the self-test plays.
+    """Scenario of the self-test.
 
-    :raises SelfTestError: it cannot tell anything about this program.
+    :raises SelfTestError: it does not support this program.
     """
     if program not in PROGRAMS:
-        raise SelfTestError(f"the self-test knows the programs {', '.join(PROGRAMS)}, and the computer has {program}")
+        raise SelfTestError(f"the self-test supports the programs {', '.join(PROGRAMS)}, not {program}")
     excitation = Excitation(low_v=LOW_V, high_v=HIGH_V, frequency_hz=FREQUENCY_HZ, clock="free")
     return Scenario(SAMPLES, excitation, random_phase=True, plant=PlantChoice(set=program), name="self-test")  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
 class SelfTestRecord:
-    """What was played and what was seen of it."""
+    """Samples of force and displacement, with what was played."""
 
     program: str
     sample_period_s: float
     time_scale: float
     channels: Mapping[str, Channel]
     codes: Mapping[str, NDArray[np.uint16]]
-    """By channel: (n,)"""
+    """Codes of each channel (n,)."""
     clipped: Mapping[str, NDArray[np.bool_]]
-    """By channel: (n,)"""
 
     @classmethod
-    def taken(cls, rig: Rig, seed: int, program: str) -> SelfTestRecord:
-        """Plays the self-test.
+    def take(cls, rig: Rig, seed: int, program: str) -> SelfTestRecord:
+        """Play the self-test on a rig.
 
         :raises ConfigurationError: the rig cannot play it.
-        :raises SelfTestError: it samples too fast for it, or did not take it as one record.
+        :raises SelfTestError: the rig samples too fast, or its samples have a gap.
         :raises RigError: the rig failed.
         """
         performance = rig.perform(scenario(program), seed)
@@ -88,7 +87,7 @@ class SelfTestRecord:
 
     @property
     def plant(self) -> Plant:
-        """What the pots are set for."""
+        """Plant that the pots are set for."""
         return PLANTS[self.program]
 
     @property
@@ -96,22 +95,22 @@ class SelfTestRecord:
         return 0.5 / (FREQUENCY_HZ * self.sample_period_s)
 
     def volts(self, channel: str) -> NDArray[np.float64]:
-        """(n,): at the computer."""
+        """(n,) voltage at the computer."""
         return self.channels[channel].volts(self.codes[channel])
 
     def swing_v(self, channel: str) -> float:
-        """From nearly the lowest sample to nearly the highest."""
+        """Range of the voltage between its 1 % and 99 % quantiles."""
         low, high = np.quantile(self.volts(channel), (0.01, 0.99))
         return float(high - low)
 
     def swing_codes(self, channel: str) -> float:
-        """The same in codes."""
+        """Same range in codes."""
         return self.swing_v(channel) / self.channels[channel].lsb_v
 
     def sharpness(self, channel: str) -> float:
-        """The step from one sample to the next that every other half period exceeds, in parts of the swing.
+        """Step between neighbouring samples that is exceeded once in two half periods, in parts of the swing.
 
-        About 1 for a square wave; a drop-out or a spike makes none of another signal.
+        It is about 1 for a square wave; a drop-out or a spike in another signal does not affect it.
         """
         steps = np.sort(np.abs(np.diff(self.volts(channel))))
         return float(steps[-int(0.5 * len(steps) / self.half_period_n)] / self.swing_v(channel))
