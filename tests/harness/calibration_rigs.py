@@ -43,7 +43,7 @@ class DrawnRig:
         return self.description.computer.components
 
 
-def drawn(number: int) -> DrawnRig:
+def draw_rig(number: int) -> DrawnRig:
     """Rig with random components within their tolerances.
 
     Every second one has the card of a served instrument, every third one pots set by dials, every fifth one is wired as
@@ -67,7 +67,7 @@ def drawn(number: int) -> DrawnRig:
     return DrawnRig(EmulatorDescription(card=card, computer=computer), "shock" if number % 5 == 4 else "front")
 
 
-def calibrated(
+def calibrate_rig(
     rig: DrawnRig, number: int, stocks: tuple[Stock, ...], pots: tuple[Pots, ...] = ("coefficient",)
 ) -> Calibration:
     """Calibration of a rig from recordings with independent noise."""

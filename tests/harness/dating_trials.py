@@ -46,7 +46,7 @@ def machines() -> EmulatorRig:
     return EmulatorRig(dataclasses.replace(described, computer=computer))
 
 
-def played(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
+def play(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
     """Samples of a scenario on one of the machines, or on another rig."""
     performance = (rig or machines()).perform(scenario, seed)
     blocks = list(performance.blocks)
@@ -71,7 +71,7 @@ def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> Tweak
     return Tweak(sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()})
 
 
-def changed(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
+def change_front(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
     """Front suspension with ``together`` of M, B, K changed, by factors from 1 +- least to 1 +- most."""
     plant = FRONT
     for name in rng.choice(PARAMETERS, size=together, replace=False).tolist():
@@ -100,21 +100,21 @@ class Trial:
         Edges come every 50 or 100 samples; the plant after the change is given in five of six trials.
         """
         rng = np.random.default_rng([9, seed])
-        after = changed(rng, 0.05, 0.5, together=int(rng.integers(1, 3)))
+        after = change_front(rng, 0.05, 0.5, together=int(rng.integers(1, 3)))
         sample = QUIET_N + int(rng.integers(200))
         first = sample - int(rng.integers(50, 550))
         scenario = scenario_of(2200, clock, float(rng.choice([100.0, 200.0])), after, sample)
-        return cls(played(scenario, seed), after, sample, 0, range(first, first + 600), bool(rng.uniform() < 5.0 / 6.0))
+        return cls(play(scenario, seed), after, sample, 0, range(first, first + 600), bool(rng.uniform() < 5.0 / 6.0))
 
     @classmethod
     def ramp(cls, seed: int, clock: Clock) -> Trial:
         """Change of one parameter by 10 to 50 % within 20 to 600 samples, 50 to 300 samples inside the range."""
         rng = np.random.default_rng([10, seed])
-        after = changed(rng, 0.1, 0.5, together=1)
+        after = change_front(rng, 0.1, 0.5, together=1)
         sample, ramp_n = QUIET_N + int(rng.integers(200)), int(math.exp(rng.uniform(math.log(20.0), math.log(600.0))))
         search = range(sample - int(rng.integers(50, 300)), sample + ramp_n + int(rng.integers(50, 300)))
         scenario = scenario_of(3000, clock, 200.0, after, sample, ramp_n)
-        return cls(played(scenario, seed), after, sample, ramp_n, search, known=True)
+        return cls(play(scenario, seed), after, sample, ramp_n, search, known=True)
 
     def date_jump(self) -> Instant | NoInstant:
         return date_jump(self.signals, FRONT, self.after if self.known else None, self.search)
@@ -161,7 +161,7 @@ class Several:
         The force overloads no amplifier where K is least.
         """
         rng = np.random.default_rng([12, seed])
-        away = [changed(rng, 0.05, 0.74, together=1) for _ in range(4)]
+        away = [change_front(rng, 0.05, 0.74, together=1) for _ in range(4)]
         plants = [FRONT, *(plant for each in away for plant in (each, FRONT))]
         instants = 600 + np.append(0, np.cumsum(rng.integers(150, 600, size=8)))
         pairs = list(zip(instants.tolist(), plants, plants[1:], strict=False))
@@ -173,7 +173,7 @@ class Several:
             tweaks=tuple(tweak_of(*pair) for pair in pairs),
             name="several",
         )
-        return cls(played(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
+        return cls(play(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
 
     def stretches(self) -> Iterator[tuple[Told, range]]:
         """Each change with the samples between its neighbours."""
@@ -194,5 +194,7 @@ def _next(
 def still(seed: int, clock: Clock) -> Trial:
     """Trial without a change, although a pot was to turn."""
     rng = np.random.default_rng([11, seed])
-    signals = played(scenario_of(2200, clock, 200.0), seed)
-    return Trial(signals, changed(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0))
+    signals = play(scenario_of(2200, clock, 200.0), seed)
+    return Trial(
+        signals, change_front(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0)
+    )

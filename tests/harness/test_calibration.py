@@ -36,7 +36,7 @@ from analogrig.rigs.rig import Block, Hindsight, Performance
 from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.scenario import PlantChoice
 from analogrig_emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
-from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
+from tests.harness.calibration_rigs import calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 
 LSB_V = 20.0 / 4096
 
@@ -51,8 +51,8 @@ def test_twin_of_a_random_rig_follows_it_and_its_errors_cover_the_truth(number: 
 
     One of 17 Gaussian errors exceeds 4.5 standard errors with a probability of 1e-4; chi-square 3 x 17 with 3e-5.
     """
-    rig = drawn(number)
-    found = calibrated(rig, number, stocks)
+    rig = draw_rig(number)
+    found = calibrate_rig(rig, number, stocks)
     assert found.twin.computer.components == rig.stock
     assert found.twin.card.bits == rig.description.card.bits
     for scenario in (thesis_profile(rig.program), check_scenario(rig.program)):
@@ -65,9 +65,9 @@ def test_twin_of_a_random_rig_follows_it_and_its_errors_cover_the_truth(number: 
 
 
 def test_pots_set_by_dials_are_identified_with_their_tracks() -> None:
-    rig = drawn(2)
+    rig = draw_rig(2)
     assert rig.description.computer.pots == "dial"
-    found = calibrated(rig, 2, (rig.stock,), ("coefficient", "dial"))
+    found = calibrate_rig(rig, 2, (rig.stock,), ("coefficient", "dial"))
     assert found.twin.computer.pots == "dial"
     assert rms_lsb(rig, found.twin, thesis_profile("front")) < 0.5
     track = found.estimate("B track")
@@ -157,7 +157,7 @@ def recordings() -> list[SquareWaveRecording]:
         return [record(rig, each, 1) for each in scenarios("front")]
 
 
-def altered(recordings: list[SquareWaveRecording], **changes: Any) -> list[SquareWaveRecording]:
+def alter(recordings: list[SquareWaveRecording], **changes: Any) -> list[SquareWaveRecording]:
     return [
         dataclasses.replace(each, **{name: change(each) for name, change in changes.items()}) for each in recordings
     ]
@@ -176,7 +176,7 @@ def test_recordings_of_no_computer_raise_one_line(
     recordings: list[SquareWaveRecording], codes: Any, message: str
 ) -> None:
     with pytest.raises(RigError, match=message):
-        calibrate(altered(recordings, codes=codes), stocks=("nominal",), pots=("coefficient",))
+        calibrate(alter(recordings, codes=codes), stocks=("nominal",), pots=("coefficient",))
 
 
 def test_too_few_recordings_are_rejected(recordings: list[SquareWaveRecording]) -> None:
@@ -186,10 +186,10 @@ def test_too_few_recordings_are_rejected(recordings: list[SquareWaveRecording]) 
 
 def test_card_whose_samples_do_not_fit_the_periods_is_rejected(recordings: list[SquareWaveRecording]) -> None:
     with pytest.raises(ConfigurationError, match=r"scenario calibration-1: half a period .* at 12345 Hz; .* 20000 Hz"):
-        calibrate(altered(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
+        calibrate(alter(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
 
 
-class Troubled:
+class FaultyRig:
     """Rig with a lit lamp, a caveat, or samples of two records."""
 
     capabilities = frozenset({"excite"})
@@ -219,15 +219,15 @@ class Troubled:
 @pytest.mark.parametrize(
     ("rig", "message"),
     [
-        (Troubled({"U1": 7}), "scenario calibration-1: overload lamps of U1 are lit"),
+        (FaultyRig({"U1": 7}), "scenario calibration-1: overload lamps of U1 are lit"),
         (
-            Troubled({}, ("the rig's self-test: skew",)),
+            FaultyRig({}, ("the rig's self-test: skew",)),
             "scenario calibration-1: the rig's self-test: skew: nothing",
         ),
-        (Troubled({}, records=(0, 1)), "scenario calibration-1: the samples have a gap"),
+        (FaultyRig({}, records=(0, 1)), "scenario calibration-1: the samples have a gap"),
     ],
 )
-def test_recordings_with_overload_or_gap_are_rejected(rig: Troubled, message: str) -> None:
+def test_recordings_with_overload_or_gap_are_rejected(rig: FaultyRig, message: str) -> None:
     with pytest.raises(RigError, match=message):
         record(rig, scenarios("front")[0], 1)
 
@@ -255,13 +255,13 @@ def test_command_writes_a_twin_that_opens_as_a_rig(
     monkeypatch.setattr("analogrig.cli.terminal._PROGRESS_S", 0.0)
     out = tmp_path / "twin.toml"
     assert run_calibrate(rig_file(tmp_path), out, "--json") == 0
-    said = capsys.readouterr()
-    assert "\r4 of 13 recordings (31%)" in said.err
-    assert said.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
-    told = json.loads(said.out)
-    assert told["check_lsb"] < 0.5
-    assert told["caveats"] == []
-    gain = next(each for each in told["estimates"] if each["name"] == "force gain")
+    output = capsys.readouterr()
+    assert "\r4 of 13 recordings (31%)" in output.err
+    assert output.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
+    result = json.loads(output.out)
+    assert result["check_lsb"] < 0.5
+    assert result["caveats"] == []
+    gain = next(each for each in result["estimates"] if each["name"] == "force gain")
     assert abs(gain["value"] - 1e-3) < 4.5 * gain["standard_error"]
     with open_rig(str(out)) as twin:
         assert isinstance(twin, EmulatorRig)
@@ -283,9 +283,9 @@ def test_rig_unlike_its_twin_fails_and_writes_no_file(tmp_path: Path, capsys: py
     """Stuck bit of 4 codes: an error of 0 to 4 LSB that depends on the level."""
     out = tmp_path / "twin.toml"
     assert run_calibrate(rig_file(tmp_path, stuck_low=4), out) == 1
-    said = capsys.readouterr().out
-    assert "no twin: more than 1 LSB" in said
-    assert re.search(r"^caveat: chi-square \d+ where noise leaves \d+ \+- \d+: ", said, re.MULTILINE)
+    output = capsys.readouterr().out
+    assert "no twin: more than 1 LSB" in output
+    assert re.search(r"^caveat: chi-square \d+ where noise leaves \d+ \+- \d+: ", output, re.MULTILINE)
     assert not out.exists()
 
 

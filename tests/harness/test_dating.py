@@ -25,7 +25,7 @@ from analogrig.hardware.dating.two_filter import (
 )
 from analogrig.plant import Plant, SampledPlant
 from analogrig_emulator import COMPONENTS, Excitation, PotChange, SuspensionComputer
-from tests.harness.dating_trials import FRONT, Trial, played, scenario_of, still
+from tests.harness.dating_trials import FRONT, Trial, play, scenario_of, still
 
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01
 NOISE_LSB = (1.0 + 1.0 / 12.0) ** 0.5
@@ -112,17 +112,17 @@ def test_interval_of_a_change_at_rest_reaches_to_the_next_edge() -> None:
 
 
 def test_deviation_of_some_per_cent_from_nominal_values_leaves_the_date() -> None:
-    beside = Plant(115.0 * 1.08, 3021.0 * 0.94, 24500.0 * 1.07)
-    signals = simulate([(0, beside), (600, beside.scaled("K", 0.72))], 1200, seed=7, place=0.4)
+    deviating = Plant(115.0 * 1.08, 3021.0 * 0.94, 24500.0 * 1.07)
+    signals = simulate([(0, deviating), (600, deviating.scaled("K", 0.72))], 1200, seed=7, place=0.4)
     assert jump_instant(signals, SOFT, range(400, 800)) == jump_instant(signals, None, range(400, 800))
     assert jump_instant(signals, SOFT, range(400, 800)).sample == 600
 
 
 def test_instant_is_found_if_the_plant_after_the_change_is_unknown() -> None:
     signals = simulate([(0, FRONT), (600, FRONT.scaled("M", 0.55))], 1200, seed=9)
-    told, untold = (jump_instant(signals, after, range(400, 800)) for after in (FRONT.scaled("M", 0.55), None))
-    assert untold.low <= 600 <= untold.high
-    assert abs(untold.low - told.low) <= 1 and abs(untold.high - told.high) <= 1
+    given, unknown = (jump_instant(signals, after, range(400, 800)) for after in (FRONT.scaled("M", 0.55), None))
+    assert unknown.low <= 600 <= unknown.high
+    assert abs(unknown.low - given.low) <= 1 and abs(unknown.high - given.high) <= 1
 
 
 def test_offsets_of_both_channels_leave_the_date() -> None:
@@ -170,10 +170,10 @@ def test_interval_on_a_finer_card_allows_for_real_components() -> None:
 
 def test_invalid_samples_are_ignored() -> None:
     signals = simulate([(0, FRONT), (600, SOFT)], 1200, seed=13)
-    gone = np.zeros(1200, bool)
-    gone[[300, 301, 302, 590, 591, 604, 605, 606]] = True
-    wild = np.where(gone, 0.3, signals.displacement_m)
-    out = jump_instant(dataclasses.replace(signals, displacement_m=wild, valid=~gone), SOFT, range(400, 800))
+    invalid = np.zeros(1200, bool)
+    invalid[[300, 301, 302, 590, 591, 604, 605, 606]] = True
+    wild = np.where(invalid, 0.3, signals.displacement_m)
+    out = jump_instant(dataclasses.replace(signals, displacement_m=wild, valid=~invalid), SOFT, range(400, 800))
     assert out.low <= 600 <= out.high
     assert out.high - out.low <= 4
 
@@ -204,8 +204,8 @@ def test_invisible_change_has_no_instant() -> None:
         force_n=signals.force_n * 0.0 + 30.0,
         displacement_m=M_PER_LSB * np.round(np.random.default_rng(1).normal(size=1200)),
     )
-    said = rejection(at_rest, FRONT.scaled("M", 0.5), range(400, 800))
-    assert said == "nothing in the samples 400 to 799 shows that the plant has changed"
+    message = rejection(at_rest, FRONT.scaled("M", 0.5), range(400, 800))
+    assert message == "nothing in the samples 400 to 799 shows that the plant has changed"
 
 
 def test_change_just_after_the_range_has_no_instant() -> None:
@@ -215,24 +215,24 @@ def test_change_just_after_the_range_has_no_instant() -> None:
     sample = 604 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[600:])) > 1000.0)[0])
     signals = simulate([(0, FRONT), (sample, light)], 1200, seed=18)
     assert jump_instant(signals, light, range(sample - 50, sample + 50)).sample == sample
-    said = rejection(signals, light, range(sample - 100, sample - 1))
-    assert said == f"the plant seems to have changed before or after the samples {sample - 100} to {sample - 2}"
+    message = rejection(signals, light, range(sample - 100, sample - 1))
+    assert message == f"the plant seems to have changed before or after the samples {sample - 100} to {sample - 2}"
 
 
 @pytest.mark.parametrize(
-    ("search", "said"),
+    ("search", "message"),
     [
         (range(400, 500), "the plant seems to have changed before or after the samples 400 to 499"),
         (range(700, 800), "the residuals of a plant that changes once have"),
     ],
     ids=["long before it", "long after it"],
 )
-def test_change_far_outside_the_range_has_no_instant(search: range, said: str) -> None:
+def test_change_far_outside_the_range_has_no_instant(search: range, message: str) -> None:
     signals = simulate([(0, FRONT), (600, SOFT)], 1200, seed=17)
     out = date_jump(signals, FRONT, SOFT, search)
     assert isinstance(out, NoInstant)
     assert not out.unchanged
-    assert out.reason.startswith(said)
+    assert out.reason.startswith(message)
 
 
 def test_within_excludes_another_change_nearby() -> None:
@@ -287,23 +287,23 @@ def test_range_that_leaves_the_record_raises(search: range) -> None:
 def test_begin_and_end_of_an_even_turn_are_within_their_intervals() -> None:
     """Machines of real components. The mean width of a hundred begins is 21 to 22 samples (README); ten instants stay
     below twice that."""
-    beside, widths = 0, []
+    misses, widths = 0, []
     for seed in range(5):
         trial = Trial.ramp(seed, "free" if seed % 2 else "card")
         out = trial.date_turn()
         assert isinstance(out, TurnInstants), out
-        beside += not out.begin.low <= trial.sample <= out.begin.high
-        beside += not out.end.low <= trial.sample + trial.ramp_n <= out.end.high
+        misses += not out.begin.low <= trial.sample <= out.begin.high
+        misses += not out.end.low <= trial.sample + trial.ramp_n <= out.end.high
         widths += [each.high - each.low + 1 for each in (out.begin, out.end)]
-    assert beside == 0
+    assert misses == 0
     assert np.mean(widths) < 44.0
 
 
 def test_gentle_turn_of_a_hand_is_found_from_its_begin_to_its_end() -> None:
     """Least jerk, as of a hand: 0.9 % of the path after a tenth of the time."""
     times = (np.arange(300) + 0.5) / 300.0
-    gone = times**3 * (10.0 - 15.0 * times + 6.0 * times**2)
-    way = [(600 + k, FRONT.on_the_way(SOFT, part)) for k, part in enumerate(gone.tolist())]
+    done = times**3 * (10.0 - 15.0 * times + 6.0 * times**2)
+    way = [(600 + k, FRONT.on_the_way(SOFT, part)) for k, part in enumerate(done.tolist())]
     signals = simulate_path([(0, FRONT), *way, (900, SOFT)], 1600)
     out = date_turn(signals, FRONT, SOFT, range(450, 1050))
     assert isinstance(out, TurnInstants), out
@@ -318,21 +318,21 @@ def test_two_pots_that_jump_in_succession_are_both_found() -> None:
     At a coverage of 95 %, more than two misses of twelve have a probability of 1 in 50, each by a few samples.
     """
     orders = [("B", "K", 5), ("K", "M", 40), ("B", "K", 120), ("M", "B", 60), ("M", "K", 90), ("K", "B", 20)]
-    beside_n = []
+    miss_n = []
     for seed, (first, second, gap) in enumerate(orders):
         middle = FRONT.scaled(first, 0.75)
         after = middle.scaled(second, 0.7)
         scenario = scenario_of(2200, "card", 200.0, middle, 1000 + 7 * seed)
         (tweak,) = scenario.tweaks
         (later,) = scenario_of(2200, "card", 200.0, after, tweak.sample + gap).tweaks
-        signals = played(dataclasses.replace(scenario, tweaks=(tweak, later)), seed)
+        signals = play(dataclasses.replace(scenario, tweaks=(tweak, later)), seed)
         out = date_turn(signals, FRONT, after, range(800, 1400), middle=middle)
         assert isinstance(out, TurnInstants), out
         for each, sample in ((out.begin, tweak.sample), (out.end, later.sample)):
-            beside_n.append(max(0, each.low - sample, sample - each.high))
+            miss_n.append(max(0, each.low - sample, sample - each.high))
         assert out.end.high - out.begin.low <= gap + 60
-    assert sum(n > 0 for n in beside_n) <= 2
-    assert max(beside_n) <= 5
+    assert sum(n > 0 for n in miss_n) <= 2
+    assert max(miss_n) <= 5
 
 
 def simulate_path(plants: Sequence[tuple[int, Plant]], samples: int) -> Signals:

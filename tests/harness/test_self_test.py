@@ -34,7 +34,7 @@ IDEAL = ComputerDescription(op_amp="ideal")
 Codes = NDArray[np.uint16]
 
 
-def emulated(
+def emulate(
     computer: ComputerDescription = IDEAL,
     ranges: Mapping[str, tuple[float, float]] = WIDE,
     noise_lsb: float = 1.0,
@@ -94,7 +94,7 @@ def value(findings: Findings, title: str) -> Check:
 
 @pytest.mark.parametrize("program", ["front", "shock"])
 def test_ideal_rig_is_well(program: str) -> None:
-    assert self_test(emulated(noise_lsb=0.0), 1, program).well
+    assert self_test(emulate(noise_lsb=0.0), 1, program).well
 
 
 @pytest.mark.parametrize("name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
@@ -105,7 +105,7 @@ def test_shipped_rigs_are_well(name: str) -> None:
 
 def test_twenty_machines_within_tolerance_are_well() -> None:
     """Resistors of 1 %, polyester of 5 %, offsets of 3 mV. `make bench ARGS=self-test` tries hundreds."""
-    rig = emulated(ComputerDescription(components="polyester"))
+    rig = emulate(ComputerDescription(components="polyester"))
     found = {
         (seed, program): self_test(rig, seed, program).reasons
         for seed in range(20)
@@ -117,11 +117,11 @@ def test_twenty_machines_within_tolerance_are_well() -> None:
 # ------------------------------------------------------------------------------------- each fault, at twice its limit
 
 
-def swapped(codes: Codes) -> Codes:
+def swap(codes: Codes) -> Codes:
     return codes[:, [1, 0, 2, 3]]
 
 
-def inverted(channel: str) -> Callable[[Codes], Codes]:
+def invert_channel(channel: str) -> Callable[[Codes], Codes]:
     """Inversion of a channel on a range from -12.5 to 12.5 V."""
     column = CHANNELS.index(channel)
 
@@ -148,7 +148,7 @@ def stuck_bit(codes: Codes) -> Codes:
     return codes
 
 
-def soaked(codes: Codes) -> Codes:
+def soak(codes: Codes) -> Codes:
     """Add a part of 1 % with a lag of 60 samples: 0.06 % of the swing that is no second-order response."""
     column = CHANNELS.index("displacement")
     values = codes[:, column].astype(np.float64)
@@ -172,48 +172,48 @@ SWING_LSB = 9.0 / FORCE_LSB_V, 5.43 / LSB_V
 # damping of 15 %.
 
 FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
-    "leads swapped": (lambda: Altered(emulated(), swapped), ["identity"]),
-    "force inverted": (lambda: Altered(emulated(ranges=BIPOLAR), inverted("force")), ["polarity of force"]),
+    "leads swapped": (lambda: Altered(emulate(), swap), ["identity"]),
+    "force inverted": (lambda: Altered(emulate(ranges=BIPOLAR), invert_channel("force")), ["polarity of force"]),
     "displacement inverted": (
-        lambda: Altered(emulated(ranges=BIPOLAR), inverted("displacement")),
+        lambda: Altered(emulate(ranges=BIPOLAR), invert_channel("displacement")),
         ["polarity of displacement"],
     ),
-    "force clips": (lambda: emulated(ranges=ranges(force=(-1.0, 9.0))), ["clipping of force"]),
+    "force clips": (lambda: emulate(ranges=ranges(force=(-1.0, 9.0))), ["clipping of force"]),
     "displacement clips": (
-        lambda: emulated(ranges=ranges(displacement=(-1.0, 5.6))),
+        lambda: emulate(ranges=ranges(displacement=(-1.0, 5.6))),
         ["clipping of displacement"],
     ),
     "force takes an eighth of the range": (
-        lambda: emulated(ranges=ranges(force=(-37.0, 37.0)), noise_lsb=0.2),
+        lambda: emulate(ranges=ranges(force=(-37.0, 37.0)), noise_lsb=0.2),
         ["range use of force"],
     ),
     "displacement takes an eighth of the range": (
-        lambda: emulated(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
+        lambda: emulate(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
         ["range use of displacement"],
     ),
-    "gain of force": (lambda: emulated(gain_error=[-0.02, 0, 0, 0]), ["gain of force"]),
-    "gain of displacement": (lambda: emulated(gain_error=[0, 0.10, 0, 0]), ["gain of displacement"]),
-    "offset of force": (lambda: emulated(offset_lsb=[0.120 / FORCE_LSB_V, 0, 0, 0]), ["offset of force"]),
-    "offset of displacement": (lambda: emulated(offset_lsb=[0, -0.120 / LSB_V, 0, 0]), ["offset of displacement"]),
-    "displacement late": (lambda: emulated(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
-    "force late": (lambda: emulated(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
+    "gain of force": (lambda: emulate(gain_error=[-0.02, 0, 0, 0]), ["gain of force"]),
+    "gain of displacement": (lambda: emulate(gain_error=[0, 0.10, 0, 0]), ["gain of displacement"]),
+    "offset of force": (lambda: emulate(offset_lsb=[0.120 / FORCE_LSB_V, 0, 0, 0]), ["offset of force"]),
+    "offset of displacement": (lambda: emulate(offset_lsb=[0, -0.120 / LSB_V, 0, 0]), ["offset of displacement"]),
+    "displacement late": (lambda: emulate(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
+    "force late": (lambda: emulate(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
     "force noisy": (
-        lambda: Altered(emulated(), noisier("force", 0.004 * SWING_LSB[0])),
+        lambda: Altered(emulate(), noisier("force", 0.004 * SWING_LSB[0])),
         ["noise of force"],
     ),
     "displacement noisy": (
-        lambda: Altered(emulated(), noisier("displacement", 0.004 * SWING_LSB[1])),
+        lambda: Altered(emulate(), noisier("displacement", 0.004 * SWING_LSB[1])),
         ["noise of displacement"],
     ),
-    "card fast": (lambda: emulated(clock_drift_ppm=100.0), ["clock ratio"]),
-    "card slow": (lambda: emulated(clock_drift_ppm=-100.0), ["clock ratio"]),
-    "pot of M": (lambda: Altered(emulated(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
+    "card fast": (lambda: emulate(clock_drift_ppm=100.0), ["clock ratio"]),
+    "card slow": (lambda: emulate(clock_drift_ppm=-100.0), ["clock ratio"]),
+    "pot of M": (lambda: Altered(emulate(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
     "pot of B": (
-        lambda: Altered(emulated(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
+        lambda: Altered(emulate(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
         ["damping"],
     ),
-    "a dielectric that soaks": (lambda: Altered(emulated(), soaked), ["shape of displacement"]),
-    "a bit of displacement stuck": (lambda: Altered(emulated(), stuck_bit), ["shape of displacement"]),
+    "a dielectric that soaks": (lambda: Altered(emulate(), soak), ["shape of displacement"]),
+    "a bit of displacement stuck": (lambda: Altered(emulate(), stuck_bit), ["shape of displacement"]),
 }
 
 
@@ -224,7 +224,7 @@ def test_each_fault_is_identified_without_another(fault: str) -> None:
 
 
 def test_half_of_each_limit_is_well() -> None:
-    rig = emulated(
+    rig = emulate(
         gain_error=[-0.005, 0.025, 0, 0],
         offset_lsb=[0.030 / FORCE_LSB_V, -0.030 / LSB_V, 0, 0],
         skew_s=[0.0, 2.5e-6, 0, 0],
@@ -236,7 +236,7 @@ def test_half_of_each_limit_is_well() -> None:
 
 
 def test_inverted_signal_on_a_unipolar_range_is_clipping() -> None:
-    rig = emulated(ranges=ranges(displacement=(-10.0, 0.0)))
+    rig = emulate(ranges=ranges(displacement=(-10.0, 0.0)))
     assert wrong_titles(rig) == ["clipping of displacement"]
 
 
@@ -245,16 +245,16 @@ def test_swapped_leads_are_separated_from_one_signal_on_both() -> None:
         return codes[:, [0, 0, 2, 3]]
 
     found = {}
-    for alter in (swapped, both):
-        (check,) = self_test(Altered(emulated(), alter), 1, "shock").in_state("wrong")
+    for alter in (swap, both):
+        (check,) = self_test(Altered(emulate(), alter), 1, "shock").in_state("wrong")
         assert check.title == "identity"
         found[alter] = check.advice
-    assert "swapped" in found[swapped]
+    assert "swapped" in found[swap]
     assert "wrong jack" in found[both]
 
 
 def test_several_faults_are_all_identified() -> None:
-    rig = emulated(skew_s=[0, 15e-6, 0, 0], clock_drift_ppm=-150.0, gain_error=[0.05, 0, 0, 0])
+    rig = emulate(skew_s=[0, 15e-6, 0, 0], clock_drift_ppm=-150.0, gain_error=[0.05, 0, 0, 0])
     assert wrong_titles(rig) == ["gain of force", "skew", "clock ratio"]
 
 
@@ -265,8 +265,8 @@ def test_error_of_the_generator_is_separated_from_one_of_the_input() -> None:
         wave = dataclasses.replace(played.excitation, low_v=0.515, high_v=9.785)
         return dataclasses.replace(played, excitation=wave)
 
-    generator = self_test(Altered(emulated(), play=louder), 1).in_state("wrong")
-    card = self_test(emulated(gain_error=[0.03, 0, 0, 0]), 1).in_state("wrong")
+    generator = self_test(Altered(emulate(), play=louder), 1).in_state("wrong")
+    card = self_test(emulate(gain_error=[0.03, 0, 0, 0]), 1).in_state("wrong")
     assert [check.title for check in (*generator, *card)] == ["gain of force"] * 2
     assert "generator" in generator[0].advice
     assert "generator" not in card[0].advice
@@ -288,7 +288,7 @@ def test_standard_errors_are_those_of_the_estimates() -> None:
     for seed in range(DRAWN):
         gains, offsets = rng.uniform(-0.005, 0.005, 2), rng.uniform(-10, 10, 2)
         late_n, ppm = int(rng.integers(0, 10)) / 10, float(rng.uniform(-200, 200))
-        rig = emulated(
+        rig = emulate(
             noise_lsb=1.5,
             gain_error=[*gains, 0, 0],
             offset_lsb=[*offsets, 0, 0],
@@ -328,7 +328,7 @@ def test_delay_interval_of_edges_between_samples_holds_the_truth() -> None:
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
-        found_n, error_n = delay(codes, levels, edges, numbered(line, edges), 0.0)
+        found_n, error_n = delay(codes, levels, edges, align(line, edges), 0.0)
         assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
 
 
@@ -340,7 +340,7 @@ def test_averaging_instrument_is_identified_by_samples_between_levels() -> None:
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         assert edges.averaging_n() == pytest.approx(averaged, abs=0.03)
-        found_n, _ = delay(codes, levels, edges, numbered(line, edges), 0.0)
+        found_n, _ = delay(codes, levels, edges, align(line, edges), 0.0)
         assert found_n == pytest.approx(late_n, abs=5e-3)
 
 
@@ -358,7 +358,7 @@ def square_wave(line: EdgeTimes, late_n: float, averaged: float) -> Codes:
     return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
 
 
-def numbered(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
+def align(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
     """Same timing, with the instants next to the middle edge."""
     turns = np.rint((edges.times().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
@@ -389,10 +389,10 @@ def test_averaging_over_the_sample_period_causes_no_skew() -> None:
             performance = super().perform(dataclasses.replace(scenario, samples=8 * scenario.samples), seed)
             return dataclasses.replace(performance, sample_period_s=8.0 * performance.sample_period_s)
 
-    assert self_test(Averaging(emulated(rate_hz=160e3), averages), 1).reasons == ()
-    late = self_test(Averaging(emulated(rate_hz=160e3, skew_s=[0.0, 2e-6, 0, 0]), averages), 1)
+    assert self_test(Averaging(emulate(rate_hz=160e3), averages), 1).reasons == ()
+    late = self_test(Averaging(emulate(rate_hz=160e3, skew_s=[0.0, 2e-6, 0, 0]), averages), 1)
     assert value(late, "skew").value == pytest.approx(0.04, abs=0.03)
-    later = emulated(rate_hz=160e3)
+    later = emulate(rate_hz=160e3)
     shifted = Averaging(
         later, lambda codes: averages(np.stack([codes[:, 0], np.roll(codes[:, 1], -2), *codes.T[2:]], 1))
     )
@@ -436,7 +436,7 @@ def glitch(codes: Codes) -> Codes:
 
 
 @pytest.mark.parametrize(
-    ("alter", "says"),
+    ("alter", "message"),
     [
         (zero_from(0), "no signal on force"),
         (zero_from(0, CHANNELS.index("displacement")), "no signal on displacement"),
@@ -446,9 +446,9 @@ def glitch(codes: Codes) -> Codes:
         (lambda codes: codes[:-1], "16383 of 16384 samples"),
     ],
 )
-def test_record_without_signal_or_with_a_drop_out_raises(alter: Callable[[Codes], Codes], says: str) -> None:
-    with pytest.raises(SelfTestError, match=says):
-        self_test(Altered(emulated(noise_lsb=0.0), alter), 1)
+def test_record_without_signal_or_with_a_drop_out_raises(alter: Callable[[Codes], Codes], message: str) -> None:
+    with pytest.raises(SelfTestError, match=message):
+        self_test(Altered(emulate(noise_lsb=0.0), alter), 1)
 
 
 def test_failure_of_the_rig_is_raised() -> None:
@@ -456,7 +456,7 @@ def test_failure_of_the_rig_is_raised() -> None:
         raise RigError("the instrument is gone")
 
     with pytest.raises(RigError, match="the instrument is gone"):
-        self_test(Altered(emulated(), fails), 1)
+        self_test(Altered(emulate(), fails), 1)
 
 
 def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
@@ -466,7 +466,7 @@ def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
 
 def test_other_programs_cannot_be_tested() -> None:
     with pytest.raises(SelfTestError, match="two-mass"):
-        self_test(emulated(), 1, "two-mass")
+        self_test(emulate(), 1, "two-mass")
 
 
 RIG_FILE = """
@@ -489,9 +489,9 @@ def rig_file(tmp_path: Path, faults: str) -> str:
 
 def test_doctor_passes_a_healthy_rig(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--rig", "emulator", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["rig"], said["well"], said["reasons"]) == ("emulator", True, [])
-    assert {check["state"] for check in said["checks"]} == {"well"}
+    output = json.loads(capsys.readouterr().out)
+    assert (output["rig"], output["well"], output["reasons"]) == ("emulator", True, [])
+    assert {check["state"] for check in output["checks"]} == {"well"}
 
 
 def test_doctor_reports_value_limit_and_remedy_of_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -520,9 +520,9 @@ def test_doctor_is_inconclusive_if_a_quantity_is_not_measured(
     path = tmp_path / "noisy.toml"
     path.write_text(RIG_FILE.format(faults="").replace("noise_lsb = 1.0", "noise_lsb = 4.0"))
     assert main(["doctor", "--rig", str(path)]) == 3
-    said = capsys.readouterr().out
-    assert said.startswith("self-test of noisy, program front: 1 NOT MEASURED")
-    assert "standard error would have to be at most 0.056" in said
+    output = capsys.readouterr().out
+    assert output.startswith("self-test of noisy, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.056" in output
 
 
 def test_doctor_of_an_unknown_rig_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
@@ -534,19 +534,19 @@ def test_doctor_of_an_unknown_rig_is_a_usage_error(capsys: pytest.CaptureFixture
 def test_skew_of_a_fast_card_is_limited_in_microseconds(late_us: float) -> None:
     """At 60 kHz, 5 us are 0.3 samples; the delay of the amplifiers has a standard error of 0.03."""
     skew_s = [max(0.0, -1e-6 * late_us), max(0.0, 1e-6 * late_us), 0.0, 0.0]
-    check = value(self_test(emulated(rate_hz=60e3, skew_s=skew_s), 1), "skew")
+    check = value(self_test(emulate(rate_hz=60e3, skew_s=skew_s), 1), "skew")
     assert check.value == pytest.approx(0.06 * (late_us + 0.625), abs=0.03)  # ideal amplifiers do not delay
     assert check.state == ("wrong" if abs(late_us) > 5.0 else "well")
 
 
 def test_card_too_fast_for_the_self_test_is_rejected() -> None:
     with pytest.raises(SelfTestError, match="the self-test goes up to 120750 samples/s, and the rig takes 300000"):
-        self_test(emulated(rate_hz=300e3), 1)
-    assert self_test(emulated(rate_hz=120e3), 1).well
+        self_test(emulate(rate_hz=300e3), 1)
+    assert self_test(emulate(rate_hz=120e3), 1).well
 
 
 def test_unmeasured_quantities_are_reported() -> None:
     """Noise of 60 LSB: noise is wrong, and the skew is known to some hundredths of a sample only."""
-    findings = self_test(emulated(noise_lsb=60.0), 1)
+    findings = self_test(emulate(noise_lsb=60.0), 1)
     assert {check.title for check in findings.in_state("wrong")} == {"noise of force", "noise of displacement"}
     assert "skew" in {check.title for check in findings.in_state("not measured")}
