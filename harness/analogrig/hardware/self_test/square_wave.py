@@ -1,8 +1,8 @@
 """Square wave as a card samples it: levels, edges, timing, and the noise of force and displacement.
 
 An edge between two samples shows only that it lies between them. Each edge gives an interval for the unknown delay, and
-the truth lies in all of them. Edges fall on many parts of a sample period, so the intersection is narrow (set-membership
-estimation: Milanese and Vicino, Automatica 27, 1991, 997).
+the truth lies in all of them. Edges fall on many parts of a sample period, so the intersection is narrow
+(set-membership estimation: Milanese and Vicino, Automatica 27, 1991, 997).
 
 An instrument that averages over a part of each sample period shows some edges between the levels; the value there is
 linear in the instant.
