@@ -16,7 +16,6 @@ import shutil
 import sys
 import tempfile
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -127,5 +126,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("default")
     sys.exit(main())
