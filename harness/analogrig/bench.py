@@ -19,7 +19,7 @@ from analogrig.links.wire import Clock
 from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
+from analogrig.run import CHANNELS, Conditions, Run, missing_samples
 from analogrig.scenario import Scenario
 
 Progress = Callable[[int, int], None]
@@ -30,7 +30,7 @@ INTERRUPTED_BY_USER = "interrupted by the user"
 _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
 
-class _Collected:
+class _RunBuilder:
     """Samples and answers of one run. A Run refers to these very arrays: nothing is kept twice.
 
     The arrays have room for all samples that were asked for. Memory that is never written costs nothing.
@@ -63,7 +63,7 @@ class _Collected:
         self._clipped[to] = block.clipped[:answered]
         self._theta[to], self._innovation[to] = reply.theta, reply.innovation
         self._statistic[to], self._flags[to] = reply.statistic, reply.flags
-        shifted = _since(self.records[-1], reply)
+        shifted = _shift_replies(self.records[-1], reply)
         self._alarms += shifted.alarms
         self._diagnoses += shifted.diagnoses
         self.samples += answered
@@ -72,7 +72,7 @@ class _Collected:
         self.line_s += line_s
         self.counters.update(counters)
 
-    def run(self, conditions: Conditions) -> Run:
+    def build(self, conditions: Conditions) -> Run:
         alarms, diagnoses = self._alarms, self._diagnoses
         return Run(
             conditions=conditions,
@@ -92,7 +92,7 @@ class _Collected:
         )
 
 
-def _since(first: int, reply: Replies) -> Replies:
+def _shift_replies(first: int, reply: Replies) -> Replies:
     """What the device said of a record that begins with the sample ``first``, which is 0 to the device."""
     if not first:
         return reply
@@ -105,7 +105,7 @@ def _since(first: int, reply: Replies) -> Replies:
     )
 
 
-def uninterrupted(run: Run) -> Run:
+def raise_if_interrupted(run: Run) -> Run:
     """Return the run, for a caller to whom a part of it is of no use.
 
     :raises KeyboardInterrupt: the user interrupted it.
@@ -116,7 +116,7 @@ def uninterrupted(run: Run) -> Run:
 
 
 @contextlib.contextmanager
-def _undisturbed(pace: Pace | None) -> Iterator[None]:
+def _pause_garbage_collection(pace: Pace | None) -> Iterator[None]:
     """In real time the collector of garbage waits: among as many answers it takes longer than a message lasts."""
     if pace is None or not gc.isenabled():
         yield
@@ -173,16 +173,16 @@ class Bench:
         """
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
-        pace, blocks = self._paced(performance)
+        pace, blocks = self._pace_blocks(performance)
         self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
-        begun = self._begun(performance, scenario, seed)
-        collected = _Collected(scenario.samples, self.dut.parameters)
-        faults = (*scenario.caveats, *self._failures(blocks, pace, scenario.samples, collected, until_s))
-        conditions = self._concluded(begun, performance.hindsight(), faults, collected)
-        return collected.run(conditions)
+        begun = self._initial_conditions(performance, scenario, seed)
+        builder = _RunBuilder(scenario.samples, self.dut.parameters)
+        faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
+        conditions = self._final_conditions(begun, performance.hindsight(), faults, builder)
+        return builder.build(conditions)
 
-    def _begun(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
+    def _initial_conditions(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
         """What is known before the first sample."""
         return Conditions(
             seed=seed,
@@ -199,17 +199,17 @@ class Bench:
             real_time=self._real_time or 0.0,
         )
 
-    def _failures(
-        self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected, until_s: float
+    def _collect_samples(
+        self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder, until_s: float
     ) -> list[str]:
         """Exchanges the samples, and says what kept it from doing so to the end."""
         faults = []
         try:
-            with _undisturbed(pace), self._limited(until_s):
-                self._exchange(self._in_time(blocks, until_s), pace, samples, collected)
+            with _pause_garbage_collection(pace), self._limit_waits(until_s):
+                self._exchange(self._take_until(blocks, until_s), pace, samples, builder)
         except TimeLimitReached:
             limit = f"time limit of {self._time_limit_s:g} s"
-            faults.append(f"{limit} reached after {collected.samples} of {samples} samples")
+            faults.append(f"{limit} reached after {builder.samples} of {samples} samples")
         except RigError as error:
             faults.append(str(error))
             with contextlib.suppress(DeviceError, LinkError):
@@ -225,7 +225,7 @@ class Bench:
         return faults
 
     @contextlib.contextmanager
-    def _limited(self, until_s: float) -> Iterator[None]:
+    def _limit_waits(self, until_s: float) -> Iterator[None]:
         """Bound every wait for the device by the time limit."""
         self.dut.limit(until_s - self._clock())
         try:
@@ -233,7 +233,7 @@ class Bench:
         finally:
             self.dut.limit(math.inf)
 
-    def _in_time(self, blocks: Iterable[Block], until_s: float) -> Iterator[Block]:
+    def _take_until(self, blocks: Iterable[Block], until_s: float) -> Iterator[Block]:
         """The blocks until the time limit.
 
         :raises TimeLimitReached: it is over.
@@ -243,8 +243,8 @@ class Bench:
                 raise TimeLimitReached("the time limit of the run is over")
             yield block
 
-    def _concluded(
-        self, begun: Conditions, known: Hindsight, faults: tuple[str, ...], collected: _Collected
+    def _final_conditions(
+        self, begun: Conditions, known: Hindsight, faults: tuple[str, ...], builder: _RunBuilder
     ) -> Conditions:
         """What is known after the last sample."""
         return dataclasses.replace(
@@ -255,14 +255,14 @@ class Bench:
             },
             segments=known.segments,
             faults=(*faults, *known.caveats),
-            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < collected.samples},
-            records=tuple(collected.records) or (0,),
-            line_s=collected.line_s,
-            counters=collected.counters,
+            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < builder.samples},
+            records=tuple(builder.records) or (0,),
+            line_s=builder.line_s,
+            counters=builder.counters,
             link_counters=self.dut.link_counters,
         )
 
-    def _paced(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
+    def _pace_blocks(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
         """The pace of the samples, and what to send."""
         if self._real_time is None:
             return None, performance.blocks
@@ -273,19 +273,19 @@ class Bench:
         """Of a run in real time; counts its overruns."""
         return self.dut.pace(period_s)
 
-    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected) -> None:
+    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder) -> None:
         """One record after the other; to the device each is a run of its own, the first of which has begun."""
         for record, its_blocks in itertools.groupby(blocks, key=lambda block: block.record):
             if record:
                 self.dut.start(pace)
-            collected.begin_record()
-            self._exchange_record(its_blocks, samples, collected)
+            builder.begin_record()
+            self._exchange_record(its_blocks, samples, builder)
             line_s = self.dut.line_s
-            collected.end_record(line_s, self.dut.stop())
+            builder.end_record(line_s, self.dut.stop())
 
-    def _exchange_record(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
+    def _exchange_record(self, blocks: Iterable[Block], samples: int, builder: _RunBuilder) -> None:
         sent: deque[Block] = deque()
-        start = collected.records[-1]
+        start = builder.records[-1]
 
         def stretches() -> Iterator[Stretch]:
             for block in blocks:
@@ -294,10 +294,10 @@ class Bench:
                     block.first - start,
                     block.codes[:, _FORCE],
                     block.codes[:, _DISPLACEMENT],
-                    missing_to_device(block.clipped),
+                    missing_samples(block.clipped),
                 )
 
         for reply in self.dut.play(stretches()):
-            collected.add(sent.popleft(), reply)
+            builder.add(sent.popleft(), reply)
             if self._progress is not None:
-                self._progress(collected.samples, samples)
+                self._progress(builder.samples, samples)

@@ -48,7 +48,7 @@ class Plant:
         values = self.parameters()
         return Plant(*(value * factor if name == each else value for each, value in values.items()))
 
-    def on_the_way(self, other: Plant, part: float) -> Plant:
+    def interpolate(self, other: Plant, part: float) -> Plant:
         """The plant at a part (0..1) of a ramp to another: what the pots pass, 1/M, B and K, changes evenly.
 
         So it is but for the load of the pots: dials that turn evenly are at most 2 % of a coefficient beside it.
@@ -83,17 +83,17 @@ class SampledPlant:
     """x and v per newton."""
 
     @classmethod
-    def of(cls, plant: Plant, period_s: float) -> SampledPlant:
+    def from_plant(cls, plant: Plant, period_s: float) -> SampledPlant:
         """Every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
-        return cls.of_each([plant], period_s)[0]
+        return cls.from_plants([plant], period_s)[0]
 
     @classmethod
-    def of_each(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
+    def from_plants(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
         """As ``of``, bit for bit, for many plants in less time."""
         parameters = np.array([(each.mass_kg, each.damping_n_s_per_m, each.stiffness_n_per_m) for each in plants])
         return [
             cls(transition=(xx, xv, vx, vv), response=(xf, vf))
-            for (xx, xv, xf), (vx, vv, vf) in sampled(parameters.reshape(-1, 3), period_s).tolist()
+            for (xx, xv, xf), (vx, vv, vf) in discretise(parameters.reshape(-1, 3), period_s).tolist()
         ]
 
     def next(self, state: State, force_n: float) -> State:
@@ -104,7 +104,7 @@ class SampledPlant:
         return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
 
 
-def sampled(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
+def discretise(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
     """One sample period of (n, 3) values of M, B, K: of each the rows of x and v from x, v and force, (n, 2, 3)."""
     m, b, k = parameters.T
     generators = np.zeros((len(parameters), 3, 3))

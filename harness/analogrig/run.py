@@ -44,7 +44,7 @@ MAX_CHANGES = 1_000
 
 MAX_CODES = 1 << 16
 
-_NEAR, _FAR = 1e-12, 1e9
+_LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
 """Short of and beyond any unit, time or noise that is one."""
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
@@ -70,7 +70,7 @@ _ARRAYS: dict[str, tuple[str, int]] = {
     "alarm_statistic": ("float32", 1),
 }
 
-_LATER_ARRAYS: dict[str, tuple[str, int]] = {
+_OPTIONAL_ARRAYS: dict[str, tuple[str, int]] = {
     "diagnosis_index": ("int64", 1),
     "diagnosis_change": ("uint8", 1),
     "diagnosis_onset": ("int64", 1),
@@ -111,7 +111,7 @@ class Channel:
         return self.lsb_v * self.unit_per_v
 
 
-def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n,) of (n, 4): a sample whose force or displacement was clipped is no measurement."""
     used = [CHANNELS.index(name) for name in MEASURED]
     return np.asarray(clipped[:, used].any(axis=1))
@@ -139,13 +139,13 @@ class Segment:
 
     def earliest(self) -> Self:
         """As if it had begun, and been over, as early as it may have."""
-        return self._between(self.start_low, self.end_low)
+        return self._move_to(self.start_low, self.end_low)
 
     def latest(self) -> Self:
         """... as late as it may have."""
-        return self._between(self.start_high, self.end_high)
+        return self._move_to(self.start_high, self.end_high)
 
-    def _between(self, start: int | None, end: int | None) -> Self:
+    def _move_to(self, start: int | None, end: int | None) -> Self:
         start = self.start if start is None else start
         ramp_n = self.ramp_n if end is None else max(0, end - start)
         return dataclasses.replace(self, start=start, ramp_n=ramp_n)
@@ -243,7 +243,7 @@ class Run:
     @property
     def missing(self) -> NDArray[np.bool_]:
         """(n,): the device was told that this sample is missing."""
-        return missing_to_device(self.clipped)
+        return missing_samples(self.clipped)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
@@ -275,7 +275,7 @@ class Run:
         starts = [start for start in self.conditions.records if start < self.samples]
         return tuple(itertools.pairwise([*starts, self.samples]))
 
-    def supposing(self, instant: Callable[[Segment], Segment]) -> Run:
+    def with_change_instants(self, instant: Callable[[Segment], Segment]) -> Run:
         """The same run if each change had come at another instant, within its record and before the end."""
         segments = []
         for segment in self.conditions.segments:
@@ -286,7 +286,7 @@ class Run:
             segments.append(supposed)
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, segments=tuple(segments)))
 
-    def made_by(self, identity: Identity) -> Run:
+    def with_identity(self, identity: Identity) -> Run:
         """Return the same run with this provenance."""
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, identity=identity))
 
@@ -303,7 +303,7 @@ class Run:
         :raises RecordingError: the file cannot be written.
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
-        arrays = {name: getattr(self, name) for name in _ARRAYS | _LATER_ARRAYS}
+        arrays = {name: getattr(self, name) for name in _ARRAYS | _OPTIONAL_ARRAYS}
         with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
             for name, array in {"header": np.array(header), **arrays}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -321,14 +321,14 @@ class Run:
             with path.open("rb") as raw:
                 _check_archive(raw)
                 with np.load(raw, allow_pickle=False) as file:
-                    header = json.loads(str(file["header"]), parse_float=_finite, parse_constant=_finite)
-                    names = (*_ARRAYS, *(name for name in _LATER_ARRAYS if name in file))
-                    arrays = {name: _checked(name, file[name]) for name in names}
+                    header = json.loads(str(file["header"]), parse_float=_parse_finite, parse_constant=_parse_finite)
+                    names = (*_ARRAYS, *(name for name in _OPTIONAL_ARRAYS if name in file))
+                    arrays = {name: _check_array(name, file[name]) for name in names}
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
         except Exception as error:  # numpy and zipfile raise a dozen types on damaged archives, undocumented
             raise RecordingError(f"{path}: truncated, or not a recording of analogrig") from error
-        run = cls(conditions=_conditions(header, path), **arrays)
+        run = cls(conditions=_parse_conditions(header, path), **arrays)
         run._check_consistency(path)
         return run
 
@@ -361,28 +361,31 @@ class Run:
                 len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
             )
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
-            and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
+            and all(len(getattr(self, name)) == diagnoses for name in _OPTIONAL_ARRAYS),
             "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
-            "sample times": all(_NEAR < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale))
-            and all(0.0 <= each < _FAR for each in (conditions.real_time, conditions.line_s)),
+            "sample times": all(
+                _LEAST_MAGNITUDE < each < _MOST_MAGNITUDE
+                for each in (conditions.sample_period_s, conditions.time_scale)
+            )
+            and all(0.0 <= each < _MOST_MAGNITUDE for each in (conditions.real_time, conditions.line_s)),
             "number of samples": n <= conditions.samples_asked <= MAX_SAMPLES,
             "seed": 0 <= conditions.seed < 2**63,
             "units": all(
-                _NEAR < channel.lsb_v < _FAR
-                and _NEAR < abs(channel.unit_per_v) < _FAR
-                and abs(channel.low_v) < _FAR
-                and 0.0 <= channel.noise_lsb < _FAR
+                _LEAST_MAGNITUDE < channel.lsb_v < _MOST_MAGNITUDE
+                and _LEAST_MAGNITUDE < abs(channel.unit_per_v) < _MOST_MAGNITUDE
+                and abs(channel.low_v) < _MOST_MAGNITUDE
+                and 0.0 <= channel.noise_lsb < _MOST_MAGNITUDE
                 and 1 <= channel.codes <= MAX_CODES
                 for channel in conditions.channels.values()
             ),
             "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
-            "records": _ascend(conditions.records) and 1 <= len(conditions.records) <= MAX_CHANGES,
+            "records": _start_at_zero_and_rise(conditions.records) and 1 <= len(conditions.records) <= MAX_CHANGES,
             "segments": len(starts) <= MAX_CHANGES + 1
-            and all(_ascend(starts) for starts in (earliest, starts, latest))
+            and all(_start_at_zero_and_rise(starts) for starts in (earliest, starts, latest))
             and all(low <= start <= high for low, start, high in zip(earliest, starts, latest, strict=True)),
-            "alarms": _is_rising(self.alarm_index, n),
-            "diagnoses": _is_rising(self.diagnosis_index, n)
+            "alarms": _are_sample_indices(self.alarm_index, n),
+            "diagnoses": _are_sample_indices(self.diagnosis_index, n)
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
@@ -402,7 +405,7 @@ def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
         file.write(rows[first : first + CHUNK_SAMPLES].tobytes())
 
 
-def _finite(number: str) -> float:
+def _parse_finite(number: str) -> float:
     """A number of the header, which goes to other programs as JSON again.
 
     :raises ValueError: it is none that JSON has.
@@ -413,12 +416,12 @@ def _finite(number: str) -> float:
     return value
 
 
-def _is_rising(indices: NDArray[np.int64], n: int) -> bool:
+def _are_sample_indices(indices: NDArray[np.int64], n: int) -> bool:
     """True if all are samples of a run, in their order."""
     return not len(indices) or bool(indices[0] >= 0 and indices[-1] < n and (np.diff(indices) >= 0).all())
 
 
-def _ascend(starts: Sequence[int]) -> bool:
+def _start_at_zero_and_rise(starts: Sequence[int]) -> bool:
     """From 0."""
     return not starts or (starts[0] == 0 and list(starts) == sorted(set(starts)))
 
@@ -434,8 +437,8 @@ def _check_archive(raw: BinaryIO) -> None:
     raw.seek(0)
 
 
-def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    dtype, dimensions = (_ARRAYS | _LATER_ARRAYS)[name]
+def _check_array(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    dtype, dimensions = (_ARRAYS | _OPTIONAL_ARRAYS)[name]
     if array.dtype != np.dtype(dtype) or array.ndim != dimensions:
         raise ValueError(f"array {name} is {array.dtype} with {array.ndim} dimensions")
     return array
@@ -453,7 +456,7 @@ def _to_json(conditions: Conditions) -> dict[str, Any]:
     return out
 
 
-def _conditions(header: Any, path: Path) -> Conditions:
+def _parse_conditions(header: Any, path: Path) -> Conditions:
     """:raises RecordingError: the header is not one, or of another format."""
     if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
         raise RecordingError(f"{path}: not of the format {FORMAT} {FORMAT_VERSION}")

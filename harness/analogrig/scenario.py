@@ -52,12 +52,12 @@ class PlantChoice:
     def __post_init__(self) -> None:
         _check_parameters(self)
 
-    def given(self) -> dict[str, float]:
+    def overrides(self) -> dict[str, float]:
         """The parameters that do not stand where the set has them, under their names in Plant."""
-        return _given(self)
+        return _overrides(self)
 
     def plant(self) -> Plant:
-        return _changed(PLANTS[self.set], self)
+        return _apply_overrides(PLANTS[self.set], self)
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ class Tweak:
             raise ValueError(f"sample must be at least 1, not {self.sample}")
         if not 0 <= self.ramp_n <= MAX_RAMP_N:
             raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
-        if not _given(self):
+        if not _overrides(self):
             raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
 
-    def given(self) -> dict[str, float]:
+    def overrides(self) -> dict[str, float]:
         """The parameters it sets, under their names in Plant."""
-        return _given(self)
+        return _overrides(self)
 
 
 @dataclass(frozen=True)
@@ -207,9 +207,9 @@ class Scenario:
 
     def as_table(self) -> dict[str, Any]:
         """The same as plain values, so that ``from_table`` gives an equal scenario again."""
-        return _plain(dataclasses.asdict(self))
+        return _toml_table(dataclasses.asdict(self))
 
-    def excitation_drawn(self, rng: np.random.Generator) -> Excitation:
+    def draw_excitation(self, rng: np.random.Generator) -> Excitation:
         """The excitation of one run: its phase drawn if the scenario asks for it."""
         if not self.random_phase:
             return self.excitation
@@ -227,36 +227,36 @@ class Scenario:
         """The truth: the plant from the start and after each tweak; with two masses, the sprung one's."""
         out = [Segment(0, self.plant.plant())]
         for tweak in self.tweaks:
-            changed = _changed(out[-1].plant, tweak)
+            changed = _apply_overrides(out[-1].plant, tweak)
             if changed == out[-1].plant:
                 continue  # a pot set to where it stood changes nothing, and nothing can be detected
             out.append(Segment(tweak.sample, changed, tweak.ramp_n))
         return tuple(out)
 
 
-def _given(change: PlantChoice | Tweak) -> dict[str, float]:
+def _overrides(change: PlantChoice | Tweak) -> dict[str, float]:
     values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _changed(plant: Plant, change: PlantChoice | Tweak) -> Plant:
-    return dataclasses.replace(plant, **_given(change))
+def _apply_overrides(plant: Plant, change: PlantChoice | Tweak) -> Plant:
+    return dataclasses.replace(plant, **_overrides(change))
 
 
 def _check_parameters(change: PlantChoice | Tweak) -> None:
-    for name, value in _given(change).items():
+    for name, value in _overrides(change).items():
         if not LEAST_PARAMETER < value < MOST_PARAMETER:
             limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
             limit = limit if value > 0.0 else "more than 0"
             raise ValueError(f"{name} must be {limit}, not {value:g}")
 
 
-def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
+def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:
     """As TOML has it: arrays are lists, and what is not given is not there."""
-    return {key: _plain_value(value) for key, value in table.items() if value is not None}
+    return {key: _toml_value(value) for key, value in table.items() if value is not None}
 
 
-def _plain_value(value: Any) -> Any:
+def _toml_value(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return _plain(value)
-    return [_plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+        return _toml_table(value)
+    return [_toml_value(item) for item in value] if isinstance(value, list | tuple) else value

@@ -24,7 +24,7 @@ from analogrig.devices.dut import open_dut
 from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.verdict import judge
-from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, captured_run, retold
+from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, import_run, replace_scenario
 from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
@@ -71,7 +71,7 @@ def written(path: Path, frames: Iterable[can.Message]) -> Path:
 
 def captured(path: Path, **how: Any) -> Run:
     with open_rig("emulator") as rig:
-        return captured_run(path, SCENARIO, rig, **how)
+        return import_run(path, SCENARIO, rig, **how)
 
 
 def identifier(name: str) -> int:
@@ -574,9 +574,9 @@ def test_dbc_that_does_not_serve_is_refused_in_one_line(
 def test_scenario_with_fewer_samples_is_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     shorter = dataclasses.replace(SCENARIO, samples=599)
     with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match="has 600 samples, scenario thesis 599"):
-        captured_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
+        import_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
     with pytest.raises(ConfigurationError, match="the recording has 600 samples"):
-        retold(traffic[0], shorter)
+        replace_scenario(traffic[0], shorter)
 
 
 def test_disk_that_is_full_is_told_when_the_log_is_closed(

@@ -37,7 +37,7 @@ def test_before_the_first_edge_and_in_the_warm_up_no_alarm_can_come() -> None:
     assert exposure(made()).armed == 550
     assert exposure(made(warm_up_n=150)).armed == 450
     assert exposure(made(warm_up_n=600)).armed == 0
-    assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).no_evidence
+    assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).lack_of_evidence
 
 
 def test_after_an_alarm_none_can_come_while_it_is_held_off() -> None:
@@ -68,7 +68,7 @@ def test_force_that_never_moves_is_no_evidence_even_where_the_device_does_not_sa
     run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
     found = exposure(run)
     assert (found.armed, found.unexcited) == (0, 600)
-    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.no_evidence
+    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.lack_of_evidence
     assert not rate_below(0.5, [Played(run)], confidence=0.9)
 
 

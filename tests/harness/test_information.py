@@ -23,7 +23,7 @@ SOFT = Plant(115.0, 3021.0, 18000.0)
 def test_sampled_plant_is_the_exact_zero_order_hold(plant: Plant) -> None:
     m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
     exact = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)
-    sampled = SampledPlant.of(plant, 0.01)
+    sampled = SampledPlant.from_plant(plant, 0.01)
     assert np.reshape(sampled.transition, (2, 2)) == pytest.approx(exact[:2, :2], rel=1e-12)
     assert np.array(sampled.response) == pytest.approx(exact[:2, 2], rel=1e-12)
     assert sampled.next(AT_REST, 100.0) == pytest.approx(tuple(100.0 * exact[:2, 2]), rel=1e-12)
@@ -55,7 +55,7 @@ def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
     second-order system (zeta = 1.05), (x0' - x0)(1 - exp(-s t)(cosh r t + s / r sinh r t))."""
     force_n, noise_lsb = 2940.0, 1.0
     run = made_run(force_n=np.full(600, force_n), plants=[(0, FRONT), (400, SOFT)], noise_lsb=noise_lsb)
-    (gathered,) = information.changes(run)
+    (gathered,) = information.change_information(run)
     lsb_m = run.conditions.channels["displacement"].lsb
     s = SOFT.damping_n_s_per_m / (2.0 * SOFT.mass_kg)
     r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
@@ -72,14 +72,14 @@ def test_clipped_samples_carry_no_information() -> None:
     force = np.full(600, 2940.0)
     whole = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)])
     holed = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)], clipped=clipped)
-    (all_of_it,), (rest,) = information.changes(whole), information.changes(holed)
+    (all_of_it,), (rest,) = information.change_information(whole), information.change_information(holed)
     assert (rest[:9] == 0.0).all()
     assert rest[20] == pytest.approx(all_of_it[20] - all_of_it[8])
 
 
 def test_change_of_an_unloaded_suspension_cannot_be_seen() -> None:
     run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
-    (gathered,) = information.changes(run)
+    (gathered,) = information.change_information(run)
     assert information.first_reaching(gathered, math.log(1e5)) is None
 
 

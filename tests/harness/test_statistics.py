@@ -42,8 +42,8 @@ def test_interval_of_clopper_and_pearson_is_the_published_one() -> None:
 
 
 def test_chance_to_pass_at_the_limit_is_what_the_confidence_leaves() -> None:
-    assert Design(1e-3, 0.99, 3).chance_to_pass(1e-3) == pytest.approx(0.01, rel=5e-3)
-    assert Design(1e-3, 0.99, 3).chance_to_pass(1e-5) > 0.999
+    assert Design(1e-3, 0.99, 3).pass_probability(1e-3) == pytest.approx(0.01, rel=5e-3)
+    assert Design(1e-3, 0.99, 3).pass_probability(1e-5) > 0.999
 
 
 def test_sequential_test_is_wrong_no_more_often_than_it_says() -> None:

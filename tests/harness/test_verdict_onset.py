@@ -56,7 +56,7 @@ def test_latency_is_an_interval_from_the_latest_to_the_earliest_instant() -> Non
 
 def test_instant_that_is_exact_is_judged_once() -> None:
     (tweak,) = judge(learned(Segment(400, SOFT), alarms=[404])).tweaks
-    assert tweak.others == ()
+    assert tweak.alternatives == ()
     assert (tweak.between, tweak.latencies_n, tweak.result) == ((400, 400), (4, 4), "noticed")
 
 

@@ -28,18 +28,18 @@ _SAMPLES_LOOKED_AT = 4000
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences, the gravest first; empty if all is well."""
     return (
-        *_assumed(run),
+        *_assumed_settings(run),
         *_overloads(verdict),
-        *_noise(run),
-        *_edges(run),
+        *_noise_setting(run),
+        *_edge_spacing(run),
         *_warm_up(run),
-        *_false_alarms(verdict),
-        *_unseen(verdict),
-        *_unidentified(verdict),
+        *_false_alarm_rate(verdict),
+        *_undetectable_changes(verdict),
+        *_implausible_estimates(verdict),
     )
 
 
-def _assumed(run: Run) -> Iterator[str]:
+def _assumed_settings(run: Run) -> Iterator[str]:
     assumed_n = run.conditions.dut.get("assumed_n", 0)
     if assumed_n:
         settings = number_of(
@@ -62,7 +62,7 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
         )
 
 
-def _noise(run: Run) -> Iterator[str]:
+def _noise_setting(run: Run) -> Iterator[str]:
     there = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
     expected = float(run.conditions.dut["estimator"].get("noise_variance", np.inf))
     if there > NOISE_MARGIN * expected:
@@ -72,7 +72,7 @@ def _noise(run: Run) -> Iterator[str]:
         )
 
 
-def _edges(run: Run) -> Iterator[str]:
+def _edge_spacing(run: Run) -> Iterator[str]:
     estimator = run.conditions.dut["estimator"]
     if "excitation" not in run.conditions.scenario or estimator.get("edge_instants") == "anywhere":
         return
@@ -103,18 +103,18 @@ def _warm_up(run: Run) -> Iterator[str]:
         )
 
 
-def _false_alarms(verdict: Verdict) -> Iterator[str]:
+def _false_alarm_rate(verdict: Verdict) -> Iterator[str]:
     if len(verdict.false_alarms) > max(2, len(verdict.tweaks)):
         yield "with so many false alarms, an alarm soon after a change may be chance and its latency no merit"
 
 
-def _unseen(verdict: Verdict) -> Iterator[str]:
+def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
         if tweak.bound_n is None and not tweak.unseen:
             yield f"{tweak.what} at {tweak.sample} could not be seen before the next change or the end: not judged"
 
 
-def _unidentified(verdict: Verdict) -> Iterator[str]:
+def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
     for segment in verdict.estimates:
         if segment.estimate is None:
             yield f"the last estimate of samples {segment.start}-{segment.end - 1} describes no mass, damper and spring"

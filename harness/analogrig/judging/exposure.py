@@ -26,7 +26,7 @@ _QUANTISATION_LSB = 12.0**-0.5
 
 _FORCE = CHANNELS.index("force")
 
-_NOT_HEARD = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
+_NOT_PROCESSED = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
 
 
 @dataclass(frozen=True)
@@ -38,20 +38,20 @@ class Exposure:
     """Samples in which the trigger was armed."""
     unexcited: int
     """Samples before the force had moved, or after its edges had ceased."""
-    numberless: int
+    non_finite: int
     """Samples after which estimate, innovation or statistic was no number, without an alarm."""
     estimator: Mapping[str, Any]
     """The device's settings, as ``EstimatorConfig.as_table`` gives them."""
 
     @property
-    def no_evidence(self) -> str:
+    def lack_of_evidence(self) -> str:
         """Why its silence is no evidence of anything, in one line; empty if it is."""
         of = number_of(self.samples, "sample")
-        if self.numberless:
-            return f"in {self.numberless} of {of} what the device estimated was no number"
-        return "" if self.armed else f"no alarm could come in any of {of}: {self._because()}"
+        if self.non_finite:
+            return f"in {self.non_finite} of {of} what the device estimated was no number"
+        return "" if self.armed else f"no alarm could come in any of {of}: {self._unarmed_reason()}"
 
-    def _because(self) -> str:
+    def _unarmed_reason(self) -> str:
         if self.estimator.get("trigger") == "none":
             return "the device has no trigger"
         if 2 * self.unexcited <= self.samples:
@@ -64,7 +64,7 @@ class Exposure:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class ObservedRecord:
     """What is known of one record of n samples, from the first on."""
 
     force: NDArray[np.uint16]
@@ -84,8 +84,8 @@ def exposure(run: Run) -> Exposure:
     for column in run.theta.T:
         numbers &= np.isfinite(column)
     parts = [
-        exposed(
-            Heard(
+        record_exposure(
+            ObservedRecord(
                 run.codes[start:end, _FORCE],
                 run.flags[start:end],
                 numbers[start:end],
@@ -96,29 +96,31 @@ def exposure(run: Run) -> Exposure:
         )
         for start, end in run.records
     ]
-    armed, unexcited, numberless = (
-        sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "numberless")
+    armed, unexcited, non_finite = (
+        sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "non_finite")
     )
-    return Exposure(run.samples, armed, unexcited, numberless, estimator)
+    return Exposure(run.samples, armed, unexcited, non_finite, estimator)
 
 
-def exposed(heard: Heard, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
+def record_exposure(heard: ObservedRecord, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
     """Of one record; ``noise_lsb`` is that of the force."""
-    known = (heard.flags & _NOT_HEARD) == 0
+    known = (heard.flags & _NOT_PROCESSED) == 0
     edge_codes = float(estimator.get("edge_codes", 0.0))
     if edge_codes:
         edge_codes = max(edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
-    excited = _excited(heard.force, known, edge_codes, int(estimator.get("idle_n", 0)))
+    excited = _excitation_mask(heard.force, known, edge_codes, int(estimator.get("idle_n", 0)))
     excited &= (heard.flags & SteppedFlag.IDLE) == 0
-    watched = _watched(known & ((heard.flags & SteppedFlag.GATHERING) == 0), heard.alarms, estimator)
+    watched = _beyond_hold_off(known & ((heard.flags & SteppedFlag.GATHERING) == 0), heard.alarms, estimator)
     armed = watched & excited & heard.are_numbers & (estimator.get("trigger") != "none")
     armed[heard.alarms] = True
-    numberless = ~heard.are_numbers
-    numberless[heard.alarms] = False  # which is what it should say of them
-    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(numberless.sum()), estimator)
+    non_finite = ~heard.are_numbers
+    non_finite[heard.alarms] = False  # which is what it should say of them
+    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(non_finite.sum()), estimator)
 
 
-def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: float, idle_n: int) -> NDArray[np.bool_]:
+def _excitation_mask(
+    force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: float, idle_n: int
+) -> NDArray[np.bool_]:
     """(n,): the force has moved by what is an edge, and the last edge was not too long ago."""
     codes = force.astype(np.int32)
     edges = np.flatnonzero((np.abs(np.diff(codes)) >= edge_codes) & heard[1:] & heard[:-1]) + 1
@@ -136,7 +138,7 @@ def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: fl
     return excited
 
 
-def _watched(
+def _beyond_hold_off(
     equations: NDArray[np.bool_], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
 ) -> NDArray[np.bool_]:
     """(n,): of the samples with an equation those beyond warm-up and hold-off, which count equations."""

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, sampled
+from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, discretise
 from analogrig.run import CHUNK_SAMPLES, Run
 from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
 
 
-LN_CERTAIN = math.log(20.0)
+ISOLATION_INFORMATION = math.log(20.0)
 
 ISOLATION_HORIZON_N = 300
 """A change that cannot be told from others within so many samples counts as one that never can."""
@@ -47,7 +47,7 @@ class _Change:
 
     before: Plant
     after: Plant
-    turning: Sequence[SampledPlant]
+    ramp: Sequence[SampledPlant]
     """The plant in each of the sample periods after it while it lasts."""
     state: State
     """In which it finds the plant."""
@@ -57,25 +57,25 @@ class _Change:
     """(n,) of a squared metre of displacement, after each of these forces: information; 0 for a missing sample."""
 
 
-def changes(run: Run) -> list[NDArray[np.float64]]:
+def change_information(run: Run) -> list[NDArray[np.float64]]:
     """For each change of the plant in ``run``: I(1), I(2), ... up to the next change or the end.
 
     Both plants start from the state in which the change finds the true one and feel the force that was measured.
     Samples that the device could not use carry no information.
     """
     period_s = run.conditions.sample_period_problem_s
-    return [_information(change, period_s) for change in _changes(run)]
+    return [_information(change, period_s) for change in _run_changes(run)]
 
 
 def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
     """I(1), I(2), ... of one change."""
-    changed = _Motion.after(change, period_s)
-    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.of(change.before, period_s)))
+    changed = _Motion.of_change(change, period_s)
+    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.from_plant(change.before, period_s)))
     out = np.empty(len(change.force_n))
     gathered = 0.0
     for first in range(0, len(out), CHUNK_SAMPLES):
         part = slice(first, first + CHUNK_SAMPLES)
-        difference_m = changed.under(change.force_n[part]) - unchanged.under(change.force_n[part])
+        difference_m = changed.displacement_m(change.force_n[part]) - unchanged.displacement_m(change.force_n[part])
         out[part] = np.cumsum(np.append(gathered, difference_m**2 * change.weight[part]))[1:]
         gathered = float(out[part][-1])
     return out
@@ -90,11 +90,11 @@ class _Motion:
         self._steps = steps
 
     @classmethod
-    def after(cls, change: _Change, period_s: float) -> _Motion:
-        settled = itertools.repeat(SampledPlant.of(change.after, period_s))
-        return cls(change.state, itertools.chain(change.turning, settled))
+    def of_change(cls, change: _Change, period_s: float) -> _Motion:
+        settled = itertools.repeat(SampledPlant.from_plant(change.after, period_s))
+        return cls(change.state, itertools.chain(change.ramp, settled))
 
-    def under(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
+    def displacement_m(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) metres, after each of the n forces that come next."""
         state = self.state
         out = np.empty(len(force_n))
@@ -125,7 +125,7 @@ def predicted_bounds(
     scales = PROGRAMS[scenario.plant.set].scales
     lsb_m = lsb_v / scales.volts("displacement")
     weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
-    volts = _levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
+    volts = _mean_levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
     force_n = volts / scales.volts("force")
     segments = scenario.segments()
     stretches = [
@@ -138,11 +138,11 @@ def predicted_bounds(
     period_s = scales.time / rate_hz
     return [
         first_reaching(_information(change, period_s), math.log(arl0))
-        for change in _courses_of(stretches, ramps_n, force_n, weight, period_s)
+        for change in _changes_between(stretches, ramps_n, force_n, weight, period_s)
     ]
 
 
-def _levels(edges: Edges, samples: int) -> NDArray[np.float64]:
+def _mean_levels(edges: Edges, samples: int) -> NDArray[np.float64]:
     """(n,) volts in the period after each sample, on average."""
     ticks = np.append(edges.ticks, samples * TICKS_PER_SAMPLE).astype(np.float64) / TICKS_PER_SAMPLE
     integral = np.interp(np.arange(samples + 1), ticks, np.append(0.0, np.cumsum(edges.levels_v * np.diff(ticks))))
@@ -155,34 +155,34 @@ def isolation_bounds(run: Run) -> list[int | None]:
     """
     period_s = run.conditions.sample_period_problem_s
     out: list[int | None] = []
-    for (start, _, _), change in zip(run.segments[1:], _changes(run), strict=True):
+    for (start, _, _), change in zip(run.segments[1:], _run_changes(run), strict=True):
         if start in run.conditions.records or change.before == change.after:
             out.append(None)  # nothing for the device to tell: it begins afresh with each record
             continue
         changed = tuple(change.before.changes_to(change.after))
-        course = _Motion.after(change, period_s).under(change.force_n[:ISOLATION_HORIZON_N])
+        course = _Motion.of_change(change, period_s).displacement_m(change.force_n[:ISOLATION_HORIZON_N])
         least = np.full(len(course), np.inf)
         for name in PARAMETERS:
             if changed != (name,):
-                apart = (_courses(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
-                least = np.minimum(least, _least(np.cumsum(apart, axis=1)))
-        out.append(first_reaching(least, LN_CERTAIN))
+                apart = (_rival_displacements(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
+                least = np.minimum(least, _interpolated_minimum(np.cumsum(apart, axis=1)))
+        out.append(first_reaching(least, ISOLATION_INFORMATION))
     return out
 
 
-def _changes(run: Run) -> Iterator[_Change]:
+def _run_changes(run: Run) -> Iterator[_Change]:
     conditions = run.conditions
     force_n = run.channel("force")
     displacement = conditions.channels["displacement"]
     variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
     weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
-    return _courses_of(
+    return _changes_between(
         run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s, records=conditions.records
     )
 
 
-def _courses_of(
+def _changes_between(
     stretches: Iterable[tuple[int, int, Plant]],
     ramps_n: Mapping[int, int],
     force_n: NDArray[np.float64],
@@ -196,22 +196,22 @@ def _courses_of(
     for start, end, plant in stretches:
         if start in records:
             state = AT_REST
-        turning = _turning(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
-        change = _Change(before or plant, plant, turning, state, force_n[start : end - 1], weight[start + 1 : end])
+        ramp = _ramp_plants(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
+        change = _Change(before or plant, plant, ramp, state, force_n[start : end - 1], weight[start + 1 : end])
         if before is not None:
             yield change
         if end < len(force_n):
-            motion = _Motion.after(change, period_s)
+            motion = _Motion.of_change(change, period_s)
             for first in range(start, end, CHUNK_SAMPLES):
-                motion.under(force_n[first : min(first + CHUNK_SAMPLES, end)])
+                motion.displacement_m(force_n[first : min(first + CHUNK_SAMPLES, end)])
             state = motion.state
         before = plant
 
 
-def _turning(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
+def _ramp_plants(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
     """The plant in each of the sample periods of a ramp, in the middle of the period."""
-    return SampledPlant.of_each(
-        [before.on_the_way(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
+    return SampledPlant.from_plants(
+        [before.interpolate(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
     )
 
 
@@ -221,11 +221,11 @@ def first_reaching(information: Sequence[float] | NDArray[np.float64], level: fl
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _courses(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
+def _rival_displacements(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
     """(f, n) metres, had ``M``, ``B`` or ``K`` alone changed by each of the rival factors; up to the horizon."""
     plants = np.tile(list(change.before.parameters().values()), (len(_RIVAL_FACTORS), 1))
     plants[:, PARAMETERS.index(name)] *= _RIVAL_FACTORS
-    (xx, xv, xf), (vx, vv, vf) = sampled(plants, period_s).transpose(1, 2, 0)
+    (xx, xv, xf), (vx, vv, vf) = discretise(plants, period_s).transpose(1, 2, 0)
     x, v = (np.full(len(plants), value) for value in change.state)
     forces = change.force_n[:ISOLATION_HORIZON_N].tolist()
     out = np.empty((len(plants), len(forces)))
@@ -235,7 +235,7 @@ def _courses(change: _Change, name: str, period_s: float) -> NDArray[np.float64]
     return out
 
 
-def _least(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolated_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """(f, n) at evenly spaced f: the least over f (n,), by a parabola through the three lowest."""
     at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
     low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))

@@ -100,11 +100,11 @@ def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, f
     third = math.fsum(each**3 for each in off) * count / ((count - 1) * (count - 2))
     skewness = third / deviation**3 / math.sqrt(count) if deviation > 0.0 else 0.0
     quantile, error = float(stdtrit(count - 1, confidence)), deviation / math.sqrt(count)
-    low, high = (mean - _without_skewness(at, skewness) * error for at in (quantile, -quantile))
+    low, high = (mean - _invert_hall(at, skewness) * error for at in (quantile, -quantile))
     return max(low, 0.0), high
 
 
-def _without_skewness(quantile: float, skewness: float) -> float:
+def _invert_hall(quantile: float, skewness: float) -> float:
     """The quantile of (mean - truth) / error, whose skewness is that of a mean: Hall's transformation, inverted."""
     if abs(skewness) < LEAST_SKEWNESS:
         return quantile
@@ -139,7 +139,7 @@ class Design:
                 high = middle
         return high
 
-    def chance_to_pass(self, true_rate: float) -> float:
+    def pass_probability(self, true_rate: float) -> float:
         """The probability that a device with that rate passes; at ``rate`` it is 1 - confidence."""
         from scipy.stats import binom
 
@@ -248,8 +248,8 @@ class ConfidenceSequence:
         if self.trials == 0:
             return 0.0, 1.0
         most_likely = self.events / self.trials
-        low = 0.0 if self.events == 0 else self._edge(most_likely, 0.0)
-        high = 1.0 if self.events == self.trials else self._edge(most_likely, 1.0)
+        low = 0.0 if self.events == 0 else self._bisect_bound(most_likely, 0.0)
+        high = 1.0 if self.events == self.trials else self._bisect_bound(most_likely, 1.0)
         return low, high
 
     def decision(self, rate: float) -> Decision:
@@ -257,7 +257,7 @@ class ConfidenceSequence:
         low, high = self.bounds
         return Decision.BELOW if high <= rate else Decision.ABOVE if low > rate else Decision.OPEN
 
-    def _edge(self, inside: float, outside: float) -> float:
+    def _bisect_bound(self, inside: float, outside: float) -> float:
         """Where the martingale reaches its limit between a rate that is in and one that is out."""
         for _ in range(200):
             middle = 0.5 * (inside + outside)

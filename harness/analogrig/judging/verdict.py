@@ -40,7 +40,7 @@ Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not jud
 not judged was not found in the samples."""
 
 
-NAMES = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
+DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
 """What a device can say has changed."""
 
 
@@ -80,7 +80,7 @@ class TweakVerdict:
     """A later alarm is late."""
     diagnosis: DiagnosisVerdict | None = None
     """None: the device did not say, for lack of certainty or because it does not isolate."""
-    others: tuple[TweakVerdict, ...] = ()
+    alternatives: tuple[TweakVerdict, ...] = ()
     """The same for the earliest and the latest instant at which it may have come; none if it is known."""
     unseen: str = ""
     """Why nobody knows whether and when it came; it is then not judged."""
@@ -88,7 +88,7 @@ class TweakVerdict:
     @property
     def possible(self) -> tuple[TweakVerdict, ...]:
         """For each instant that it is judged for, in order of time."""
-        return tuple(sorted((self, *self.others), key=lambda each: each.sample))
+        return tuple(sorted((self, *self.alternatives), key=lambda each: each.sample))
 
     @property
     def between(self) -> tuple[int, int]:
@@ -106,7 +106,7 @@ class TweakVerdict:
         """For every instant that it is judged for."""
         if self.unseen:
             return "not judged"
-        results = {_result(each) for each in self.possible}
+        results = {_result_at_instant(each) for each in self.possible}
         return results.pop() if len(results) == 1 else "undecided"
 
     @property
@@ -119,7 +119,7 @@ class TweakVerdict:
         return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
 
 
-def _result(tweak: TweakVerdict) -> Result:
+def _result_at_instant(tweak: TweakVerdict) -> Result:
     """For the very instant that it has."""
     if tweak.missed:
         return "missed"
@@ -194,18 +194,18 @@ def judge(run: Run) -> Verdict:
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
     trigger = run.conditions.dut["estimator"]
     level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
-    judged = _judged(run, expect, level)
-    invalid = _invalidities(run, expect)
-    outcome, reasons = _concluded(judged, expect)
+    judged = _evaluate_hypotheses(run, expect, level)
+    invalid = _invalid_reasons(run, expect)
+    outcome, reasons = _decide_outcome(judged, expect)
     certain = set(judged[0].false_alarms).intersection(*(each.false_alarms for each in judged))
     possible = {index for each in judged for index in each.false_alarms}
     return Verdict(
         outcome="inconclusive" if invalid else outcome,
         reasons=(*invalid, *reasons),
-        tweaks=_with_others(judged),
+        tweaks=_merge_hypotheses(judged),
         false_alarms=tuple(sorted(certain)),
         doubtful_alarms=tuple(sorted(possible - certain)),
-        estimates=_segment_estimates(run.supposing(Segment.earliest)),
+        estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
         missing_n=int(run.missing.sum()),
@@ -269,7 +269,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Judgement:
+class _HypothesisResult:
     """Of a run whose changes came at these instants."""
 
     tweaks: tuple[TweakVerdict, ...]
@@ -277,25 +277,25 @@ class _Judgement:
     failures: tuple[str, ...]
 
 
-def _judged(run: Run, expect: Expectations, level: float) -> list[_Judgement]:
+def _evaluate_hypotheses(run: Run, expect: Expectations, level: float) -> list[_HypothesisResult]:
     """At the likeliest instants; and at the earliest and the latest, where they are not exact."""
     runs = [run]
     if not all(segment.is_exact for segment in run.conditions.segments):
-        runs += [run.supposing(Segment.earliest), run.supposing(Segment.latest)]
+        runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
         tweaks, false_alarms = _attribute_alarms(supposed, expect, level)
-        out.append(_Judgement(tweaks, false_alarms, tuple(_failures(tweaks, false_alarms, expect))))
+        out.append(_HypothesisResult(tweaks, false_alarms, tuple(_failure_reasons(tweaks, false_alarms, expect))))
     return out
 
 
-def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outcome, list[str]]:
+def _decide_outcome(judged: Sequence[_HypothesisResult], expect: Expectations) -> tuple[Outcome, list[str]]:
     """Outcome of a valid run, and why it is not ``passed``."""
-    tweaks = _with_others(judged)
+    tweaks = _merge_hypotheses(judged)
     unseen = [f"{tweak.what} at {tweak.sample} is not judged: {tweak.unseen}" for tweak in tweaks if tweak.unseen]
-    if _surely_failed(judged, expect):
+    if _fails_under_all_hypotheses(judged, expect):
         return "failed", [*judged[0].failures, *unseen]
-    undecided = [_doubt(tweak) for tweak in tweaks if tweak.result == "undecided"]
+    undecided = [_undecided_reason(tweak) for tweak in tweaks if tweak.result == "undecided"]
     counts = sorted(len(each.false_alarms) for each in judged)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
@@ -306,7 +306,7 @@ def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outc
     return ("inconclusive" if doubts or unseen else "passed"), [*doubts, *unseen]
 
 
-def _surely_failed(judged: Sequence[_Judgement], expect: Expectations) -> bool:
+def _fails_under_all_hypotheses(judged: Sequence[_HypothesisResult], expect: Expectations) -> bool:
     """Whether the same is wrong at every instant: one that is late for some and missed for others may be neither."""
     instants = list(zip(*(each.tweaks for each in judged), strict=True))
     missed = sum(all(tweak.missed and not tweak.unseen for tweak in each) for each in instants)
@@ -314,18 +314,18 @@ def _surely_failed(judged: Sequence[_Judgement], expect: Expectations) -> bool:
     return late or missed > expect.missed or min(len(each.false_alarms) for each in judged) > expect.false_alarms
 
 
-def _doubt(tweak: TweakVerdict) -> str:
+def _undecided_reason(tweak: TweakVerdict) -> str:
     """Why it is undecided."""
     low, high = tweak.between
-    results = " or ".join(dict.fromkeys(_result(each) for each in tweak.possible))
+    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.possible))
     return f"{tweak.what} between {low} and {high} was {results}, depending on when it came"
 
 
-def _with_others(judged: Sequence[_Judgement]) -> tuple[TweakVerdict, ...]:
+def _merge_hypotheses(judged: Sequence[_HypothesisResult]) -> tuple[TweakVerdict, ...]:
     """The changes at their likeliest instants, each with what is said of it at the others."""
     likeliest, *others = (each.tweaks for each in judged)
     return tuple(
-        dataclasses.replace(tweak, others=tuple(each[i] for each in others if each[i] != tweak))
+        dataclasses.replace(tweak, alternatives=tuple(each[i] for each in others if each[i] != tweak))
         for i, tweak in enumerate(likeliest)
     )
 
@@ -337,14 +337,14 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
     tweaks = []
     isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.changes(run), isolation_bounds, strict=False
+        run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
             continue  # the device began afresh, and has seen no other plant before
         # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
         mine = [index for index in alarms if start < index <= end]
         detection = mine[0] if mine else None
-        detected |= _belonging(mine, start + begun[start].ramp_n)
+        detected |= _alarms_of_change(mine, start + begun[start].ramp_n)
         changed = before.changes_to(after)
         late = information.first_reaching(gathered, expect.late_information_ratio * level)
         tweaks.append(
@@ -359,13 +359,13 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None
-                else _diagnosis(run, start, (detection, end), changed, isolation_bound_n),
+                else _judge_diagnosis(run, start, (detection, end), changed, isolation_bound_n),
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
 
 
-def _diagnosis(
+def _judge_diagnosis(
     run: Run, start: int, span: tuple[int, int], changed: Mapping[str, tuple[float, float]], bound_n: int | None
 ) -> DiagnosisVerdict | None:
     """The first that was said from the alarm to the end of the segment, both included in ``span``."""
@@ -373,7 +373,7 @@ def _diagnosis(
     if not len(said):
         return None
     first = said[0]
-    named = NAMES[Change(run.diagnosis_change[first])]
+    named = DIAGNOSABLE[Change(run.diagnosis_change[first])]
     reported = float(run.diagnosis_extent[first])
     extent = reported if named in PARAMETERS and math.isfinite(reported) else None
     right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
@@ -389,7 +389,7 @@ def _diagnosis(
     )
 
 
-def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:
+def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
     """Of the alarms after a change those that are no false ones: all while it lasts, and the first when it is over.
 
     An alarm on a ramp makes the device learn a plant that goes on changing, which is to be noticed in its turn.
@@ -398,16 +398,16 @@ def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:
     return {index for index in alarms if index <= ramp_end} | set(over[:1])
 
 
-def _invalidities(run: Run, expect: Expectations) -> list[str]:
+def _invalid_reasons(run: Run, expect: Expectations) -> list[str]:
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {number_of(run.conditions.samples_asked, 'sample')}")
-    reasons += _losses(run)
+    reasons += _loss_reasons(run)
     refused, missing = run.conditions.counters.get("refused", 0), int(run.missing.sum())
-    return reasons + no_evidence(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
+    return reasons + evidence_gaps(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
 
 
-def no_evidence(
+def evidence_gaps(
     shown: Exposure, expect: Expectations, *, refused: int, missing: int, words: str = MISSING
 ) -> list[str]:
     """Why what a device made of its samples is no evidence, whatever else is known of the run; empty if it is.
@@ -416,11 +416,11 @@ def no_evidence(
     :param missing: so many were missing; ``words`` say of what kind these are.
     """
     refusals = [f"the device refused {number_of(refused, 'sample')}"] if refused else []
-    unarmed = [shown.no_evidence] if shown.no_evidence else []
+    unarmed = [shown.lack_of_evidence] if shown.lack_of_evidence else []
     return [*refusals, *expect.gaps(shown.samples, missing, words), *unarmed]
 
 
-def _losses(run: Run) -> list[str]:
+def _loss_reasons(run: Run) -> list[str]:
     """Samples that never came to the device: more than its description allows, or not those that the harness knows."""
     most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
     where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
@@ -437,7 +437,9 @@ def _losses(run: Run) -> list[str]:
     return reasons
 
 
-def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations) -> list[str]:
+def _failure_reasons(
+    tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
+) -> list[str]:
     reasons = []
     judged = [tweak for tweak in tweaks if not tweak.unseen]
     missed = [tweak for tweak in judged if tweak.missed]

@@ -5,8 +5,8 @@ A capture knows neither the rig nor the plant: the scenario and the description 
 lacks is as if it had been lost on the way to the device; from the numbers of the messages it is known what that is.
 """
 
-from analogrig.recordings.capture import captured_run, retold
+from analogrig.recordings.capture import import_run, replace_scenario
 from analogrig.recordings.frames import READ, CapturedFrames
 from analogrig.recordings.log import WRITTEN, CanLog
 
-__all__ = ["READ", "WRITTEN", "CanLog", "CapturedFrames", "captured_run", "retold"]
+__all__ = ["READ", "WRITTEN", "CanLog", "CapturedFrames", "import_run", "replace_scenario"]

@@ -13,9 +13,9 @@ import numpy as np
 from analogrig import catalogue
 from analogrig.devices.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings.dictionary import Dictionary
+from analogrig.recordings.dictionary import FrameDecoder
 from analogrig.recordings.frames import CapturedFrames
-from analogrig.recordings.talk import CapturedRun, CapturedTalk
+from analogrig.recordings.talk import CaptureDecoder, CapturedRun
 from analogrig.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
@@ -28,7 +28,7 @@ _COUNTERS = ("updated", "refused", "alarms", "samples_lost")
 """Of the device; by these it is known whether all that it did was heard."""
 
 
-def captured_run(
+def import_run(
     path: Path,
     scenario: Scenario,
     rig: Rig,
@@ -48,10 +48,10 @@ def captured_run(
     """
     frames = CapturedFrames(path)
     try:
-        talk = CapturedTalk(Dictionary(dbc), frames)
+        talk = CaptureDecoder(FrameDecoder(dbc), frames)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
-    said = _chosen(talk, frames, number)
+    said = _select_run(talk, frames, number)
     if said.extent > scenario.samples:
         raise ConfigurationError(
             f"{path}: has {number_of(said.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
@@ -60,7 +60,7 @@ def captured_run(
     return _run(path, said, scenario, rig, most_lost_n=most_lost_n, line=_line(talk, frames), end=frames.end)
 
 
-def retold(run: Run, scenario: Scenario) -> Run:
+def replace_scenario(run: Run, scenario: Scenario) -> Run:
     """A recorded run with what another scenario says of its plant and asks of its device.
 
     :raises ConfigurationError: it has fewer samples.
@@ -78,16 +78,16 @@ def retold(run: Run, scenario: Scenario) -> Run:
     return dataclasses.replace(run, conditions=conditions)
 
 
-def _line(talk: CapturedTalk, frames: CapturedFrames) -> dict[str, int]:
+def _line(talk: CaptureDecoder, frames: CapturedFrames) -> dict[str, int]:
     """What else was seen, by name."""
     seen = {**talk.line, "lines_damaged": len(frames.damaged)}
     return {name: n for name, n in seen.items() if n}
 
 
-def _chosen(talk: CapturedTalk, frames: CapturedFrames, number: int | None) -> CapturedRun:
+def _select_run(talk: CaptureDecoder, frames: CapturedFrames, number: int | None) -> CapturedRun:
     path, runs = frames.path, [run for run in talk.runs if run.samples]
     if not runs:
-        raise RecordingError(f"{path}: holds no run of a device{_why(talk, frames)}")
+        raise RecordingError(f"{path}: holds no run of a device{_empty_reason(talk, frames)}")
     if number is None and len(runs) > 1:
         raise RecordingError(f"{path}: holds {len(runs)} runs: say --run 1 to {len(runs)}")
     if number is not None and not 1 <= number <= len(runs):
@@ -95,7 +95,7 @@ def _chosen(talk: CapturedTalk, frames: CapturedFrames, number: int | None) -> C
     return runs[(number or 1) - 1]
 
 
-def _why(talk: CapturedTalk, frames: CapturedFrames) -> str:
+def _empty_reason(talk: CaptureDecoder, frames: CapturedFrames) -> str:
     """As far as that can be told."""
     if frames.end:
         return f": {frames.end}"
@@ -113,7 +113,7 @@ def _run(
 ) -> Run:
     most = min(MAX_PARAMETERS, said.identity.get("theta_max", MAX_PARAMETERS))
     estimator = EstimatorConfig.from_settings(said.settings, str(path), most)
-    rows = _Rows(said, estimator.parameters)
+    rows = _RunArrays(said, estimator.parameters)
     counters = dict(said.counters)
     lost = int(((rows.flags & LOST) != 0).sum())
     if lost > counters.get("samples_lost", lost):  # it has seen what the capture has not
@@ -152,8 +152,8 @@ def _run(
         innovation=rows.values[:, -1],
         statistic=rows.statistic,
         flags=rows.flags,
-        **_columns(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
-        **_columns(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
+        **_event_arrays(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
+        **_event_arrays(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
     )
 
 
@@ -170,13 +170,13 @@ def _gaps(path: Path, said: CapturedRun) -> Iterator[str]:
 _TYPES = {"index": np.int64, "onset": np.int64, "kind": np.uint8, "change": np.uint8}
 
 
-def _columns(rows: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
+def _event_arrays(rows: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
     columns: Iterable[Sequence[float]] = zip(*rows, strict=True) if rows else itertools.repeat(())
     types = [_TYPES.get(name.rpartition("_")[2], np.float32) for name in names]
     return {name: np.array(column, kind) for name, kind, column in zip(names, types, columns, strict=False)}
 
 
-class _Rows:
+class _RunArrays:
     """The arrays of a run."""
 
     def __init__(self, said: CapturedRun, parameters: int) -> None:

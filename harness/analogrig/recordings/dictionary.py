@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from analogrig import catalogue
 from analogrig.catalogue import LAYOUTS, Message, pack, unpack
 from analogrig.errors import ConfigurationError
-from analogrig.recordings.frames import silenced
+from analogrig.recordings.frames import silence_logger
 
 if TYPE_CHECKING:
     import can
 
 
-class Dictionary:
+class FrameDecoder:
     """The messages as they are on the bus: those of this build, or those of a DBC that has them elsewhere."""
 
     def __init__(self, dbc: Path | None = None) -> None:
@@ -29,7 +29,7 @@ class Dictionary:
             return None
         if self.dbc is not None:
             known = self._messages.get((frame.arbitration_id, frame.is_extended_id))
-            return None if known is None else _translated(known, bytes(frame.data))
+            return None if known is None else _decode_by_dbc(known, bytes(frame.data))
         if frame.is_extended_id or frame.arbitration_id > 0xFF:
             return None
         return unpack(bytes((frame.arbitration_id,)) + bytes(frame.data))
@@ -50,7 +50,7 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     import cantools
 
     try:
-        with silenced("cantools"):
+        with silence_logger("cantools"):
             database: Any = cantools.database.load_file(str(dbc), database_format="dbc")
     except OSError as error:
         raise ConfigurationError(f"--dbc {dbc}: {error.strerror or error}") from error
@@ -79,7 +79,7 @@ def _signal(name: str) -> str:
     return "".join(word.capitalize() for word in name.split("_"))
 
 
-def _translated(known: Any, data: bytes) -> Message | None:
+def _decode_by_dbc(known: Any, data: bytes) -> Message | None:
     """By the names of message and signals; None: of the wrong length, or with a value that ours cannot have."""
     from cantools.database import DecodeError
 

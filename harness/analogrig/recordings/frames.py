@@ -24,7 +24,7 @@ READ = (*WRITTEN, "trc")
 """Formats that can be read."""
 
 
-class _Lines(io.TextIOBase):
+class _CountedLines(io.TextIOBase):
     """A text file that knows where it is."""
 
     def __init__(self, file: TextIO) -> None:
@@ -58,14 +58,14 @@ class CapturedFrames:
             raise RecordingError(f"{self.path}: {error.strerror or error}") from error
 
     def __iter__(self) -> Iterator[can.Message]:
-        return self._of_lines() if self.path.suffix.lower() == ".log" else self._of_file()
+        return self._read_candump() if self.path.suffix.lower() == ".log" else self._read_binary()
 
-    def _of_lines(self) -> Iterator[can.Message]:
+    def _read_candump(self) -> Iterator[can.Message]:
         """candump's, where a line stands for itself."""
         from analogrig.links.python_can import can
 
         with self.path.open(encoding="ascii", errors="replace") as file:
-            lines = _Lines(file)
+            lines = _CountedLines(file)
             while True:
                 before = lines.number
                 try:
@@ -76,7 +76,7 @@ class CapturedFrames:
                         continue
                 return
 
-    def _of_file(self) -> Iterator[can.Message]:
+    def _read_binary(self) -> Iterator[can.Message]:
         """The others, which cannot be read on after a fault."""
         from analogrig.links.python_can import can
 
@@ -91,7 +91,7 @@ class CapturedFrames:
         # Opened here, since readers that fail leave the file open.
         with self.path.open("rb") as raw:
             file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
-            with silenced("asammdf"), silenced("can"), _asammdf_silenced():
+            with silence_logger("asammdf"), silence_logger("can"), _silence_asammdf():
                 try:
                     for frame in readers[suffix](file):
                         yield frame
@@ -104,7 +104,7 @@ class CapturedFrames:
 
 
 @contextlib.contextmanager
-def silenced(library: str) -> Iterator[None]:
+def silence_logger(library: str) -> Iterator[None]:
     """Keep what a library logs of a file off standard error: the error that it raises is reported in one line."""
     logger = logging.getLogger(library)
     before = logger.level, logger.disabled
@@ -118,7 +118,7 @@ def silenced(library: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _asammdf_silenced() -> Iterator[None]:
+def _silence_asammdf() -> Iterator[None]:
     """Of a file that it could not open its destructor complains, with a traceback and when the garbage is collected."""
     before = sys.unraisablehook
 

@@ -15,7 +15,7 @@ WRITTEN = ("log", "blf", "asc", "mf4")
 """Formats that a run can leave, by the suffix of the file."""
 
 
-class _Writer(Protocol):
+class _FrameWriter(Protocol):
     def __call__(self, frame: can.Message) -> None: ...
 
     def stop(self) -> None: ...
@@ -32,11 +32,11 @@ class CanLog:
         self.path = path
         self._held: list[can.Message] | None = []
         """What passed before the beginning."""
-        self._writer: _Writer | None = None
+        self._writer: _FrameWriter | None = None
         self._failure: Exception | None = None
 
     @property
-    def has_heard(self) -> bool:
+    def has_frames(self) -> bool:
         """Whether a frame has passed before the beginning; after the handshake with a device on a CAN bus some have."""
         return bool(self._held)
 
@@ -54,7 +54,7 @@ class CanLog:
             return
         try:
             if self._writer is None:
-                self._writer = _writer(self.path)
+                self._writer = _open_writer(self.path)
             self._writer(frame)
         except Exception as error:  # noqa: BLE001 - the formats raise what they like; the run goes on
             self._failure = error
@@ -76,7 +76,7 @@ class CanLog:
             raise RecordingError(f"{self.path}: cannot be written: {said}") from failure
 
 
-def _writer(path: Path) -> _Writer:
+def _open_writer(path: Path) -> _FrameWriter:
     from analogrig.links.python_can import can
 
     writers: Mapping[str, Any] = {
@@ -85,5 +85,5 @@ def _writer(path: Path) -> _Writer:
         "asc": can.ASCWriter,
         "mf4": can.MF4Writer,
     }
-    writer: _Writer = writers[path.suffix[1:]](path)
+    writer: _FrameWriter = writers[path.suffix[1:]](path)
     return writer

@@ -21,7 +21,7 @@ from analogrig.catalogue import (
     index_up_to,
 )
 from analogrig.errors import RecordingError
-from analogrig.recordings.dictionary import Dictionary
+from analogrig.recordings.dictionary import FrameDecoder
 
 if TYPE_CHECKING:
     import can
@@ -57,10 +57,10 @@ class CapturedRun:
         return 1 + max((*self.samples, *self.steps), default=-1)
 
 
-class CapturedTalk:
+class CaptureDecoder:
     """Makes runs of messages, whoever they were said to."""
 
-    def __init__(self, dictionary: Dictionary, frames: Iterable[can.Message]) -> None:
+    def __init__(self, dictionary: FrameDecoder, frames: Iterable[can.Message]) -> None:
         """Listen to all of them.
 
         :raises RecordingError: the device speaks another catalogue, and nobody says which.
@@ -78,14 +78,14 @@ class CapturedTalk:
         """Of the harness and of the device."""
         self._early_faults: list[str] = []
         """What was wrong before the run."""
-        self._torn = False
+        self._has_gap = False
         self._undated: catalogue.Diagnosis | None = None
         self._at = {True: 0, False: 0}
         """Of samples and answers: the last index, which tells how often the 16 bits went around."""
         for frame in frames:
-            self._hear(frame)
+            self._decode(frame)
 
-    def _hear(self, frame: can.Message) -> None:
+    def _decode(self, frame: can.Message) -> None:
         message = self._dictionary.message(frame)
         if message is None:
             kind = "frames_dropped" if self._dictionary.is_ours(frame) else "frames_foreign"
@@ -106,21 +106,21 @@ class CapturedTalk:
         if step == 0:
             if type(message) is not type(last) or message != last:
                 who = "harness" if from_harness else "device"
-                self._doubt(f"{brief(last)} and {brief(message)} have the same number: two speak as the {who}")
+                self._add_fault(f"{brief(last)} and {brief(message)} have the same number: two speak as the {who}")
             self.line["messages_repeated"] += 1
             return False
         self.line["messages_lacking"] += step - 1
-        self._torn |= step > 1 and not from_harness
+        self._has_gap |= step > 1 and not from_harness
         return True
 
-    def _doubt(self, fault: str) -> None:
+    def _add_fault(self, fault: str) -> None:
         """Of what was said nobody knows what is true; once for each run is enough."""
         is_over = not self.runs or bool(self.runs[-1].counters)
         for faults in (*([self.runs[-1].faults] if self.runs else []), *([self._early_faults] if is_over else [])):
             if not faults:
                 faults.append(fault)
 
-    def _begun(self) -> CapturedRun:
+    def _current_run(self) -> CapturedRun:
         if not self.runs:
             self._begin(None)
         return self.runs[-1]
@@ -132,7 +132,7 @@ class CapturedTalk:
             CapturedRun(run, self._report_interval_n, self._settings, self._identity, faults=self._early_faults)
         )
         self._early_faults = []
-        self._at, self._torn, self._undated = {True: 0, False: 0}, False, None
+        self._at, self._has_gap, self._undated = {True: 0, False: 0}, False, None
 
     def _index(self, wire_index: int, *, of_sample: bool) -> int:
         last = self._at[of_sample]
@@ -142,9 +142,9 @@ class CapturedTalk:
             self._at[of_sample] = max(last, index)
         return index
 
-    def _is_of(self, flags: int) -> bool:
+    def _belongs_to_run(self, flags: int) -> bool:
         """Whether it belongs to the run; one that began before the capture has the id that comes first."""
-        run, begun = flags >> RUN_SHIFT & (RUNS - 1), self._begun()
+        run, begun = flags >> RUN_SHIFT & (RUNS - 1), self._current_run()
         if begun.run is None:
             begun.run = run
         self.line["messages_of_other_runs"] += begun.run != run
@@ -153,24 +153,24 @@ class CapturedTalk:
     # ---- of the harness
 
     def _sample(self, message: catalogue.Sample) -> None:
-        if self._is_of(message.flags):
+        if self._belongs_to_run(message.flags):
             missing = bool(message.flags & catalogue.SampleFlag.MISSING)
-            self._enter(message.sample_index, message.force, message.displacement, missing=missing)
+            self._add_sample(message.sample_index, message.force, message.displacement, missing=missing)
 
     def _sampleblock(self, message: catalogue.SampleBlock) -> None:
         n = message.flags & ((1 << LAYOUTS["SampleBlock"].bits["samples"][1]) - 1)
-        if self._is_of(message.flags) and 1 <= n <= catalogue.BLOCK_SAMPLES:
+        if self._belongs_to_run(message.flags) and 1 <= n <= catalogue.BLOCK_SAMPLES:
             for i in range(n):
                 force, displacement = message.codes[2 * i : 2 * i + 2]
                 index = (message.sample_index + i) % INDICES
-                self._enter(index, force, displacement, missing=bool(message.missing >> i & 1))
+                self._add_sample(index, force, displacement, missing=bool(message.missing >> i & 1))
 
-    def _enter(self, wire_index: int, force: int, displacement: int, *, missing: bool) -> None:
+    def _add_sample(self, wire_index: int, force: int, displacement: int, *, missing: bool) -> None:
         index = self._index(wire_index, of_sample=True)
         if index >= 0:
             sample = (force, displacement, missing)
             if self.runs[-1].samples.setdefault(index, sample) != sample:
-                self._doubt(f"sample {index} was sent twice, and not the same")
+                self._add_fault(f"sample {index} was sent twice, and not the same")
 
     # ---- of the device
 
@@ -209,13 +209,15 @@ class CapturedTalk:
 
     def _estimate(self, message: catalogue.Estimate) -> None:
         index = self._index(message.sample_index, of_sample=False)
-        elements = self._begun().estimates.setdefault(index, {})
+        elements = self._current_run().estimates.setdefault(index, {})
         if elements.setdefault(message.element, message.value) != message.value:
-            self._doubt(f"element {message.element} of the estimate of sample {index} was said twice, and not the same")
+            self._add_fault(
+                f"element {message.element} of the estimate of sample {index} was said twice, and not the same"
+            )
 
     def _alarm(self, message: catalogue.Alarm) -> None:
         index = self._index(message.sample_index, of_sample=False)
-        self._begun().alarms.append((index, message.trigger, message.statistic))
+        self._current_run().alarms.append((index, message.trigger, message.statistic))
 
     def _diagnosis(self, message: catalogue.Diagnosis) -> None:
         self._undated = message
@@ -228,13 +230,13 @@ class CapturedTalk:
             self.runs[-1].diagnoses.append((index, said.change, onset, said.extent))
 
     def _stepped(self, message: catalogue.Stepped) -> None:
-        if not self._is_of(message.flags):
+        if not self._belongs_to_run(message.flags):
             return
         index, run = self._index(message.sample_index, of_sample=False), self.runs[-1]
-        if self._torn:
+        if self._has_gap:
             run.torn.add(index)
-            self._torn = False
+            self._has_gap = False
         self._date_diagnosis(index)
         step = (message.flags & STEPPED_FLAGS, message.statistic)
         if run.steps.setdefault(index, step) != step:
-            self._doubt(f"the step of sample {index} was said twice, and not the same")
+            self._add_fault(f"the step of sample {index} was said twice, and not the same")

@@ -13,14 +13,14 @@ from analogrig_emulator.effects import SAMPLES, Effect, measured_effects
 
 __all__ = ["as_json", "measure", "text", "write_picture"]
 
-Table = Mapping[str, Sequence[Effect]]
+EffectsBySet = Mapping[str, Sequence[Effect]]
 """Rows by parameter set; each set has the same rows."""
 
 _COLOURS = ("#2b6cb0", "#c05621")
 _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
 
-def measure(sets: Sequence[str]) -> Table:
+def measure(sets: Sequence[str]) -> EffectsBySet:
     """The table for these parameter sets, the largest effect first."""
     found = {name: list(measured_effects(name)) for name in sets}
     largest = [max(row.median_lsb for row in rows) for rows in zip(*found.values(), strict=True)]
@@ -28,7 +28,7 @@ def measure(sets: Sequence[str]) -> Table:
     return {name: [rows[i] for i in order] for name, rows in found.items()}
 
 
-def as_json(table: Table) -> dict[str, Any]:
+def as_json(table: EffectsBySet) -> dict[str, Any]:
     """The table in plain values, for machines."""
     return {
         "samples": SAMPLES,
@@ -48,7 +48,7 @@ def as_json(table: Table) -> dict[str, Any]:
     }
 
 
-def text(table: Table) -> str:
+def text(table: EffectsBySet) -> str:
     """The table for people."""
     lines = [
         f"Largest change of the displacement over {SAMPLES} samples, in LSB of 12 bits over 10 V",
@@ -57,16 +57,16 @@ def text(table: Table) -> str:
         f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
     ]
     for rows in zip(*table.values(), strict=True):
-        figures = "".join(f"{_rounded(row.median_lsb):>10}" for row in rows)
+        figures = "".join(f"{_format_lsb(row.median_lsb):>10}" for row in rows)
         lines.append(f"{rows[0].name:34}{figures}{rows[0].draws:>8}")
     return "\n".join(lines)
 
 
-def _rounded(lsb: float) -> str:
+def _format_lsb(lsb: float) -> str:
     return f"{lsb:.2g}" if lsb < 10 else f"{lsb:.0f}"
 
 
-def write_picture(table: Table, path: Path) -> None:
+def write_picture(table: EffectsBySet, path: Path) -> None:
     """Bars on a logarithmic scale, as SVG.
 
     :raises RecordingError: it cannot be written.
@@ -75,7 +75,7 @@ def write_picture(table: Table, path: Path) -> None:
         file.write(_svg(table).encode("utf-8"))
 
 
-def _svg(table: Table) -> str:
+def _svg(table: EffectsBySet) -> str:
     row_px, top_px = 10 * len(table) + 8, 56
     names = [row.name for row in next(iter(table.values()))]
     height = top_px + row_px * len(names) + 30
@@ -105,7 +105,7 @@ def _bar(effect: Effect, y: float, colour: str) -> str:
     return (
         f'<rect x="{left:.1f}" y="{y}" width="{right - left:.1f}" height="9" fill="{colour}">'
         f"<title>{escape(effect.name)}: {effect.median_lsb:.3g} LSB</title></rect>"
-        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_rounded(effect.median_lsb)}</text>'
+        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_format_lsb(effect.median_lsb)}</text>'
     )
 
 

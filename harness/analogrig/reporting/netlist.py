@@ -23,12 +23,12 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
         samples=scenario.samples,
         sample_rate_hz=rate_hz,
         edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
-        turns=_turns(setup, scenario.samples),
+        turns=_dial_changes(setup, scenario.samples),
         title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
     )
 
 
-def _turns(setup: SetUp, samples: int) -> list[PotChange]:
+def _dial_changes(setup: SetUp, samples: int) -> list[PotChange]:
     """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
     dials = setup.computer.dials
     turns: list[PotChange] = []

@@ -39,7 +39,7 @@ def render(run: Run, verdict: Verdict) -> str:
 
     :raises RecordingError: the build has not put uPlot in its place.
     """
-    return assembled(
+    return assemble_page(
         FOLDER / "page.html",
         STYLES,
         (*SCRIPTS, FOLDER / "page.js"),
@@ -57,7 +57,7 @@ def render(run: Run, verdict: Verdict) -> str:
     )
 
 
-def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
+def assemble_page(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
     """A page that needs nothing but itself: ``template`` with its styles, scripts and texts; ``title`` is escaped.
 
     :raises RecordingError: the build has not put uPlot in its place.

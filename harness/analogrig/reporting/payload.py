@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from analogrig.judging.verdict import TweakVerdict, Verdict, trajectory
 from analogrig.plant import PARAMETERS, Plant
-from analogrig.reporting.points import MOST_POINTS, Piece, condensed, condensed_clipping, pieces, spread
-from analogrig.run import CHANNELS, Run, missing_to_device
+from analogrig.reporting.points import MOST_POINTS, Piece, condense, condense_clipping, pieces, spread
+from analogrig.run import CHANNELS, Run, missing_samples
 
-_SHOWN = {"m": ("mm", 1000.0)}
+_DISPLAY_UNITS = {"m": ("mm", 1000.0)}
 """Units that read better as others."""
 
 
@@ -33,7 +33,7 @@ _MOST_STEPS = 4_000
 
 
 @dataclass(frozen=True)
-class Column:
+class PlotColumn:
     """One signal; the page shows ``offset + scale * values`` in ``unit``."""
 
     name: str
@@ -57,7 +57,7 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
             {"name": c.name, "type": c.values.dtype.name, "scale": c.scale, "offset": c.offset, "unit": c.unit}
             for c in columns
         ],
-        "deflated": deflated(column.values for column in columns),
+        "deflated": deflate(column.values for column in columns),
         "tweaks": [{"sample": tweak.sample, "label": direction(tweak)} for tweak in verdict.tweaks],
         "alarms": [
             {"sample": index, "false": is_false}
@@ -65,9 +65,10 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
         ],
         "overloads": [{"sample": sample, "label": name} for name, sample in sorted(verdict.overloads.items())],
         "segments": [
-            {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in _truth(run)
+            {"start": start, "end": end, **_finite_values(plant.parameters())}
+            for start, end, plant in _true_segments(run)
         ],
-        "ceiling": finite(verdict.ceiling),
+        "ceiling": finite_or_none(verdict.ceiling),
     }
 
 
@@ -97,7 +98,7 @@ def _pieces(run: Run, verdict: Verdict) -> tuple[Piece, ...]:
     return pieces(run.samples, (0, *changes, *noticed, *verdict.overloads.values(), *false))
 
 
-def _truth(run: Run) -> Iterator[tuple[int, int, Plant]]:
+def _true_segments(run: Run) -> Iterator[tuple[int, int, Plant]]:
     """The segments of the run. Every sample of a ramp is one, or a few samples where the ramps are long."""
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
     step_n = max(1, -(-sum(ramps_n.values()) // _MOST_STEPS))
@@ -105,7 +106,7 @@ def _truth(run: Run) -> Iterator[tuple[int, int, Plant]]:
     for start, end, plant in run.segments:
         there = min(start + ramps_n.get(start, 0), end) if before is not None else start
         for k in range(start, there, step_n):
-            yield k, min(k + step_n, there), (before or plant).on_the_way(plant, (k - start) / ramps_n[start])
+            yield k, min(k + step_n, there), (before or plant).interpolate(plant, (k - start) / ramps_n[start])
         if there < end:
             yield there, end, plant
         before = plant
@@ -116,13 +117,13 @@ def as_script(data: Mapping[str, Any]) -> str:
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def deflated(columns: Iterable[NDArray[Any]]) -> str:
+def deflate(columns: Iterable[NDArray[Any]]) -> str:
     """The columns one after another, little-endian, as a zlib stream in base64."""
     raw = b"".join(np.ascontiguousarray(c, dtype=c.dtype.newbyteorder("<")).tobytes() for c in columns)
     return base64.b64encode(zlib.compress(raw, 9)).decode("ascii")
 
 
-def finite(value: float | None) -> float | None:
+def finite_or_none(value: float | None) -> float | None:
     """``value``, or None when there is none, or JSON has no word for it."""
     return value if value is not None and math.isfinite(value) else None
 
@@ -132,27 +133,27 @@ def direction(tweak: TweakVerdict) -> str:
     return ", ".join(f"{name} {'↑' if tweak.after[name] > old else '↓'}" for name, old in tweak.before.items())
 
 
-def _columns(run: Run, shown: Sequence[Piece]) -> Sequence[Column]:
+def _columns(run: Run, shown: Sequence[Piece]) -> Sequence[PlotColumn]:
     measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
     none = _points(run, slice(0), 1, measured)
     parts = [none, *(_points(run, part, piece.size, measured) for piece in shown for part in piece.parts())]
     values = {name: np.concatenate([part[name] for part in parts]) for name in none}
-    return [Column(name, points, **_units(run, name)) for name, points in values.items()]
+    return [PlotColumn(name, points, **_units(run, name)) for name, points in values.items()]
 
 
 def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[str, NDArray[Any]]:
     """The signals of a part of a run in buckets of ``size`` samples, by name."""
     codes, clipped = run.codes[part][:, measured], run.clipped[part][:, measured]
-    shown = condensed(codes, size)
-    bits = np.packbits(condensed_clipping(codes, clipped, size), axis=1, bitorder="little")[:, 0]
-    missing = missing_to_device(run.clipped[part]).astype(np.uint8)
-    estimates = condensed(trajectory(run, part).astype(np.float32), size)
+    shown = condense(codes, size)
+    bits = np.packbits(condense_clipping(codes, clipped, size), axis=1, bitorder="little")[:, 0]
+    missing = missing_samples(run.clipped[part]).astype(np.uint8)
+    estimates = condense(trajectory(run, part).astype(np.float32), size)
     return {
         **{CHANNELS[channel]: shown[:, i] for i, channel in enumerate(measured)},
         "clipped": bits,
-        "missing": np.repeat(condensed(missing, size)[1::2], 2) if size > 1 else missing,
+        "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
         **{name: estimates[:, i] for i, name in enumerate(PARAMETERS)},
-        "statistic": condensed(run.statistic[part], size),
+        "statistic": condense(run.statistic[part], size),
     }
 
 
@@ -161,10 +162,10 @@ def _units(run: Run, name: str) -> dict[str, Any]:
     if name not in run.conditions.channels:
         return {}
     channel = run.conditions.channels[name]
-    unit, factor = _SHOWN.get(channel.unit, (channel.unit, 1.0))
+    unit, factor = _DISPLAY_UNITS.get(channel.unit, (channel.unit, 1.0))
     per_volt = channel.unit_per_v * factor
     return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit}
 
 
-def _finite_only(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: finite(value) for name, value in values.items()}
+def _finite_values(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: finite_or_none(value) for name, value in values.items()}

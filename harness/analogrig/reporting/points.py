@@ -75,7 +75,7 @@ def _near(moments: Iterable[int], samples: int) -> list[tuple[int, int]]:
     return out
 
 
-def condensed(values: NDArray[Any], size: int) -> NDArray[Any]:
+def condense(values: NDArray[Any], size: int) -> NDArray[Any]:
     """(p, ...): minimum and maximum in turn of each bucket of (n, ...); NaN for a bucket without a finite value."""
     if size == 1:
         return values
@@ -88,8 +88,8 @@ def condensed(values: NDArray[Any], size: int) -> NDArray[Any]:
     return out
 
 
-def condensed_clipping(codes: NDArray[np.uint16], clipped: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
-    """(p, c): the points of ``condensed(codes, size)`` that were clipped; a clipped code is an end of its range."""
+def condense_clipping(codes: NDArray[np.uint16], clipped: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    """(p, c): the points of ``condense(codes, size)`` that were clipped; a clipped code is an end of its range."""
     if size == 1:
         return clipped
     starts = range(0, len(codes), size)

@@ -36,7 +36,7 @@ _SENTENCES = {
 
 def title(run: Run, verdict: Verdict) -> str:
     """Title of the document, escaped."""
-    return f"{_text(verdict.outcome.upper())}: {_what_ran(run)}"
+    return f"{_text(verdict.outcome.upper())}: {_run_title(run)}"
 
 
 def outcome(run: Run, verdict: Verdict) -> str:
@@ -46,10 +46,10 @@ def outcome(run: Run, verdict: Verdict) -> str:
     return (
         f'<section class="outcome {verdict.outcome}" aria-labelledby="outcome">'
         f'<h1 id="outcome"><span class="sign" aria-hidden="true">{_SIGNS[verdict.outcome]}</span>'
-        f" {_text(verdict.outcome.upper())}<small>{_what_ran(run)}</small></h1>"
+        f" {_text(verdict.outcome.upper())}<small>{_run_title(run)}</small></h1>"
         f"<p>{_SENTENCES[verdict.outcome]}</p>"
         f"{f'<ul>{reasons}</ul>' if reasons else ''}"
-        f"{_tally(run, verdict)}</section>"
+        f"{_figures_sentence(run, verdict)}</section>"
     )
 
 
@@ -71,7 +71,7 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Theta hash", verdict.theta_hash),
         *provenance(ran.identity),
     ]
-    return _table("What ran, and where", "", (_named(name, value) for name, value in rows), kind="pairs")
+    return _table("What ran, and where", "", (_pair_row(name, value) for name, value in rows), kind="pairs")
 
 
 def provenance(identity: Identity | None) -> list[tuple[str, str]]:
@@ -93,7 +93,7 @@ def tweaks(verdict: Verdict) -> str:
         return "<p>The plant did not change in this run.</p>"
     assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
     caption = f"Latency and bound in samples from the change; {assumed}"
-    if any(tweak.others for tweak in verdict.tweaks):
+    if any(tweak.alternatives for tweak in verdict.tweaks):
         caption += "; where the instant was learned from the samples, from the earliest to the latest"
     head = _row(
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
@@ -153,7 +153,7 @@ def settings(run: Run) -> str:
         "channel": channels,
         "counter": ran.counters,
     }
-    rows = (_named(key, value) for key, value in _flat(everything))
+    rows = (_pair_row(key, value) for key, value in _flatten(everything))
     return _table("As recorded", "", rows, kind="pairs")
 
 
@@ -178,12 +178,12 @@ def resolution(run: Run, verdict: Verdict) -> str:
     return out
 
 
-def _what_ran(run: Run) -> str:
+def _run_title(run: Run) -> str:
     ran = run.conditions
     return f"{_text(ran.scenario['name'])} on {_text(ran.rig['name'])}, device {_text(ran.dut['name'])}"
 
 
-def _tally(run: Run, verdict: Verdict) -> str:
+def _figures_sentence(run: Run, verdict: Verdict) -> str:
     """The figures in one sentence; none for a run that is not valid, since they would read like a result."""
     if not verdict.valid:
         return ""
@@ -208,7 +208,7 @@ def _tweak_row(tweak: TweakVerdict) -> str:
     change = ", ".join(
         f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
     )
-    exact = not tweak.others and tweak.latency_n is not None and tweak.bound_n
+    exact = not tweak.alternatives and tweak.latency_n is not None and tweak.bound_n
     ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
     low, high = tweak.between
@@ -255,22 +255,22 @@ def _error(segment: SegmentEstimate, name: str) -> float | None:
     return None if error is None else round(error, 4) + 0.0
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """``a.b.c`` and value of everything in nested tables."""
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from _flatten(value, f"{prefix}{key}.")
         elif isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
-            yield from _flat({str(i): item for i, item in enumerate(value)}, f"{prefix}{key}.")
+            yield from _flatten({str(i): item for i, item in enumerate(value)}, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 
 
 def _pairs(table: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key.replace('_', ' ')} {_shown(key, value)}" for key, value in table.items())
+    return ", ".join(f"{key.replace('_', ' ')} {_format_value(key, value)}" for key, value in table.items())
 
 
-def _shown(key: str, value: object) -> str:
+def _format_value(key: str, value: object) -> str:
     """Hashes and nonces as people compare them."""
     return f"{value:#010x}" if isinstance(value, int) and key.endswith(("hash", "nonce")) else str(value)
 
@@ -298,7 +298,7 @@ def _number_head(name: str) -> str:
     return f'<th scope="col" class="number">{_text(name)}</th>'
 
 
-def _named(name: str, value: object) -> str:
+def _pair_row(name: str, value: object) -> str:
     return _row([f'<th scope="row">{_text(name)}</th>', _cell(value, "text")])
 
 
