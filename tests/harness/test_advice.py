@@ -58,11 +58,13 @@ def test_edges_that_come_anywhere_are_named(excitation: dict[str, Any], told: bo
 
 def test_many_false_alarms_devalue_latencies() -> None:
     run = made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[10, 20, 30, 404], theta=GOOD_THETA)
-    assert "may be chance" in advised(run)
+    assert "may be coincidence" in advised(run)
 
 
 def test_change_that_could_not_be_seen_is_named() -> None:
-    assert "K at 400 could not be seen" in advised(made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA))
+    assert "K at 400 is not judged: not detectable" in advised(
+        made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA)
+    )
 
 
 def test_estimate_that_is_no_suspension_is_named() -> None:
@@ -75,4 +77,4 @@ def test_warm_up_that_ends_before_the_second_edge_is_told(frequency_hz: float, t
     estimator = {**run.conditions.dut["estimator"], "warm_up_n": 150}
     dut = {**run.conditions.dut, "estimator": estimator}
     run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, dut=dut))
-    assert ("warm-up of 150 samples ends before 2 edges" in advised(run)) == told
+    assert ("warm-up of 150 samples ends before edge 2" in advised(run)) == told

@@ -212,7 +212,7 @@ def test_capture_without_the_handshake_has_a_note(tmp_path: Path, traffic: tuple
     assert "not in the log" not in summary(whole, judge(whole))
     later = captured(written(tmp_path / "can.log", frames[nth(frames, "Sample", 0) :]))
     n = len(list(EstimatorConfig().settings()))
-    said = f"note: {n} settings of the device are not in the log and were taken to be as by default"
+    said = f"note: {n} settings of the device are not in the log and were replaced by the default"
     assert said in summary(later, judge(later))
 
 

@@ -112,7 +112,7 @@ def test_estimate_that_is_no_number_is_no_evidence(lost: str) -> None:
     array[400:] = np.nan
     broken = dataclasses.replace(run, **{lost: array})
     assert exposure(broken).armed == exposure(run).armed - 200
-    assert judge(broken).reasons == ("in 200 of 600 samples what the device estimated was no number",)
+    assert judge(broken).reasons == ("the device reported non-finite estimates in 200 of 600 samples",)
     assert judge(broken).outcome == "inconclusive"
 
 

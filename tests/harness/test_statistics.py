@@ -97,7 +97,7 @@ def test_confidence_sequence_decides_on_either_side() -> None:
     ("call", "message"),
     [
         (lambda: upper_rate(2, 1, 0.9), "there cannot be 2 events in 1 trials"),
-        (lambda: upper_rate(0, 0, 0.9), "nothing is known without a trial"),
+        (lambda: upper_rate(0, 0, 0.9), "there must be at least one trial"),
         (lambda: lower_rate(0, 1, 1.0), "confidence must be between 0 and 1, not 1"),
         (lambda: Design(0.0, 0.9), "rate must be between 0 and 1, not 0"),
         (lambda: SequentialTest(0.2, 0.1, 0.1, 0.1), "good must be below bad"),

@@ -104,8 +104,8 @@ def test_run_that_was_not_valid_is_inconclusive_however_good_it_looks(changes: d
         ([30, 31], 2, 2, ()),
         ([30, 799], 2, 1, ()),
         ([30, 31], 1, 2, ("2 samples were lost on the way to the device, more than 1",)),
-        ([], 0, 3, ("the device never saw 3 samples, where 0 are known to be lost",)),
-        ([30], 5, 0, ("the device never saw 0 samples, where 1 are known to be lost",)),
+        ([], 0, 3, ("the device counted 3 lost samples, the harness 0",)),
+        ([30], 5, 0, ("the device counted 0 lost samples, the harness 1",)),
     ],
     ids=["allowed", "last", "too many", "unknown", "untrue"],
 )

@@ -81,7 +81,7 @@ def test_between_the_deadlines_of_earliest_and_latest_instant_a_run_is_inconclus
     verdict = judge(learned(between(395, 400, 402), alarms=[alarm]))
     assert verdict.outcome == "inconclusive"
     assert verdict.tweaks[0].result == "undecided"
-    assert verdict.reasons == ("K between 395 and 402 was late or noticed, depending on when it came",)
+    assert verdict.reasons == ("K between 395 and 402 was late or noticed, depending on its instant",)
 
 
 def test_alarm_between_earliest_and_latest_instant_is_false_or_the_detection() -> None:
