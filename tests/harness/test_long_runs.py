@@ -15,7 +15,7 @@ from analogrig.config import locate
 from analogrig.judging.verdict import judge
 from analogrig.plant import Plant
 from analogrig.reporting import render
-from analogrig.reporting.points import MOST_POINTS, Piece, condense, pieces
+from analogrig.reporting.payload import MOST_POINTS, Piece, condense, pieces
 from analogrig.run import Run, Segment
 from tests.harness.long_runs import FIRM, long_run
 from tests.harness.reported import Page

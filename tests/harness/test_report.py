@@ -91,7 +91,7 @@ def test_marks_are_those_of_the_run(read: Page) -> None:
 
 
 def test_change_is_listed_with_latency_bound_and_ratio(read: Page) -> None:
-    assert read.row("1200") == ["1200", "K 24500 → 18000 N/m", "3", "2", "1.50", "✓ noticed"]
+    assert read.row("1200") == ["1200", "K 24500 → 18000 N/m", "3", "2", "1.50", "✓ detected"]
 
 
 def test_missed_change_is_marked(read: Page) -> None:
@@ -102,7 +102,7 @@ def test_change_that_nobody_could_see_is_not_marked_as_missed(run: Run) -> None:
     verdict = reported_verdict(run)
     unseen = replace(verdict.tweaks[1], bound_n=None)
     read = Page(render(run, replace(verdict, tweaks=(unseen,))))
-    assert read.row("1500")[-1] == "could not be seen"
+    assert read.row("1500")[-1] == "not detectable"
     assert "MISSED" not in read.text
 
 
@@ -123,7 +123,7 @@ def test_diagnosis_is_listed_against_the_truth(run: Run, read: Page) -> None:
 def test_device_that_names_no_change_is_said_to(run: Run) -> None:
     silent = tuple(replace(tweak, diagnosis=None) for tweak in reported_verdict(run).tweaks)
     read = Page(render(run, replace(reported_verdict(run), tweaks=silent)))
-    assert "The device did not say what had changed." in read.text
+    assert "The device reported no diagnosis." in read.text
 
 
 def test_false_alarms_are_listed(read: Page) -> None:
@@ -187,7 +187,7 @@ def test_inconclusive_run_says_that_it_is_no_result() -> None:
     read = Page(render(run, judge(run)))
     assert "This run is not valid" in read.text
     assert "the device was reset" in read.text
-    assert "of 2 changes noticed" not in read.text
+    assert "of 2 changes detected" not in read.text
 
 
 def test_run_without_a_sample_has_a_page() -> None:

@@ -66,7 +66,7 @@ def test_late_alarm_fails_and_names_its_deadline() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
     assert verdict.tweaks[0].late
     assert verdict.outcome == "failed"
-    assert "K at 400 was noticed after 100 samples, later than" in verdict.reasons[0]
+    assert "K at 400 was detected after 100 samples, later than" in verdict.reasons[0]
 
 
 def test_expectations_of_the_scenario_count() -> None:

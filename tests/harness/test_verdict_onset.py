@@ -73,7 +73,7 @@ def test_alarm_after_the_latest_instant_passes_if_it_is_in_time_even_for_the_ear
 def test_device_is_late_only_if_it_is_so_for_the_latest_instant() -> None:
     late = judge(learned(between(395, 400, 402), alarms=[deadline_of(402) + 1]))
     assert (late.outcome, late.tweaks[0].result) == ("failed", "late")
-    assert "K at 400 was noticed after" in late.reasons[0]
+    assert "K at 400 was detected after" in late.reasons[0]
 
 
 @pytest.mark.parametrize("alarm", [deadline_of(395) + 1, deadline_of(402)], ids=["just after", "just before"])
@@ -167,7 +167,7 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     text, page, verdict = shown(run)
     line = next(line for line in text.splitlines() if "24500 -> 18000" in line)
     assert line.split()[-2:] == ["2-9", str(verdict.tweaks[0].bound_n)]
-    assert "between 395 and 402, the likeliest instant is shown: noticed" in text
+    assert "between 395 and 402 (the likeliest instant is shown): noticed" in text
     assert ">395–402</button>" in page and ">2–9</td>" in page
     (tweak,) = as_json(verdict)["tweaks"]
     wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "noticed"}
@@ -177,8 +177,8 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
 
 def test_doubt_is_shown_wherever_the_result_is() -> None:
     text, page, verdict = shown(learned(between(380, 400, 402), alarms=[390]))
-    assert "depending on when the changes came: alarms at 390" in text
-    assert "? depends on when it came" in page and "the alarms at 390 are such" in page
+    assert "depending on the instants of the changes: alarms at 390" in text
+    assert "? depends on its instant" in page and "the alarms at 390 are false" in page
     assert as_json(verdict)["doubtful_alarms"] == [390]
     assert as_json(verdict)["tweaks"][0]["result"] == "undecided"
 

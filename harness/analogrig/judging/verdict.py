@@ -456,7 +456,7 @@ def _failure_reasons(
         of = number_of(len(judged), "change")
         reasons.append(f"missed {len(missed)} of {of} ({names}), at most {expect.missed} expected")
     reasons += [
-        f"{tweak.what} at {tweak.sample} was noticed after {number_of(tweak.latency_n or 0, 'sample')},"
+        f"{tweak.what} at {tweak.sample} was detected after {number_of(tweak.latency_n or 0, 'sample')},"
         f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
         for tweak in judged
         if tweak.late

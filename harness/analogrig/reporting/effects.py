@@ -1,4 +1,4 @@
-"""The table "what matters at 12 bits" as text, plain values, and a picture."""
+"""Effect sizes at 12 bits (command ``effects``) as text, plain values, and a picture."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from analogrig_emulator.effects import SAMPLES, Effect, measured_effects
 __all__ = ["as_json", "measure", "text", "write_picture"]
 
 EffectsBySet = Mapping[str, Sequence[Effect]]
-"""Rows by parameter set; each set has the same rows."""
+"""Effects by parameter set; each set has the same effects in the same order."""
 
 _COLOURS = ("#2b6cb0", "#c05621")
 _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
 
 def measure(sets: Sequence[str]) -> EffectsBySet:
-    """The table for these parameter sets, the largest effect first."""
+    """Measure all effects for these parameter sets; the largest first."""
     found = {name: list(measured_effects(name)) for name in sets}
     largest = [max(row.median_lsb for row in rows) for rows in zip(*found.values(), strict=True)]
     order = sorted(range(len(largest)), key=lambda i: -largest[i])
@@ -29,7 +29,7 @@ def measure(sets: Sequence[str]) -> EffectsBySet:
 
 
 def as_json(table: EffectsBySet) -> dict[str, Any]:
-    """The table in plain values, for machines."""
+    """Effects in plain JSON types."""
     return {
         "samples": SAMPLES,
         "unit": "LSB (10 V / 4096)",
@@ -49,10 +49,10 @@ def as_json(table: EffectsBySet) -> dict[str, Any]:
 
 
 def text(table: EffectsBySet) -> str:
-    """The table for people."""
+    """Effects as a table for the terminal."""
     lines = [
         f"Largest change of the displacement over {SAMPLES} samples, in LSB of 12 bits over 10 V",
-        "(of what is drawn: the median over draws)",
+        "(random effects: median over draws)",
         "",
         f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
     ]
@@ -67,9 +67,9 @@ def _format_lsb(lsb: float) -> str:
 
 
 def write_picture(table: EffectsBySet, path: Path) -> None:
-    """Bars on a logarithmic scale, as SVG.
+    """Write the effects as bars on a logarithmic scale, in SVG.
 
-    :raises RecordingError: it cannot be written.
+    :raises RecordingError: the file cannot be written.
     """
     with replacing(path) as file:
         file.write(_svg(table).encode("utf-8"))
@@ -110,6 +110,6 @@ def _bar(effect: Effect, y: float, colour: str) -> str:
 
 
 def _x_px(lsb: float) -> float:
-    """Where a figure stands on the logarithmic axis; what is smaller than its left end stands there."""
+    """Position on the logarithmic axis, limited to its ends."""
     span = math.log10(_MOST_LSB / _LEAST_LSB)
     return 250.0 + 460.0 * min(max(math.log10(max(lsb, _LEAST_LSB) / _LEAST_LSB) / span, 0.0), 1.0)
