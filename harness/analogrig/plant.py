@@ -113,7 +113,7 @@ def discretise(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.f
 
 
 def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix exponentials of (k, n, n), of the same shape."""
+    """Matrix exponentials of (k, n, n), of the same shape. Importing scipy.linalg would take longer than numpy."""
     norms = np.abs(matrices).sum(axis=2).max(axis=1)
     squarings = np.maximum(0, np.frexp(norms)[1] + 4)
     out = np.empty_like(matrices)

@@ -344,10 +344,14 @@ class Run:
         """
         from analogrig.header import check_tables  # imports scenario, which imports this module
 
-        ran = self.conditions
+        conditions = self.conditions
         try:
             return check_tables(
-                f"{path}: the header of the recording", scenario=ran.scenario, rig=ran.rig, dut=ran.dut, line=ran.line
+                f"{path}: the header of the recording",
+                scenario=conditions.scenario,
+                rig=conditions.rig,
+                dut=conditions.dut,
+                line=conditions.line,
             )
         except ConfigurationError as error:
             raise RecordingError(str(error)) from error

@@ -117,7 +117,7 @@ class Expectations:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative")
 
-    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+    def excess_missing(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
         """Reason that a run with so many missing samples is not valid, in a list; empty if it is valid."""
         if missing <= self.max_missing_fraction * samples:
             return []

@@ -135,12 +135,6 @@ class Design:
                 high = middle
         return high
 
-    def pass_probability(self, true_rate: float) -> float:
-        """Probability that a device with this true rate passes; at ``rate`` it is 1 - confidence."""
-        from scipy.stats import binom
-
-        return float(binom.cdf(self.allowed, self.trials, true_rate))
-
 
 def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:
     """Mean with its two-sided confidence interval, as (mean, low, high) (Student 1908).
@@ -205,11 +199,6 @@ class SequentialTest:
         if self.log_ratio >= -math.log(self.false_alarm):
             return Decision.ABOVE
         return Decision.OPEN
-
-    @property
-    def fewest_trials(self) -> int:
-        """Trials without an event after which the decision is BELOW."""
-        return math.ceil(math.log(self.miss) / (math.log1p(-self.bad) - math.log1p(-self.good)))
 
 
 @dataclass

@@ -85,19 +85,19 @@ class TweakVerdict:
     """Reason that the change was not found in the samples and is not judged; empty otherwise."""
 
     @property
-    def possible(self) -> tuple[TweakVerdict, ...]:
+    def hypotheses(self) -> tuple[TweakVerdict, ...]:
         """Verdicts under all hypotheses, in order of time."""
         return tuple(sorted((self, *self.alternatives), key=lambda each: each.sample))
 
     @property
     def between(self) -> tuple[int, int]:
         """Earliest and latest possible sample of the change."""
-        return self.possible[0].sample, self.possible[-1].sample
+        return self.hypotheses[0].sample, self.hypotheses[-1].sample
 
     @property
     def latencies_n(self) -> tuple[int, int] | None:
         """Smallest and largest possible latency; None: no alarm is attributed to the change."""
-        known = [each.latency_n for each in self.possible if each.latency_n is not None]
+        known = [each.latency_n for each in self.hypotheses if each.latency_n is not None]
         return (min(known), max(known)) if known else None
 
     @property
@@ -105,7 +105,7 @@ class TweakVerdict:
         """Result under all hypotheses; ``undecided`` if they differ."""
         if self.unseen:
             return "not judged"
-        results = {_result_at_instant(each) for each in self.possible}
+        results = {_result_at_instant(each) for each in self.hypotheses}
         return results.pop() if len(results) == 1 else "undecided"
 
     @property
@@ -322,7 +322,7 @@ def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Ex
 def _undecided_reason(tweak: TweakVerdict) -> str:
     """Message that the result of a change depends on its instant."""
     low, high = tweak.between
-    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.possible))
+    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.hypotheses))
     return f"{tweak.what} between {low} and {high} was {results}, depending on its instant"
 
 
@@ -424,7 +424,7 @@ def evidence_gaps(
     """
     refusals = [f"the device refused {number_of(refused, 'sample')}"] if refused else []
     unarmed = [shown.lack_of_evidence] if shown.lack_of_evidence else []
-    return [*refusals, *expect.gaps(shown.samples, missing, words), *unarmed]
+    return [*refusals, *expect.excess_missing(shown.samples, missing, words), *unarmed]
 
 
 def _loss_reasons(run: Run) -> list[str]:

@@ -58,7 +58,9 @@ def import_run(
             f"{path}: has {number_of(captured.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
             " pass the scenario that was played"
         )
-    return _run(path, captured, scenario, rig, most_lost_n=most_lost_n, line=_line(decoder, frames), end=frames.end)
+    return _run(
+        path, captured, scenario, rig, most_lost_n=most_lost_n, line=_line_counts(decoder, frames), end=frames.end
+    )
 
 
 def replace_scenario(run: Run, scenario: Scenario) -> Run:
@@ -79,7 +81,7 @@ def replace_scenario(run: Run, scenario: Scenario) -> Run:
     return dataclasses.replace(run, conditions=conditions)
 
 
-def _line(decoder: CaptureDecoder, frames: CapturedFrames) -> dict[str, int]:
+def _line_counts(decoder: CaptureDecoder, frames: CapturedFrames) -> dict[str, int]:
     """Traffic other than intact messages of harness and device: counts by name."""
     counts = {**decoder.line, "lines_damaged": len(frames.damaged)}
     return {name: n for name, n in counts.items() if n}
@@ -126,7 +128,7 @@ def _run(
     lost = int(((rows.flags & LOST) != 0).sum())
     if lost > counters.get("samples_lost", lost):  # the device received samples that the capture lacks
         counters = {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
-    faults = (*scenario.caveats, *captured.faults, *_gaps(path, captured), *([end] if end else []))
+    faults = (*scenario.caveats, *captured.faults, *_capture_faults(path, captured), *([end] if end else []))
     performance = rig.perform(scenario, 0)
     alarms = [alarm for alarm in captured.alarms if 0 <= alarm[0] < captured.extent]
     diagnoses = [each for each in captured.diagnoses if 0 <= each[0] < captured.extent]
@@ -165,7 +167,7 @@ def _run(
     )
 
 
-def _gaps(path: Path, captured: CapturedRun) -> Iterator[str]:
+def _capture_faults(path: Path, captured: CapturedRun) -> Iterator[str]:
     """Faults: alarms missing from the capture, or counters that cannot confirm it."""
     alarms = captured.counters.get("alarms", len(captured.alarms))
     if alarms != len(captured.alarms):

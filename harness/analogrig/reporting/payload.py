@@ -63,7 +63,7 @@ def pieces(samples: int, moments: Iterable[int]) -> tuple[Piece, ...]:
     size = -(-samples // _MOST_BUCKETS)
     out: list[Piece] = []
     end = 0
-    for begin, last in [*_near(moments, samples), (samples, samples)]:
+    for begin, last in [*_spans_near(moments, samples), (samples, samples)]:
         first = begin - ((begin - end) % size == 1)  # a bucket of one sample has no two points
         if end < first:
             out.append(Piece(end, first, size))
@@ -73,7 +73,7 @@ def pieces(samples: int, moments: Iterable[int]) -> tuple[Piece, ...]:
     return tuple(out)
 
 
-def _near(moments: Iterable[int], samples: int) -> list[tuple[int, int]]:
+def _spans_near(moments: Iterable[int], samples: int) -> list[tuple[int, int]]:
     """Spans (first, end) around the most important moments, in order and apart."""
     chosen = list(dict.fromkeys(moments))[:_MOST_MOMENTS]
     reach = min(_LONGEST_REACH, _MOST_NEAR_MOMENTS // (2 * len(chosen))) if chosen else 0
@@ -112,7 +112,7 @@ def condense_clipping(codes: NDArray[np.uint16], clipped: NDArray[np.bool_], siz
     return out
 
 
-def spread(values: Sequence[int], samples: int, most: int) -> list[int]:
+def thin_out(values: Sequence[int], samples: int, most: int) -> list[int]:
     """At most ``most`` of ``values`` (sample indices), in order: the first in each equal part of the run."""
     if len(values) <= most:
         return sorted(values)
@@ -184,7 +184,7 @@ def _alarms(run: Run, verdict: Verdict) -> tuple[list[int], list[int]]:
     """Alarms to be marked: detections, and false alarms."""
     false = set(verdict.false_alarms)
     detections = [index for index in run.alarm_index.tolist() if index not in false]
-    return detections, spread(
+    return detections, thin_out(
         [index for index in run.alarm_index.tolist() if index in false], run.samples, _MOST_FALSE_ALARMS
     )
 

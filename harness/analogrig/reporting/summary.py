@@ -40,7 +40,7 @@ def summary(run: Run, verdict: Verdict) -> str:
         lines += [f"  {missing_text(run)}: {number_of(verdict.missing_n, 'sample')}"]
     if verdict.overloads:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
-    if seen := line_text(conditions.link_counters):
+    if seen := traffic_text(conditions.link_counters):
         lines += [f"  on the line: {seen}"]
     load = load_of(run)
     if load is not None:
@@ -51,7 +51,7 @@ def summary(run: Run, verdict: Verdict) -> str:
     return "\n".join(lines)
 
 
-def line_text(link_counters: Mapping[str, int]) -> str:
+def traffic_text(link_counters: Mapping[str, int]) -> str:
     """Other traffic on the line: ``12 frames foreign, 1 error frame``."""
     return ", ".join(number_named(n, name) for name, n in link_counters.items() if n)
 

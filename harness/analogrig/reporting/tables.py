@@ -52,21 +52,21 @@ def outcome(run: Run, verdict: Verdict) -> str:
 
 def conditions(run: Run, verdict: Verdict) -> str:
     """Table of the conditions: scenario, rig, device, link and provenance."""
-    ran = run.conditions
-    description = ran.scenario.get("description")
+    context = run.conditions
+    description = context.scenario.get("description")
     load = load_of(run)
     rows = [
-        ("Scenario", f"{ran.scenario['name']}{f': {description}' if description else ''}"),
-        ("Rig", ran.rig["name"]),
-        ("Device", ran.dut["name"]),
-        ("Firmware", _pairs(ran.dut.get("identity", {})) or "unknown"),
-        ("Link", ran.link),
+        ("Scenario", f"{context.scenario['name']}{f': {description}' if description else ''}"),
+        ("Rig", context.rig["name"]),
+        ("Device", context.dut["name"]),
+        ("Firmware", _pairs(context.dut.get("identity", {})) or "unknown"),
+        ("Link", context.link),
         ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
-        ("Seed", ran.seed),
+        ("Seed", context.seed),
         ("Samples", _samples(run, verdict)),
         ("Overload lamps", lamps_text(verdict.overloads)),
         ("Theta hash", verdict.theta_hash),
-        *provenance(ran.identity),
+        *provenance(context.identity),
     ]
     return _table("Scenario, rig and device", "", (_pair_row(name, value) for name, value in rows), kind="pairs")
 
@@ -139,14 +139,14 @@ def estimates(verdict: Verdict) -> str:
 
 def settings(run: Run) -> str:
     """Table of all settings and counters in the recording."""
-    ran = run.conditions
-    channels = {name: vars(channel) for name, channel in ran.channels.items()}
+    context = run.conditions
+    channels = {name: vars(channel) for name, channel in context.channels.items()}
     everything = {
-        "scenario": ran.scenario,
-        "rig": ran.rig,
-        "device": ran.dut,
+        "scenario": context.scenario,
+        "rig": context.rig,
+        "device": context.dut,
         "channel": channels,
-        "counter": ran.counters,
+        "counter": context.counters,
     }
     rows = (_pair_row(key, value) for key, value in _flatten(everything))
     return _table("As recorded", "", rows, kind="pairs")
@@ -154,8 +154,8 @@ def settings(run: Run) -> str:
 
 def period(run: Run) -> str:
     """Sample period in problem time and at the machine, escaped."""
-    ran = run.conditions
-    problem_ms, machine_us = ran.sample_period_problem_s * 1e3, ran.sample_period_s * 1e6
+    context = run.conditions
+    problem_ms, machine_us = context.sample_period_problem_s * 1e3, context.sample_period_s * 1e6
     return _text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
 
 
@@ -174,8 +174,8 @@ def resolution(run: Run, verdict: Verdict) -> str:
 
 
 def _run_title(run: Run) -> str:
-    ran = run.conditions
-    return f"{_text(ran.scenario['name'])} on {_text(ran.rig['name'])}, device {_text(ran.dut['name'])}"
+    context = run.conditions
+    return f"{_text(context.scenario['name'])} on {_text(context.rig['name'])}, device {_text(context.dut['name'])}"
 
 
 def _figures_sentence(run: Run, verdict: Verdict) -> str:

@@ -167,7 +167,7 @@ _UNKNOWN = "it depends on when the change came, which is not known better"
 
 def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
     """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
-    reasons = [_too_late(each, within) for each in tweak.possible]
+    reasons = [_too_late(each, within) for each in tweak.hypotheses]
     if all(reasons):
         return _too_late(tweak, within)
     low, high = tweak.between
