@@ -7,8 +7,8 @@ Detection: with a mean time between false alarms of ARL0, no detector can, to fi
 reaches ln ARL0 (Lorden 1971; Moustakides 1986; Lai 1998). I(n) compares the plant before and after the change. It
 depends on the phase of the excitation, so it is computed for each change in each run.
 
-Isolation: the changed parameter is known with 95 % confidence once the same information, between the true plant and
-the most similar plant with another single parameter changed, reaches ln 20.
+Isolation: the changed parameter is known with 95 % confidence once I(n) between the true plant and its best rival
+reaches ln 20. A rival is a plant with one other parameter changed.
 """
 
 from __future__ import annotations

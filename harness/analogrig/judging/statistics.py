@@ -160,7 +160,7 @@ class SequentialTest:
     """Wald's sequential test of a good rate against a bad one; may be evaluated after every trial.
 
     BELOW for a rate of ``bad`` or more has a probability of at most ``miss``. ABOVE for a rate of ``good`` or less has
-    a probability of at most ``false_alarm`` (Wald 1947, section 3.2, with A = 1 / false_alarm and B = miss).
+    a probability of at most ``false_alarm``. Source: Wald 1947, section 3.2, with A = 1 / false_alarm and B = miss.
     ValueError: a value is out of range.
     """
 

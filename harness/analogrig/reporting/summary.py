@@ -24,7 +24,7 @@ def summary(run: Run, verdict: Verdict) -> str:
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
-        lines += [line for tweak in verdict.tweaks for line in _tweak_lines(tweak)]
+        lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak)]
     diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
         lines += [
@@ -79,7 +79,7 @@ def _false_alarms(verdict: Verdict) -> str:
     return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
 
 
-def _tweak_lines(tweak: TweakVerdict) -> list[str]:
+def _change_lines(tweak: TweakVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
     change = _change(tweak.before, tweak.after)
     out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]

@@ -95,7 +95,7 @@ def tweaks(verdict: Verdict) -> str:
     head = _row(
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
     )
-    return _table(caption, head, (_tweak_row(tweak) for tweak in verdict.tweaks))
+    return _table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
 
 
 def diagnoses(verdict: Verdict) -> str:
@@ -199,7 +199,7 @@ def _samples(run: Run, verdict: Verdict) -> str:
     return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
-def _tweak_row(tweak: TweakVerdict) -> str:
+def _change_row(tweak: TweakVerdict) -> str:
     change = ", ".join(
         f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
     )
