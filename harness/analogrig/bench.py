@@ -1,4 +1,4 @@
-"""The bench: a rig, a link and a device on one table, and the one thing that is done there: play a scenario."""
+"""Bench: joins a rig, a link and a device, and plays scenarios."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from analogrig.links.wire import Clock
 from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
+from analogrig.run import CHANNELS, Conditions, Run, missing_samples
 from analogrig.scenario import Scenario
 
 Progress = Callable[[int, int], None]
-"""Called after each block with the samples done and the samples asked."""
+"""Callback after each block, with the number of samples done and of samples asked."""
 
 INTERRUPTED_BY_USER = "interrupted by the user"
 
 _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
 
-class _Collected:
-    """Samples and answers of one run. A Run refers to these very arrays: nothing is kept twice.
+class _RunBuilder:
+    """Collector of the samples and answers of one run. The Run shares its arrays.
 
-    The arrays have room for all samples that were asked for. Memory that is never written costs nothing.
+    The arrays are allocated for all samples asked. The operating system provides only the pages that are written.
     """
 
     def __init__(self, samples_asked: int, parameters: int) -> None:
@@ -47,32 +47,35 @@ class _Collected:
         self._diagnoses: list[StatedDiagnosis] = []
         self.samples = 0
         self.records: list[int] = []
-        """Their first samples."""
+        """First samples of the records."""
         self.counters: Counter[str] = Counter()
-        """The device's, of all records."""
+        """Sums of the device's counters over all records."""
         self.line_s = 0.0
 
     def begin_record(self) -> None:
+        """Start a record with the next sample."""
         self.records.append(self.samples)
 
     def add(self, block: Block, reply: Replies) -> None:
-        """Keep the samples of a block that were answered: all, unless the run ends here."""
+        """Append the answered samples of a block: all of them, unless the run ends here."""
         answered = len(reply.flags)
         to = slice(self.samples, self.samples + answered)
         self._codes[to] = block.codes[:answered]
         self._clipped[to] = block.clipped[:answered]
         self._theta[to], self._innovation[to] = reply.theta, reply.innovation
         self._statistic[to], self._flags[to] = reply.statistic, reply.flags
-        shifted = _since(self.records[-1], reply)
+        shifted = _shift_replies(self.records[-1], reply)
         self._alarms += shifted.alarms
         self._diagnoses += shifted.diagnoses
         self.samples += answered
 
     def end_record(self, line_s: float, counters: Mapping[str, int]) -> None:
+        """Add the line time and the device's counters of the record."""
         self.line_s += line_s
         self.counters.update(counters)
 
-    def run(self, conditions: Conditions) -> Run:
+    def build(self, conditions: Conditions) -> Run:
+        """Run of the samples so far."""
         alarms, diagnoses = self._alarms, self._diagnoses
         return Run(
             conditions=conditions,
@@ -92,8 +95,8 @@ class _Collected:
         )
 
 
-def _since(first: int, reply: Replies) -> Replies:
-    """What the device said of a record that begins with the sample ``first``, which is 0 to the device."""
+def _shift_replies(first: int, reply: Replies) -> Replies:
+    """Replies with the device's sample indices, which start at 0 in each record, shifted by ``first``."""
     if not first:
         return reply
     return dataclasses.replace(
@@ -105,10 +108,10 @@ def _since(first: int, reply: Replies) -> Replies:
     )
 
 
-def uninterrupted(run: Run) -> Run:
-    """Return the run, for a caller to whom a part of it is of no use.
+def raise_if_interrupted(run: Run) -> Run:
+    """Return ``run`` if the user did not interrupt it.
 
-    :raises KeyboardInterrupt: the user interrupted it.
+    :raises KeyboardInterrupt: the user interrupted the run.
     """
     if INTERRUPTED_BY_USER in run.conditions.faults:
         raise KeyboardInterrupt
@@ -116,8 +119,8 @@ def uninterrupted(run: Run) -> Run:
 
 
 @contextlib.contextmanager
-def _undisturbed(pace: Pace | None) -> Iterator[None]:
-    """In real time the collector of garbage waits: among as many answers it takes longer than a message lasts."""
+def _pause_garbage_collection(pace: Pace | None) -> Iterator[None]:
+    """Disable garbage collection in real time: with so many objects it would take longer than a message."""
     if pace is None or not gc.isenabled():
         yield
         return
@@ -129,11 +132,11 @@ def _undisturbed(pace: Pace | None) -> Iterator[None]:
 
 
 class Bench:
-    """A rig and a device, joined to play scenarios.
+    """Rig and device, joined to play scenarios.
 
     The device is configured and its handshake is done, as ``open_dut`` returns it. ``progress`` is called after each
-    block with the samples done and the samples asked. ``real_time`` stretches the time of the machine to that of the
-    wall clock by this factor; None: lock-step, where no sample is late.
+    block with the samples done and the samples asked. ``real_time`` is the wall-clock time per machine time; None:
+    lock-step, where no sample is late.
     """
 
     def __init__(
@@ -146,10 +149,10 @@ class Bench:
         time_limit_s: float | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        """With ``real_time`` the samples go out as the machine takes them, in time stretched by that factor.
+        """Join ``rig`` and ``dut``.
 
-        ``time_limit_s`` is the longest time of one play, on ``clock``. It bounds every wait for the device. A rig is
-        not interrupted: the limit is checked after each block of samples that it gives.
+        ``time_limit_s`` is the longest duration of one play, on ``clock``. It bounds every wait for the device. The
+        rig is not interrupted: the limit is checked after each of its blocks.
         """
         self.rig = rig
         self.dut = dut
@@ -161,29 +164,28 @@ class Bench:
     def play(self, scenario: Scenario, seed: int) -> Run:
         """Play ``scenario`` and collect the answers of the device, in lock-step or in real time.
 
-        In real time the messages of samples that are late are counted, and make the run invalid. What the emulated
-        machine does is worked out before.
+        In real time, late messages are counted and make the run invalid. The emulated machine is computed in advance.
 
-        A rig, link or device that fails once samples flow ends the run, it does not raise: the Run holds all complete
-        blocks until then, and its conditions say what failed. The time limit ends the run likewise, and the Run holds
-        every sample that was answered until then.
+        A failure of rig, link or device after the first sample ends the run and does not raise. The Run holds the
+        complete blocks until then, and ``conditions.faults`` names the failure. The time limit ends the run likewise;
+        the Run then holds every answered sample.
 
         :raises DeviceError, LinkError, RigError: before the first sample.
         :raises ConfigurationError: real time does not fit the line.
         """
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
-        pace, blocks = self._paced(performance)
+        pace, blocks = self._pace_blocks(performance)
         self.dut.set_force_zero(performance.channels["force"].zero)
         self.dut.start(pace)
-        begun = self._begun(performance, scenario, seed)
-        collected = _Collected(scenario.samples, self.dut.parameters)
-        faults = (*scenario.caveats, *self._failures(blocks, pace, scenario.samples, collected, until_s))
-        conditions = self._concluded(begun, performance.hindsight(), faults, collected)
-        return collected.run(conditions)
+        initial = self._initial_conditions(performance, scenario, seed)
+        builder = _RunBuilder(scenario.samples, self.dut.parameters)
+        faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
+        conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
+        return builder.build(conditions)
 
-    def _begun(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
-        """What is known before the first sample."""
+    def _initial_conditions(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
+        """Conditions known before the first sample."""
         return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
@@ -199,21 +201,21 @@ class Bench:
             real_time=self._real_time or 0.0,
         )
 
-    def _failures(
-        self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected, until_s: float
+    def _collect_samples(
+        self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder, until_s: float
     ) -> list[str]:
-        """Exchanges the samples, and says what kept it from doing so to the end."""
+        """Exchange the samples; return the failures that ended the exchange early or make it invalid."""
         faults = []
         try:
-            with _undisturbed(pace), self._limited(until_s):
-                self._exchange(self._in_time(blocks, until_s), pace, samples, collected)
+            with _pause_garbage_collection(pace), self._limit_waits(until_s):
+                self._exchange(self._take_until(blocks, until_s), pace, samples, builder)
         except TimeLimitReached:
             limit = f"time limit of {self._time_limit_s:g} s"
-            faults.append(f"{limit} reached after {collected.samples} of {samples} samples")
+            faults.append(f"{limit} reached after {builder.samples} of {samples} samples")
         except RigError as error:
             faults.append(str(error))
             with contextlib.suppress(DeviceError, LinkError):
-                self.dut.handshake()  # it waits for samples: nothing of this run may reach the next one
+                self.dut.handshake()  # the device awaits samples; a handshake keeps this run out of the next one
         except (DeviceError, LinkError) as error:
             faults.append(str(error))
         except KeyboardInterrupt:
@@ -225,7 +227,7 @@ class Bench:
         return faults
 
     @contextlib.contextmanager
-    def _limited(self, until_s: float) -> Iterator[None]:
+    def _limit_waits(self, until_s: float) -> Iterator[None]:
         """Bound every wait for the device by the time limit."""
         self.dut.limit(until_s - self._clock())
         try:
@@ -233,59 +235,60 @@ class Bench:
         finally:
             self.dut.limit(math.inf)
 
-    def _in_time(self, blocks: Iterable[Block], until_s: float) -> Iterator[Block]:
-        """The blocks until the time limit.
+    def _take_until(self, blocks: Iterable[Block], until_s: float) -> Iterator[Block]:
+        """Blocks until the time limit.
 
-        :raises TimeLimitReached: it is over.
+        :raises TimeLimitReached: the time limit has passed.
         """
         for block in blocks:
             if self._clock() >= until_s:
                 raise TimeLimitReached("the time limit of the run is over")
             yield block
 
-    def _concluded(
-        self, begun: Conditions, known: Hindsight, faults: tuple[str, ...], collected: _Collected
+    def _final_conditions(
+        self, initial: Conditions, known: Hindsight, faults: tuple[str, ...], builder: _RunBuilder
     ) -> Conditions:
-        """What is known after the last sample."""
+        """Conditions known after the last sample."""
         return dataclasses.replace(
-            begun,
+            initial,
             channels={
                 name: dataclasses.replace(channel, noise_lsb=known.noise_lsb.get(name, channel.noise_lsb))
-                for name, channel in begun.channels.items()
+                for name, channel in initial.channels.items()
             },
             segments=known.segments,
             faults=(*faults, *known.caveats),
-            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < collected.samples},
-            records=tuple(collected.records) or (0,),
-            line_s=collected.line_s,
-            counters=collected.counters,
+            overloads={amplifier: sample for amplifier, sample in known.lamps.items() if sample < builder.samples},
+            records=tuple(builder.records) or (0,),
+            line_s=builder.line_s,
+            counters=builder.counters,
             link_counters=self.dut.link_counters,
         )
 
-    def _paced(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
-        """The pace of the samples, and what to send."""
+    def _pace_blocks(self, performance: Performance) -> tuple[Pace | None, Iterable[Block]]:
+        """Pace of the samples (None in lock-step), and the blocks, which are computed in advance in real time."""
         if self._real_time is None:
             return None, performance.blocks
         pace = self.pace(performance.sample_period_s * self._real_time)
         return pace, list(performance.blocks)
 
     def pace(self, period_s: float) -> Pace:
-        """Of a run in real time; counts its overruns."""
+        """Pace of a real-time run with ``period_s`` between samples; counts the overruns."""
         return self.dut.pace(period_s)
 
-    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, collected: _Collected) -> None:
-        """One record after the other; to the device each is a run of its own, the first of which has begun."""
-        for record, its_blocks in itertools.groupby(blocks, key=lambda block: block.record):
+    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder) -> None:
+        """Exchange all records. Each is a run of its own for the device, which has already started the first."""
+        for record, record_blocks in itertools.groupby(blocks, key=lambda block: block.record):
             if record:
                 self.dut.start(pace)
-            collected.begin_record()
-            self._exchange_record(its_blocks, samples, collected)
+            builder.begin_record()
+            self._exchange_record(record_blocks, samples, builder)
             line_s = self.dut.line_s
-            collected.end_record(line_s, self.dut.stop())
+            builder.end_record(line_s, self.dut.stop())
 
-    def _exchange_record(self, blocks: Iterable[Block], samples: int, collected: _Collected) -> None:
+    def _exchange_record(self, blocks: Iterable[Block], samples: int, builder: _RunBuilder) -> None:
+        """Send the blocks of one record and collect their replies."""
         sent: deque[Block] = deque()
-        start = collected.records[-1]
+        start = builder.records[-1]
 
         def stretches() -> Iterator[Stretch]:
             for block in blocks:
@@ -294,10 +297,10 @@ class Bench:
                     block.first - start,
                     block.codes[:, _FORCE],
                     block.codes[:, _DISPLACEMENT],
-                    missing_to_device(block.clipped),
+                    missing_samples(block.clipped),
                 )
 
         for reply in self.dut.play(stretches()):
-            collected.add(sent.popleft(), reply)
+            builder.add(sent.popleft(), reply)
             if self._progress is not None:
-                self._progress(collected.samples, samples)
+                self._progress(builder.samples, samples)

@@ -1,7 +1,7 @@
-"""Tables in the header of a recording: what is computed from them later is checked when the file is read.
+"""Checks on the tables in the header of a recording.
 
-``Conditions`` keeps the tables of scenario, rig and device as they were written, for people. A verdict reads a few of
-their keys, and a hostile or damaged file may hold anything there.
+``Conditions`` keeps the tables of scenario, rig and device as they were written. A verdict reads some of their keys.
+These are checked when the file is read, because a hostile or damaged file may hold anything there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from analogrig_emulator import Excitation
 _MOST = 2**31
 
 _NEEDED = ("na", "nb", "offset", "trigger")
-"""Settings without a default, and the ceiling of a trigger: another value would be another verdict."""
+"""Settings without a default, because each of them changes the verdict; so does the ceiling of a trigger."""
 
 
 @dataclass(frozen=True)
@@ -72,23 +72,23 @@ class _Line:
 def check_tables(
     where: str, *, scenario: Mapping[str, Any], rig: Mapping[str, Any], dut: Mapping[str, Any], line: Mapping[str, int]
 ) -> EstimatorConfig:
-    """The settings of the recorded estimator, if the tables hold what a verdict needs; ``where`` leads every error.
+    """Settings of the recorded estimator, after a check of every key that a verdict reads; ``where`` leads errors.
 
-    :raises ConfigurationError: a key that is read later is lacking or wrong.
+    :raises ConfigurationError: a key that is read later is missing or wrong.
     """
-    _known(_Scenario, scenario, f"{where}: scenario")
-    _known(_Rig, rig, f"{where}: rig")
-    _known(_Line, line, f"{where}: line")
+    _build_known(_Scenario, scenario, f"{where}: scenario")
+    _build_known(_Rig, rig, f"{where}: rig")
+    _build_known(_Line, line, f"{where}: line")
     settings = dut.get("estimator")
-    if isinstance(settings, Mapping):  # which is checked below
+    if isinstance(settings, Mapping):
         needed = _NEEDED if settings.get("trigger") == "none" else (*_NEEDED, "ceiling")
         lacking = [key for key in needed if key not in settings]
         if lacking:
             raise ConfigurationError(f"{where}: dut: estimator: the key {lacking[0]!r} is lacking")
-    estimator: EstimatorConfig = _known(_Device, dut, f"{where}: dut").estimator
+    estimator: EstimatorConfig = _build_known(_Device, dut, f"{where}: dut").estimator
     return estimator
 
 
-def _known(cls: type[Any], table: Mapping[str, Any], where: str) -> Any:
-    """The keys that ``cls`` has; others are only shown."""
+def _build_known(cls: type[Any], table: Mapping[str, Any], where: str) -> Any:
+    """Build ``cls`` from the keys that it has; ignore the others."""
     return config.build(cls, {key: value for key, value in table.items() if key in cls.__dataclass_fields__}, where)

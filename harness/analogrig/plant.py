@@ -1,7 +1,7 @@
-"""The plant: a mass, a damper and a spring, in continuous time and as the device sees it, sample by sample.
+"""Plant model: a mass, a damper and a spring, in continuous time and discretised.
 
-This is the harness's own model of what the rig computes: it is used to say how much a change of the plant can be seen
-(``information``) and what an estimate theta means in kilograms, never to produce the samples of a run.
+The harness uses this model for the information bounds and to convert estimates to physical units. It never produces
+the samples of a run.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 PARAMETERS = ("M", "B", "K")
-"""Names and order of the physical parameters wherever they stand in one array."""
+"""Names of the physical parameters, in the order of every array of them."""
 
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
-
 LEAST_PARAMETER, MOST_PARAMETER = 1e-12, 1e12
-"""Of any of the three, in its unit."""
+"""Limits of each parameter in its unit, exclusive."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +39,18 @@ class Plant:
                 raise ValueError(f"{name} must be {limits}, not {value:g}")
 
     def parameters(self) -> dict[str, float]:
-        """The values under their short names ``M``, ``B``, ``K``."""
+        """Values by their short names ``M``, ``B``, ``K``."""
         return dict(zip(PARAMETERS, (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m), strict=True))
 
     def scaled(self, name: str, factor: float) -> Plant:
-        """The plant with its ``M``, ``B`` or ``K`` times a factor."""
+        """The same plant with parameter ``name`` (``M``, ``B`` or ``K``) multiplied by ``factor``."""
         values = self.parameters()
         return Plant(*(value * factor if name == each else value for each, value in values.items()))
 
-    def on_the_way(self, other: Plant, part: float) -> Plant:
-        """The plant at a part (0..1) of a ramp to another: what the pots pass, 1/M, B and K, changes evenly.
+    def interpolate(self, other: Plant, part: float) -> Plant:
+        """Plant at the fraction ``part`` (0..1) of a ramp to ``other``: linear in 1/M, B and K, as the pots set them.
 
-        So it is but for the load of the pots: dials that turn evenly are at most 2 % of a coefficient beside it.
+        The load of the pots is neglected: it moves a coefficient by at most 2 % if the dials turn linearly.
         """
         mass_kg = 1.0 / ((1.0 - part) / self.mass_kg + part / other.mass_kg)
         damping = self.damping_n_s_per_m + part * (other.damping_n_s_per_m - self.damping_n_s_per_m)
@@ -59,7 +58,7 @@ class Plant:
         return Plant(mass_kg, damping, stiffness)
 
     def changes_to(self, other: Plant) -> dict[str, tuple[float, float]]:
-        """``{name: (before, after)}`` of the parameters in which ``other`` differs."""
+        """Parameters in which ``other`` differs, as ``{name: (before, after)}``."""
         pairs = zip(PARAMETERS, self.parameters().values(), other.parameters().values(), strict=True)
         return {name: (before, after) for name, before, after in pairs if before != after}
 
@@ -72,40 +71,40 @@ AT_REST: State = (0.0, 0.0)
 
 @dataclass(frozen=True)
 class SampledPlant:
-    """One sample period of a plant whose force is held. Zero-order hold, exact.
+    """Plant discretised by an exact zero-order hold of the force.
 
-    Plain floats, since a 2 x 2 product takes numpy ten times as long.
+    Plain floats: numpy takes ten times as long for a 2 x 2 product.
     """
 
     transition: tuple[float, float, float, float]
-    """Row by row: x from x, x from v, v from x, v from v."""
+    """Transition matrix of (x, v), row by row."""
     response: tuple[float, float]
-    """x and v per newton."""
+    """Change of x and v per newton."""
 
     @classmethod
-    def of(cls, plant: Plant, period_s: float) -> SampledPlant:
-        """Every ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
-        return cls.of_each([plant], period_s)[0]
+    def from_plant(cls, plant: Plant, period_s: float) -> SampledPlant:
+        """Discretise with ``period_s`` of problem time (Astrom and Wittenmark, Computer-Controlled Systems, 2.3)."""
+        return cls.from_plants([plant], period_s)[0]
 
     @classmethod
-    def of_each(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
-        """As ``of``, bit for bit, for many plants in less time."""
+    def from_plants(cls, plants: Sequence[Plant], period_s: float) -> list[SampledPlant]:
+        """Discretise many plants at once; equal to ``from_plant`` to the bit."""
         parameters = np.array([(each.mass_kg, each.damping_n_s_per_m, each.stiffness_n_per_m) for each in plants])
         return [
             cls(transition=(xx, xv, vx, vv), response=(xf, vf))
-            for (xx, xv, xf), (vx, vv, vf) in sampled(parameters.reshape(-1, 3), period_s).tolist()
+            for (xx, xv, xf), (vx, vv, vf) in discretise(parameters.reshape(-1, 3), period_s).tolist()
         ]
 
     def next(self, state: State, force_n: float) -> State:
-        """The state one sample later."""
+        """State one sample later."""
         x, v = state
         xx, xv, vx, vv = self.transition
         xf, vf = self.response
         return (xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n)
 
 
-def sampled(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
-    """One sample period of (n, 3) values of M, B, K: of each the rows of x and v from x, v and force, (n, 2, 3)."""
+def discretise(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.float64]:
+    """Discretise plants (n, 3) of M, B, K: (n, 2, 3), the rows of x and v from x, v and force."""
     m, b, k = parameters.T
     generators = np.zeros((len(parameters), 3, 3))
     generators[:, 0, 1] = 1.0
@@ -114,7 +113,7 @@ def sampled(parameters: NDArray[np.float64], period_s: float) -> NDArray[np.floa
 
 
 def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Exponential of each of (k, n, n) matrices, of the same shape."""
+    """Matrix exponentials of (k, n, n), of the same shape. Importing scipy.linalg would take longer than numpy."""
     norms = np.abs(matrices).sum(axis=2).max(axis=1)
     squarings = np.maximum(0, np.frexp(norms)[1] + 4)
     out = np.empty_like(matrices)
@@ -125,7 +124,7 @@ def _exponentials(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.float64]:
-    """Exponential by scaling, a Taylor series, and squaring; relative error near 1e-15 for the norms used here."""
+    """Matrix exponentials by scaling, a Taylor series, and squaring; relative error near 1e-15 for these norms."""
     scaled = matrices / 2.0**squarings
     term = result = np.eye(matrices.shape[-1])
     for order in range(1, 13):
@@ -139,12 +138,11 @@ def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.fl
 def physical_parameters(
     theta: NDArray[np.floating], estimator: Mapping[str, object], n_per_code: float, m_per_code: float, period_s: float
 ) -> NDArray[np.float64]:
-    """Estimates (n, p) in codes to M, B, K (n, 3); NaN where a row describes no mass, damper and spring.
+    """M, B, K (n, 3) of estimates theta (n, p) in codes; NaN if a row describes no mass, damper and spring.
 
-    The poles of A give B/M and K/M, the static gain gives K; neither needs to know when inside the interval an edge
-    came.
+    The poles of A give B/M and K/M, the static gain gives K. Neither depends on the instant of an edge within a sample.
 
-    :param estimator: at least ``na`` and ``nb``, which say what the columns of theta are; all NaN unless ``na`` is 2.
+    :param estimator: at least the orders ``na`` and ``nb`` of theta; all NaN unless ``na`` is 2.
     :param n_per_code: newtons per code of force.
     :param m_per_code: metres per code of displacement.
     :param period_s: problem time between samples.

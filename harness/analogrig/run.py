@@ -1,7 +1,7 @@
-"""A Run: everything that one play of a scenario yielded, and the one file it is kept in.
+"""Run: the complete result of one play of a scenario, and its file format.
 
-The file is an uncompressed ``.npz``: the arrays under their own names and ``header``, a JSON text. Nothing in it is
-ever executed (``allow_pickle=False``); a verdict can be computed from it alone, today or in ten years.
+The file is an uncompressed ``.npz``: the arrays under their own names, and ``header``, a JSON text. It is read with
+``allow_pickle=False`` and contains everything that a verdict needs.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
 
 CHUNK_SAMPLES = 1 << 16
-"""Long runs are worked on in parts of this length, so that intermediate results take no memory to speak of."""
+"""Samples per chunk. Long runs are processed in chunks to bound the memory of intermediate results."""
 
 MAX_SAMPLES = 10_000_000
-"""A run is kept in memory, some 70 bytes a sample."""
+"""Largest number of samples. A run is kept in memory, about 70 bytes a sample."""
 
 MAX_CHANGES = 1_000
-"""Changes of the plant in a run, and its records: what can be known of each takes milliseconds to compute."""
+"""Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
 
 MAX_CODES = 1 << 16
 
-_NEAR, _FAR = 1e-12, 1e9
-"""Short of and beyond any unit, time or noise that is one."""
+_LEAST_MAGNITUDE, _MOST_MAGNITUDE = 1e-12, 1e9
+"""Limits of every plausible unit, time or noise, exclusive."""
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
-"""Order of the columns of ``Run.codes`` and ``Run.clipped``."""
+"""Channels in the order of the columns of ``Run.codes`` and ``Run.clipped``."""
 
 MEASURED = ("force", "displacement")
-"""Those that every rig has, and that the device is given."""
+"""Channels that every rig measures and every device receives."""
 
 LOST = 0x20
-"""In the flags of a sample, beside SteppedFlag: it was lost on the way to the device, for which it is missing."""
+"""Flag of a sample, beside SteppedFlag: lost on the way to the device."""
 UNREPORTED = 0x40
-"""... the device was asked not to report every estimate, and this one is that of the row before."""
+"""Flag of a sample, beside SteppedFlag: the device reported no estimate, and theta repeats the previous row."""
 
 _ARRAYS: dict[str, tuple[str, int]] = {
     "codes": ("uint16", 2),
@@ -70,88 +70,89 @@ _ARRAYS: dict[str, tuple[str, int]] = {
     "alarm_statistic": ("float32", 1),
 }
 
-_LATER_ARRAYS: dict[str, tuple[str, int]] = {
+_OPTIONAL_ARRAYS: dict[str, tuple[str, int]] = {
     "diagnosis_index": ("int64", 1),
     "diagnosis_change": ("uint8", 1),
     "diagnosis_onset": ("int64", 1),
     "diagnosis_extent": ("float32", 1),
 }
-"""Recordings made before a device could say what has changed lack them: they are empty."""
+"""Arrays of diagnoses, absent and then empty in older recordings."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """How the codes of one channel translate: volts = low_v + code * lsb_v, physical = volts * unit_per_v."""
+    """Scale of one channel: volts = low_v + code * lsb_v, physical = volts * unit_per_v."""
 
     low_v: float
     lsb_v: float
     unit: str
     unit_per_v: float
     noise_lsb: float
-    """rms of the noise before quantisation, as far as the rig knows it."""
+    """Noise before quantisation, rms in LSB; 0 if unknown."""
     codes: int = 4096
-    """How many there are, from 0 on."""
+    """Number of codes, from 0 on."""
 
     def physical(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """Codes of any shape to ``unit`` (float64, same shape)."""
+        """Values in ``unit`` of codes of any shape (float64, same shape)."""
         return self.volts(codes) * self.unit_per_v
 
     def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """Codes of any shape to volts at the rig (float64, same shape)."""
+        """Volts at the rig of codes of any shape (float64, same shape)."""
         return self.low_v + codes.astype(np.float64) * self.lsb_v
 
     @property
     def zero(self) -> float:
-        """The code of zero volts, not rounded; it may lie outside the range."""
+        """Code of zero volts, not rounded; may lie outside the range."""
         return -self.low_v / self.lsb_v
 
     @property
     def lsb(self) -> float:
-        """One code in ``unit``."""
+        """Size of one code in ``unit``."""
         return self.lsb_v * self.unit_per_v
 
 
-def missing_to_device(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) of (n, 4): a sample whose force or displacement was clipped is no measurement."""
+def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) bool from (n, 4) bool: samples whose force or displacement was clipped."""
     used = [CHANNELS.index(name) for name in MEASURED]
     return np.asarray(clipped[:, used].any(axis=1))
 
 
 @dataclass(frozen=True)
 class Segment:
-    """The plant from a sample on, until the next segment."""
+    """Plant from a sample on, until the next segment. Instants are sample indices."""
 
     start: int
-    """Sample index."""
+    """First sample, or the likeliest one if estimated from the samples."""
     plant: Plant
     ramp_n: int = 0
-    """So many samples go by until it has become so."""
+    """Samples from ``start`` to the end of the ramp; 0: a jump."""
     start_low: int | None = None
-    """The earliest instant at which it may have begun, where the samples had to tell; None: it is exact ..."""
+    """Earliest possible ``start``; None: ``start`` is exact."""
     start_high: int | None = None
-    """... and the latest."""
+    """Latest possible ``start``; None: ``start`` is exact."""
     end_low: int | None = None
-    """The earliest instant at which a ramp may have been over ..."""
+    """Earliest possible end of the ramp; None: ``ramp_n`` is exact."""
     end_high: int | None = None
-    """... and the latest."""
+    """Latest possible end of the ramp; None: ``ramp_n`` is exact."""
     unseen: str = ""
-    """Why nobody knows whether the plant changed, somewhere on the ramp; empty if one does."""
+    """Reason that the change could not be found in the samples; empty otherwise."""
 
     def earliest(self) -> Self:
-        """As if it had begun, and been over, as early as it may have."""
-        return self._between(self.start_low, self.end_low)
+        """The same segment with its change at the earliest possible instants."""
+        return self._move_to(self.start_low, self.end_low)
 
     def latest(self) -> Self:
-        """... as late as it may have."""
-        return self._between(self.start_high, self.end_high)
+        """The same segment with its change at the latest possible instants."""
+        return self._move_to(self.start_high, self.end_high)
 
-    def _between(self, start: int | None, end: int | None) -> Self:
+    def _move_to(self, start: int | None, end: int | None) -> Self:
         start = self.start if start is None else start
         ramp_n = self.ramp_n if end is None else max(0, end - start)
         return dataclasses.replace(self, start=start, ramp_n=ramp_n)
 
     @property
     def is_exact(self) -> bool:
+        """True if start and end are known, not estimated from the samples."""
         return self.start_low is None and self.start_high is None and self.end_low is None and self.end_high is None
 
 
@@ -159,7 +160,7 @@ class Segment:
 class Conditions:
     """Conditions of a run: seed, sample times, the true plant, and the descriptions of scenario, rig, device and link.
 
-    They are the header of the file. Instants are sample indices, times are in seconds.
+    Stored as the header of the file. Instants are sample indices, times are in seconds.
     """
 
     seed: int
@@ -170,32 +171,32 @@ class Conditions:
     """Problem time per machine time (200: the computer runs 200 times faster than the motorcycle)."""
     channels: Mapping[str, Channel]
     segments: tuple[Segment, ...]
-    """The truth, which the device never saw; empty if the rig does not know it."""
+    """True plant, which the device never receives; empty if the rig does not know it."""
     scenario: Mapping[str, Any]
-    """The scenario's TOML, with its name."""
+    """Scenario as a TOML table, with its name."""
     rig: Mapping[str, Any]
-    """The rig's description, with its name."""
+    """Description of the rig, with its name."""
     dut: Mapping[str, Any]
     """Device: name, kind, estimator settings, identity (firmware, catalogue hash, boot nonce)."""
     link: str
     counters: Mapping[str, int] = field(default_factory=dict)
-    """The device's own counters at the end."""
+    """Counters of the device at the end."""
     faults: tuple[str, ...] = ()
-    """Why the run is not valid; empty if it is."""
+    """Reasons that the run is not valid; empty if it is."""
     overloads: Mapping[str, int] = field(default_factory=dict)
-    """Of each amplifier whose overload lamp lit, the first sample that was taken with the lamp lit."""
+    """First sample with a lit overload lamp, by amplifier."""
     real_time: float = 0.0
-    """By how much the machine's time was stretched to be that of the clock on the wall; 0: lock-step, in no time."""
+    """Wall-clock time per machine time; 0: lock-step."""
     link_counters: Mapping[str, int] = field(default_factory=dict)
-    """What was on the line since it was opened that was no message of the device: damaged frames, those of others..."""
+    """Traffic on the line other than messages of the device, such as damaged or foreign frames, by name."""
     records: tuple[int, ...] = (0,)
-    """First samples of the gap-free records, each of which the device began afresh and from rest."""
+    """First samples of the gap-free records. Plant and device start each record from rest."""
     line_s: float = 0.0
-    """How long a line of the described speed would have taken, in lock-step; 0: none is described."""
+    """Transmission time of a lock-step run at the configured line speed; 0: no speed is configured."""
     line: Mapping[str, int] = field(default_factory=dict)
-    """How the samples went (``Dut.line``); empty if that is not recorded."""
+    """Speed and packing of the line (``Dut.line``); empty if not recorded."""
     identity: Identity | None = None
-    """Provenance; None in older recordings, and where a program plays that keeps none."""
+    """Provenance; None if not recorded."""
 
     @property
     def sample_period_problem_s(self) -> float:
@@ -218,47 +219,48 @@ class Run:
     theta: NDArray[np.float32]
     """(n, p): the estimate after each sample, in codes per code; order of est.h."""
     innovation: NDArray[np.float32]
-    """(n,) codes."""
+    """(n,) prediction errors in codes."""
     statistic: NDArray[np.float32]
     """(n,): the trigger's statistic."""
     flags: NDArray[np.uint8]
-    """(n,): SteppedFlag of the device, LOST, UNREPORTED."""
+    """(n,): SteppedFlag of the device, with LOST and UNREPORTED."""
     alarm_index: NDArray[np.int64]
     """(a,): sample index of each alarm."""
     alarm_kind: NDArray[np.uint8]
     alarm_statistic: NDArray[np.float32]
     diagnosis_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(d,): sample after which the device said what had changed."""
+    """(d,): sample after which the device reported the diagnosis."""
     diagnosis_change: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
     """(d,): Change of the catalogue."""
     diagnosis_onset: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(d,): the sample of the change, as the device has it."""
+    """(d,): sample of the change according to the device."""
     diagnosis_extent: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    """(d,): new over old."""
+    """(d,): ratio of the new to the old value of the parameter."""
 
     @property
     def samples(self) -> int:
+        """Number of samples that were played."""
         return len(self.codes)
 
     @property
     def missing(self) -> NDArray[np.bool_]:
-        """(n,): the device was told that this sample is missing."""
-        return missing_to_device(self.clipped)
+        """(n,): samples sent to the device as missing."""
+        return missing_samples(self.clipped)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
-        """(n,): this sample was lost on the way to the device."""
+        """(n,): samples lost on the way to the device."""
         return np.asarray((self.flags & LOST) != 0)
 
     def channel(self, name: str) -> NDArray[np.float64]:
-        """One channel in its physical unit, (n,) float64."""
+        """Values of one channel in its physical unit, (n,) float64."""
         return self.conditions.channels[name].physical(self.codes[:, CHANNELS.index(name)])
 
     @property
     def segments(self) -> tuple[tuple[int, int, Plant], ...]:
-        """The stretches (start, end, plant) of the samples start <= k < end that were played, in order.
+        """Stretches (start, end, plant) of the played samples start <= k < end, in order.
 
-        Each begins with a change of the plant or with a record.
+        A new stretch begins at each change of the plant and at each record.
         """
         plants = {segment.start: segment.plant for segment in self.conditions.segments if segment.start < self.samples}
         if not plants:
@@ -271,23 +273,26 @@ class Run:
 
     @property
     def records(self) -> tuple[tuple[int, int], ...]:
-        """The gap-free records (start, end) of the samples start <= k < end that were played, in order."""
+        """Gap-free records (start, end) of the played samples start <= k < end, in order."""
         starts = [start for start in self.conditions.records if start < self.samples]
         return tuple(itertools.pairwise([*starts, self.samples]))
 
-    def supposing(self, instant: Callable[[Segment], Segment]) -> Run:
-        """The same run if each change had come at another instant, within its record and before the end."""
+    def with_change_instants(self, instant: Callable[[Segment], Segment]) -> Run:
+        """The same run with each segment replaced by ``instant(segment)``, which moves the instant of its change.
+
+        The instants are limited to the record of the change.
+        """
         segments = []
         for segment in self.conditions.segments:
             first, end = next((span for span in self.records if span[0] <= segment.start < span[1]), (-1, -1))
-            supposed = instant(segment)
+            moved = instant(segment)
             if first < segment.start < end:
-                supposed = dataclasses.replace(supposed, start=min(max(supposed.start, first + 1), end - 1))
-            segments.append(supposed)
+                moved = dataclasses.replace(moved, start=min(max(moved.start, first + 1), end - 1))
+            segments.append(moved)
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, segments=tuple(segments)))
 
-    def made_by(self, identity: Identity) -> Run:
-        """Return the same run with this provenance."""
+    def with_identity(self, identity: Identity) -> Run:
+        """The same run with this provenance."""
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, identity=identity))
 
     def theta_hash(self) -> str:
@@ -298,12 +303,12 @@ class Run:
         return digest.hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write atomically: the file is either the whole run or not there.
+        """Write the run to one file, atomically.
 
         :raises RecordingError: the file cannot be written.
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
-        arrays = {name: getattr(self, name) for name in _ARRAYS | _LATER_ARRAYS}
+        arrays = {name: getattr(self, name) for name in _ARRAYS | _OPTIONAL_ARRAYS}
         with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
             for name, array in {"header": np.array(header), **arrays}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -321,31 +326,41 @@ class Run:
             with path.open("rb") as raw:
                 _check_archive(raw)
                 with np.load(raw, allow_pickle=False) as file:
-                    header = json.loads(str(file["header"]), parse_float=_finite, parse_constant=_finite)
-                    names = (*_ARRAYS, *(name for name in _LATER_ARRAYS if name in file))
-                    arrays = {name: _checked(name, file[name]) for name in names}
+                    header = json.loads(str(file["header"]), parse_float=_parse_finite, parse_constant=_parse_finite)
+                    names = (*_ARRAYS, *(name for name in _OPTIONAL_ARRAYS if name in file))
+                    arrays = {name: _check_array(name, file[name]) for name in names}
         except OSError as error:
             raise RecordingError(f"{path}: cannot read the recording: {error.strerror or error}") from error
         except Exception as error:  # numpy and zipfile raise a dozen types on damaged archives, undocumented
             raise RecordingError(f"{path}: truncated, or not a recording of analogrig") from error
-        run = cls(conditions=_conditions(header, path), **arrays)
+        run = cls(conditions=_parse_conditions(header, path), **arrays)
         run._check_consistency(path)
         return run
 
     def _estimator(self, path: Path) -> EstimatorConfig:
-        """:raises RecordingError: a table of the header is not what is read of it later."""
-        from analogrig.header import check_tables  # which needs the types of scenarios, and these ours
+        """Settings of the recorded estimator.
 
-        ran = self.conditions
+        :raises RecordingError: a table of the header lacks a key that a verdict reads, or has a wrong one.
+        """
+        from analogrig.header import check_tables  # imports scenario, which imports this module
+
+        conditions = self.conditions
         try:
             return check_tables(
-                f"{path}: the header of the recording", scenario=ran.scenario, rig=ran.rig, dut=ran.dut, line=ran.line
+                f"{path}: the header of the recording",
+                scenario=conditions.scenario,
+                rig=conditions.rig,
+                dut=conditions.dut,
+                line=conditions.line,
             )
         except ConfigurationError as error:
             raise RecordingError(str(error)) from error
 
     def _check_consistency(self, path: Path) -> None:
-        """The arrays belong together, and so do they and the header."""
+        """Check the arrays against each other and against the header.
+
+        :raises RecordingError: names every check that failed.
+        """
         n, alarms, diagnoses = self.samples, len(self.alarm_index), len(self.diagnosis_index)
         conditions = self.conditions
         earliest, starts, latest = (
@@ -361,28 +376,31 @@ class Run:
                 len(getattr(self, name)) == n for name in ("clipped", "theta", "innovation", "statistic", "flags")
             )
             and len(self.alarm_kind) == len(self.alarm_statistic) == alarms
-            and all(len(getattr(self, name)) == diagnoses for name in _LATER_ARRAYS),
+            and all(len(getattr(self, name)) == diagnoses for name in _OPTIONAL_ARRAYS),
             "channels": set(MEASURED) <= set(conditions.channels) <= set(CHANNELS)
             and self.codes.shape[1] == self.clipped.shape[1] == len(CHANNELS),
-            "sample times": all(_NEAR < each < _FAR for each in (conditions.sample_period_s, conditions.time_scale))
-            and all(0.0 <= each < _FAR for each in (conditions.real_time, conditions.line_s)),
+            "sample times": all(
+                _LEAST_MAGNITUDE < each < _MOST_MAGNITUDE
+                for each in (conditions.sample_period_s, conditions.time_scale)
+            )
+            and all(0.0 <= each < _MOST_MAGNITUDE for each in (conditions.real_time, conditions.line_s)),
             "number of samples": n <= conditions.samples_asked <= MAX_SAMPLES,
             "seed": 0 <= conditions.seed < 2**63,
             "units": all(
-                _NEAR < channel.lsb_v < _FAR
-                and _NEAR < abs(channel.unit_per_v) < _FAR
-                and abs(channel.low_v) < _FAR
-                and 0.0 <= channel.noise_lsb < _FAR
+                _LEAST_MAGNITUDE < channel.lsb_v < _MOST_MAGNITUDE
+                and _LEAST_MAGNITUDE < abs(channel.unit_per_v) < _MOST_MAGNITUDE
+                and abs(channel.low_v) < _MOST_MAGNITUDE
+                and 0.0 <= channel.noise_lsb < _MOST_MAGNITUDE
                 and 1 <= channel.codes <= MAX_CODES
                 for channel in conditions.channels.values()
             ),
             "ramps": all(0 <= segment.ramp_n <= max(n, conditions.samples_asked) for segment in conditions.segments),
-            "records": _ascend(conditions.records) and 1 <= len(conditions.records) <= MAX_CHANGES,
+            "records": _start_at_zero_and_rise(conditions.records) and 1 <= len(conditions.records) <= MAX_CHANGES,
             "segments": len(starts) <= MAX_CHANGES + 1
-            and all(_ascend(starts) for starts in (earliest, starts, latest))
+            and all(_start_at_zero_and_rise(starts) for starts in (earliest, starts, latest))
             and all(low <= start <= high for low, start, high in zip(earliest, starts, latest, strict=True)),
-            "alarms": _is_rising(self.alarm_index, n),
-            "diagnoses": _is_rising(self.diagnosis_index, n)
+            "alarms": _are_sample_indices(self.alarm_index, n),
+            "diagnoses": _are_sample_indices(self.diagnosis_index, n)
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
@@ -394,7 +412,7 @@ class Run:
 
 
 def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
-    """Write in the npy format, in parts: np.savez would copy 16 MB at a time."""
+    """Write an array in the npy format, in chunks: np.savez would copy 16 MB at a time."""
     described = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
     np.lib.format.write_array_header_1_0(file, described)
     rows = np.atleast_1d(array)
@@ -402,10 +420,10 @@ def _write_array(file: IO[bytes], array: NDArray[Any]) -> None:
         file.write(rows[first : first + CHUNK_SAMPLES].tobytes())
 
 
-def _finite(number: str) -> float:
-    """A number of the header, which goes to other programs as JSON again.
+def _parse_finite(number: str) -> float:
+    """Value of a number in the header.
 
-    :raises ValueError: it is none that JSON has.
+    :raises ValueError: the number is non-finite, which JSON cannot express.
     """
     value = float(number)
     if not math.isfinite(value):
@@ -413,18 +431,21 @@ def _finite(number: str) -> float:
     return value
 
 
-def _is_rising(indices: NDArray[np.int64], n: int) -> bool:
-    """True if all are samples of a run, in their order."""
+def _are_sample_indices(indices: NDArray[np.int64], n: int) -> bool:
+    """True if all ``indices`` are in 0 .. n - 1, in ascending order."""
     return not len(indices) or bool(indices[0] >= 0 and indices[-1] < n and (np.diff(indices) >= 0).all())
 
 
-def _ascend(starts: Sequence[int]) -> bool:
-    """From 0."""
+def _start_at_zero_and_rise(starts: Sequence[int]) -> bool:
+    """True if ``starts`` is empty, or begins with 0 and ascends strictly."""
     return not starts or (starts[0] == 0 and list(starts) == sorted(set(starts)))
 
 
 def _check_archive(raw: BinaryIO) -> None:
-    """Refuses what would be far larger in memory than on disk: a recording is not compressed."""
+    """Check the archive's checksums, and reject compressed members, which could exhaust the memory.
+
+    :raises ValueError: a member is compressed or damaged.
+    """
     with zipfile.ZipFile(raw) as archive:
         if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
             raise ValueError("compressed")
@@ -434,14 +455,16 @@ def _check_archive(raw: BinaryIO) -> None:
     raw.seek(0)
 
 
-def _checked(name: str, array: NDArray[Any]) -> NDArray[Any]:
-    dtype, dimensions = (_ARRAYS | _LATER_ARRAYS)[name]
+def _check_array(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    """Return ``array`` if its type and dimensions are those of ``name``; else raise ValueError."""
+    dtype, dimensions = (_ARRAYS | _OPTIONAL_ARRAYS)[name]
     if array.dtype != np.dtype(dtype) or array.ndim != dimensions:
         raise ValueError(f"array {name} is {array.dtype} with {array.ndim} dimensions")
     return array
 
 
 def _to_json(conditions: Conditions) -> dict[str, Any]:
+    """Header of the file in plain JSON types."""
     out = dict(vars(conditions))
     if (identity := out.pop("identity")) is not None:
         out["identity"] = identity.as_table()
@@ -453,8 +476,11 @@ def _to_json(conditions: Conditions) -> dict[str, Any]:
     return out
 
 
-def _conditions(header: Any, path: Path) -> Conditions:
-    """:raises RecordingError: the header is not one, or of another format."""
+def _parse_conditions(header: Any, path: Path) -> Conditions:
+    """Conditions from the header of a file.
+
+    :raises RecordingError: ``header`` is malformed, or of another format.
+    """
     if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != FORMAT_VERSION:
         raise RecordingError(f"{path}: not of the format {FORMAT} {FORMAT_VERSION}")
     table = header.get("conditions")

@@ -1,4 +1,4 @@
-"""A scenario: what is played to the plant, and when its pots are tweaked. The device never sees the tweaks."""
+"""Scenario: excitation, plant, pot changes and expectations of one play. The device never receives the pot changes."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from analogrig_emulator import PROGRAMS, Excitation
 MAX_RAMP_N = 100_000
 
 DEFAULT_SEED = 1995
-"""When neither the user nor the scenario says another."""
+"""Random seed if neither the user nor the scenario sets one."""
 
 _MASS_DAMPER_SPRING = ("front", "shock")
-"""The programs that are one, which is what the harness's plant, its bounds and its estimates describe."""
+"""Programs that ``Plant`` describes. Bounds and estimates of others have no meaning."""
 
 PLANTS = {name: Plant(*list(program.values.values())[:3]) for name, program in PROGRAMS.items()}
-"""The parameters with which each program of the computer starts."""
+"""Initial parameters of each program of the computer."""
 
 MOST_SEED = 2**63
 
 Limit = bool | int | float | str
-"""Of a statement."""
+"""Value of a limit of a statement."""
 
 MISSING = "clipped and missing for the device"
-"""What the samples are that count as missing."""
+"""Predicate for missing samples, for messages."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +52,20 @@ class PlantChoice:
     def __post_init__(self) -> None:
         _check_parameters(self)
 
-    def given(self) -> dict[str, float]:
-        """The parameters that do not stand where the set has them, under their names in Plant."""
-        return _given(self)
+    def overrides(self) -> dict[str, float]:
+        """Parameters that differ from the program's, by their names in Plant."""
+        return _overrides(self)
 
     def plant(self) -> Plant:
-        return _changed(PLANTS[self.set], self)
+        """Plant with the program's parameters and the overrides."""
+        return _apply_overrides(PLANTS[self.set], self)
 
 
 @dataclass(frozen=True)
 class Tweak:
     """Change of pots at the instant of a sample: mass in kg, damping in N s/m, stiffness in N/m; None: unchanged.
 
-    The next sample is the first that shows it. With ``ramp_n`` the pots turn evenly from that instant on, and arrive
+    The next sample is the first one affected. With ``ramp_n`` the pots turn linearly from that instant and arrive
     ``ramp_n`` samples later. ValueError: nothing changes, or a value is out of range.
     """
 
@@ -80,12 +81,12 @@ class Tweak:
             raise ValueError(f"sample must be at least 1, not {self.sample}")
         if not 0 <= self.ramp_n <= MAX_RAMP_N:
             raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
-        if not _given(self):
+        if not _overrides(self):
             raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
 
-    def given(self) -> dict[str, float]:
-        """The parameters it sets, under their names in Plant."""
-        return _given(self)
+    def overrides(self) -> dict[str, float]:
+        """Changed parameters, by their names in Plant."""
+        return _overrides(self)
 
 
 @dataclass(frozen=True)
@@ -93,17 +94,17 @@ class Expectations:
     """Requirements of a scenario on the device; its ``[expect]`` table. ValueError: a value is out of range."""
 
     missed: int = 0
-    """Changes that could be seen (the bound was reached) and raised no alarm: at most so many."""
+    """Largest number of detectable changes (the bound was reached) without an alarm."""
     false_alarms: int = 0
-    """At most so many in the whole run."""
+    """Largest number of false alarms in the run."""
     arl0: float = 1e5
-    """Mean samples between false alarms that the bound assumes when the device's trigger has none of its own."""
+    """Mean samples between false alarms that the bound assumes if the device's trigger has no ceiling of its own."""
     late_information_ratio: float = 4.0
-    """An alarm is late when by then I(n) had reached this many times ln ARL0 ..."""
+    """Information at the deadline, as a multiple of ln ARL0; see ``late_slack_n``."""
     late_slack_n: int = 15
-    """... so many samples ago."""
+    """Samples from reaching that information to the deadline. A later alarm is late."""
     max_missing_fraction: float = 0.25
-    """A run in which the device could use fewer samples than this leaves is INCONCLUSIVE."""
+    """Largest share of missing samples in a valid run; a run with more is INCONCLUSIVE."""
 
     def __post_init__(self) -> None:
         if not self.arl0 > 1.0:
@@ -116,8 +117,8 @@ class Expectations:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative")
 
-    def gaps(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
-        """Why a run of which so many samples were missing is not valid; empty if it is."""
+    def excess_missing(self, samples: int, missing: int, words: str = MISSING) -> list[str]:
+        """Reason that a run with so many missing samples is not valid, in a list; empty if it is valid."""
         if missing <= self.max_missing_fraction * samples:
             return []
         allowed = f"more than the {self.max_missing_fraction:.0%} that the scenario allows"
@@ -127,15 +128,15 @@ class Expectations:
 
 @dataclass(frozen=True)
 class Statement:
-    """The ``[statement]`` table of a scenario: what a test asserted of it, and did not find."""
+    """Assertion of a test that the scenario violated; its ``[statement]`` table."""
 
     name: str
     limits: Mapping[str, Limit] = field(default_factory=dict)
-    """By which it judged."""
+    """Limits of the assertion, by name."""
     tries: int = 1
-    """Seeds, one after the other, with one of which it must hold; an experiment has its own."""
+    """Number of consecutive seeds, with one of which the assertion must hold; an experiment has its own."""
     test: str = ""
-    """That asserted it; for people."""
+    """Name of the test, for information."""
 
     def __post_init__(self) -> None:
         if self.tries < 1:
@@ -158,13 +159,13 @@ class Scenario:
     random_phase: bool = False
     """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
     seed: int | None = None
-    """Of all that is random, unless the user says another."""
+    """Default random seed; None: DEFAULT_SEED."""
     rig: str = ""
-    """The rig that plays it, unless the user says another; a .toml file is meant from the scenario's own folder."""
+    """Default rig: a name, or a .toml file relative to the scenario's folder."""
     dut: str = ""
-    """The device that it is for, likewise."""
+    """Default device, likewise."""
     statement: Statement | None = None
-    """What a test asserted of it, and did not find; None: what is expected is what counts."""
+    """Violated assertion that replays of a counterexample check; None: ``expect`` is checked."""
     description: str = ""
     name: str = ""
 
@@ -190,7 +191,7 @@ class Scenario:
 
     @classmethod
     def load(cls, name: str) -> Scenario:
-        """A shipped scenario by name, or a user's .toml file.
+        """Load a shipped scenario by name, or a user's .toml file.
 
         :raises ConfigurationError: absent, not TOML, or not a scenario; names the file and the key.
         """
@@ -201,62 +202,65 @@ class Scenario:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str, default_name: str = "") -> Scenario:
-        """From TOML values; ``where``, the file that holds them, leads every error."""
+        """Build a scenario from TOML values; ``where``, the name of their file, leads every error.
+
+        :raises ConfigurationError: not a scenario; names the key.
+        """
         scenario = config.build(cls, {"name": default_name, **table}, where)
         return dataclasses.replace(scenario, dut=FiledName(scenario.dut, where)) if scenario.dut else scenario
 
     def as_table(self) -> dict[str, Any]:
-        """The same as plain values, so that ``from_table`` gives an equal scenario again."""
-        return _plain(dataclasses.asdict(self))
+        """Plain TOML values, from which ``from_table`` builds an equal scenario."""
+        return _toml_table(dataclasses.asdict(self))
 
-    def excitation_drawn(self, rng: np.random.Generator) -> Excitation:
-        """The excitation of one run: its phase drawn if the scenario asks for it."""
+    def draw_excitation(self, rng: np.random.Generator) -> Excitation:
+        """Excitation of one run, with a random phase if ``random_phase`` is set."""
         if not self.random_phase:
             return self.excitation
         return dataclasses.replace(self.excitation, phase=float(rng.uniform()))
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """Why runs of it are not judged; none for the programs of a mass, a damper and a spring."""
+        """Reasons that runs are not judged; empty for the programs of a mass, a damper and a spring."""
         program = self.plant.set
         if program in _MASS_DAMPER_SPRING:
             return ()
-        return (f"the program {program} is not one mass, damper and spring, of which bounds and estimates speak",)
+        return (f"the program {program} is not a single mass, damper and spring, as bounds and estimates require",)
 
     def segments(self) -> tuple[Segment, ...]:
-        """The truth: the plant from the start and after each tweak; with two masses, the sprung one's."""
+        """True plant from the start and after each change; with two masses, that of the sprung mass."""
         out = [Segment(0, self.plant.plant())]
         for tweak in self.tweaks:
-            changed = _changed(out[-1].plant, tweak)
+            changed = _apply_overrides(out[-1].plant, tweak)
             if changed == out[-1].plant:
                 continue  # a pot set to where it stood changes nothing, and nothing can be detected
             out.append(Segment(tweak.sample, changed, tweak.ramp_n))
         return tuple(out)
 
 
-def _given(change: PlantChoice | Tweak) -> dict[str, float]:
+def _overrides(change: PlantChoice | Tweak) -> dict[str, float]:
     values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _changed(plant: Plant, change: PlantChoice | Tweak) -> Plant:
-    return dataclasses.replace(plant, **_given(change))
+def _apply_overrides(plant: Plant, change: PlantChoice | Tweak) -> Plant:
+    return dataclasses.replace(plant, **_overrides(change))
 
 
 def _check_parameters(change: PlantChoice | Tweak) -> None:
-    for name, value in _given(change).items():
+    for name, value in _overrides(change).items():
         if not LEAST_PARAMETER < value < MOST_PARAMETER:
             limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
             limit = limit if value > 0.0 else "more than 0"
             raise ValueError(f"{name} must be {limit}, not {value:g}")
 
 
-def _plain(table: Mapping[str, Any]) -> dict[str, Any]:
-    """As TOML has it: arrays are lists, and what is not given is not there."""
-    return {key: _plain_value(value) for key, value in table.items() if value is not None}
+def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain TOML values of ``table``: tuples become lists, None values are left out."""
+    return {key: _toml_value(value) for key, value in table.items() if value is not None}
 
 
-def _plain_value(value: Any) -> Any:
+def _toml_value(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return _plain(value)
-    return [_plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+        return _toml_table(value)
+    return [_toml_value(item) for item in value] if isinstance(value, list | tuple) else value

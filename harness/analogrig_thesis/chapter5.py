@@ -293,7 +293,7 @@ def _identify_on_card(rig: str, plant: Plant, seed: int) -> Arx:
 def _identify_with_early_edge() -> Arx:
     """Batch estimate if both channels are sampled at once and each edge of the force comes 10 us before."""
     u, y, state = (square(FIRST_N, 1470.0, 200) + 1470.0), np.empty(FIRST_N), AT_REST
-    before, after = (SampledPlant.of(INFERRED, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
+    before, after = (SampledPlant.from_plant(INFERRED, part * PERIOD_S) for part in (1.0 - EARLY, EARLY))
     for k in range(FIRST_N):
         state = after.next(before.next(state, float(u[k - 1]) if k else 0.0), float(u[k]))
         y[k] = state[0]

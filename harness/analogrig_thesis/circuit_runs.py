@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from analogrig.bench import Bench, uninterrupted
+from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.devices.dut import connect
 from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.host import HostDevice
@@ -174,7 +174,7 @@ def circuit_schemes(m_per_unit: float) -> dict[str, EstimatorConfig]:
 def _play(rig_name: str, scenario: Scenario, config: EstimatorConfig) -> Run:
     device = HostDevice(name="host", exchange="block", estimator=config, timeout_s=TIMEOUT_S)
     with open_rig(rig_name) as rig, connect(device) as dut:
-        return uninterrupted(Bench(rig, dut).play(scenario, SEED))
+        return raise_if_interrupted(Bench(rig, dut).play(scenario, SEED))
 
 
 def _play_all(rig_name: str) -> TrackedRun:

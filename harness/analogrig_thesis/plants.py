@@ -50,7 +50,7 @@ class Arx:
         Trace and determinant of the transition matrix are -a1 and a2; b follows from the first two values of the step
         response.
         """
-        sampled = SampledPlant.of(plant, PERIOD_S)
+        sampled = SampledPlant.from_plant(plant, PERIOD_S)
         xx, xv, vx, vv = sampled.transition
         first = sampled.next(AT_REST, 1.0)
         second = sampled.next(first, 1.0)
@@ -114,7 +114,7 @@ def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: flo
     """Displacement (n,) of a plant whose parameters jump; position and velocity are continuous."""
     y, state = np.empty(len(u)), AT_REST
     for segment, (start, end) in zip(segments, stretches(segments, len(u)), strict=True):
-        sampled = SampledPlant.of(segment.plant, period_s)
+        sampled = SampledPlant.from_plant(segment.plant, period_s)
         for k in range(start, end):
             y[k] = state[0]
             state = sampled.next(state, float(u[k]))

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.reporting.page import SCRIPTS, STYLES, assembled
-from analogrig.reporting.payload import as_script, deflated
+from analogrig.reporting.page import SCRIPTS, STYLES, assemble_page
+from analogrig.reporting.payload import as_script, deflate
 from analogrig_thesis.document import Chapter, Claim, Figure, Number, ReproducedChapter, Verdict
 from analogrig_thesis.scheme_comparison import ComparedData, SchemeComparison, SeedSummary
 from analogrig_thesis.schemes import NAMES
@@ -44,7 +44,7 @@ def render(chapters: Sequence[ReproducedChapter], comparison: SchemeComparison) 
     """
     texts = [chapter.text for chapter in chapters]
     order = {figure.number: i for i, figure in enumerate(figure for text in texts for figure in text.figures)}
-    return assembled(
+    return assemble_page(
         _FOLDER / "page.html",
         (*STYLES, _FOLDER / "page.css"),
         (*SCRIPTS, _FOLDER / "page.js"),
@@ -77,7 +77,7 @@ def _payload(chapters: Sequence[ReproducedChapter]) -> dict[str, Any]:
         return {"number": each.number, "marks": [vars(mark) for mark in drawing.marks], "panels": panels}
 
     described = [figure(chapter, each) for chapter in chapters for each in chapter.text.figures]
-    return {"figures": described, "lengths": [len(each) for each in columns], "deflated": deflated(columns)}
+    return {"figures": described, "lengths": [len(each) for each in columns], "deflated": deflate(columns)}
 
 
 def _summary(claims: Sequence[Claim]) -> str:

@@ -109,7 +109,7 @@ def test_information_is_that_of_the_two_plants_from_one_state() -> None:
     played = simulate((FRONT, FRONT.scaled("M", 1.2)), np.array([onset]), excitation, samples, seed=5)
     first = excitation.first_edges(np.random.default_rng(5), 1)[0]
     force = [2940.0 * ((k - first) // 60.0 % 2.0 == 0.0) * (k >= first) for k in range(samples)]
-    before, after = (SampledPlant.of(Plant(mass, 3021.0, 24500.0), 0.01) for mass in (115.0, 138.0))
+    before, after = (SampledPlant.from_plant(Plant(mass, 3021.0, 24500.0), 0.01) for mass in (115.0, 138.0))
     state = (0.0, 0.0)
     for k in range(onset):
         state = before.next(state, force[k])

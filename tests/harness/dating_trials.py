@@ -132,11 +132,11 @@ class Trial:
         courses_m = self._courses(first, samples)
         true_m = courses_m[samples == self.sample]
         gathered = ((courses_m - true_m) ** 2).sum(axis=1) / (2.0 * self.signals.noise_m**2)
-        return int((gathered < information.LN_CERTAIN).sum())
+        return int((gathered < information.ISOLATION_INFORMATION).sum())
 
     def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
         """(m, 800) displacement in metres from sample ``first`` on, for a change at each of ``samples`` (m,)."""
-        before, after = (SampledPlant.of(plant, self.signals.period_s) for plant in (FRONT, self.after))
+        before, after = (SampledPlant.from_plant(plant, self.signals.period_s) for plant in (FRONT, self.after))
         x, v = np.zeros(len(samples)), np.zeros(len(samples))
         out = []
         for k, force in enumerate(self.signals.force_n[first : first + 800].tolist(), start=first):

@@ -1,4 +1,4 @@
-"""Runs of any length, made without a rig and a device."""
+"""Synthetic runs of any length, without rig and device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run made by hand with everything a report shows, and a reader of the page that knows nothing of how it is made."""
+"""Synthetic run with every feature of a report, and an independent reader of the page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAID = DiagnosisVerdict("K", right=True, delay_n=17, bound_n=9, onset_error_n=-1
 
 
 def reported_run() -> Run:
-    """Two changes: one noticed at ``NOTICED``, one missed; a false alarm; displacement clipped over ``CLIPPED``."""
+    """Run with two changes (one detected at ``NOTICED``, one missed), a false alarm, and clipping over ``CLIPPED``."""
     force_n = np.where(np.arange(SAMPLES) // 50 % 2, 2900.0, 30.0)
     clipped = np.zeros(SAMPLES, bool)
     clipped[CLIPPED] = True
@@ -49,7 +49,7 @@ def reported_run() -> Run:
 
 
 def reported_verdict(run: Run) -> Verdict:
-    """What there is to say about ``reported_run``, written by hand."""
+    """Verdict on ``reported_run``, written by hand."""
     return Verdict(
         outcome="failed",
         reasons=("missed 1 of 2 changes",),
@@ -76,13 +76,13 @@ def reported_verdict(run: Run) -> Verdict:
 
 
 def empty_run() -> Run:
-    """A run that ended before its first sample."""
+    """Run that ended before its first sample."""
     return made_run(np.zeros(0), PLANTS[:1], samples_asked=100, faults=("the line is dead",))
 
 
 @dataclass
 class Page(HTMLParser):
-    """The elements of a page, and the text outside of scripts and styles."""
+    """Elements of a page, and the text outside of scripts and styles."""
 
     source: str
     elements: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
@@ -123,18 +123,18 @@ class Page(HTMLParser):
         return next(row for row in self.rows if row[0] == name)
 
     def value(self, name: str) -> str:
-        """What stands beside ``name`` in a table of two columns."""
+        """Cell beside ``name`` in a table of two columns."""
         (row,) = [row for row in self.rows if len(row) == 2 and row[0] == name]
         return row[1]
 
     def data(self) -> dict[str, Any]:
-        """What the plots are drawn from."""
+        """Data of the plots."""
         (text,) = [raw for raw in self.raw["script"] if raw.startswith("{")]
         data: dict[str, Any] = json.loads(text)
         return data
 
     def columns(self) -> dict[str, NDArray[np.float64]]:
-        """The signals as a browser is to show them: (n,) each."""
+        """Signals as a browser must show them, (n,) each."""
         data = self.data()
         raw = zlib.decompress(base64.b64decode(data["deflated"]))
         out = {}

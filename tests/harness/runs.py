@@ -1,4 +1,4 @@
-"""Runs made by hand, for tests of what reads them."""
+"""Synthetic runs for tests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def made_run(
     theta: NDArray[np.floating] | None = None,
     estimator: Mapping[str, object] | None = None,
 ) -> Run:
-    """A run of the given force; ``clipped`` is the displacement's. Without ``theta`` all estimates are zero.
+    """Run of the given force; ``clipped`` applies to the displacement. Without ``theta`` all estimates are zero.
 
     :param diagnoses: of each the sample after which it was said, what, the onset and the extent.
     """
@@ -79,5 +79,5 @@ def made_run(
 
 
 def with_fault(run: Run, fault: str) -> Run:
-    """The same run, marked as not valid for this reason."""
+    """The same run with a fault, which makes it invalid."""
     return dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, faults=(fault,)))

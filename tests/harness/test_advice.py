@@ -1,4 +1,4 @@
-"""Advice: each sentence comes when it should, and none when all is well."""
+"""Advice: each sentence appears under its condition, and none on a sound run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def excited(**excitation: Any) -> Run:
     return dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, scenario=scenario))
 
 
-def test_run_in_which_all_is_well_needs_none() -> None:
+def test_sound_run_has_no_advice() -> None:
     assert advised(made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[404], theta=GOOD_THETA)) == ""
 
 
@@ -52,27 +52,29 @@ def test_more_noise_than_the_device_is_set_for_is_named() -> None:
     ],
     ids=str,
 )
-def test_edges_that_come_anywhere_are_named(excitation: dict[str, Any], told: bool) -> None:  # noqa: FBT001
+def test_edges_off_the_sample_grid_are_named(excitation: dict[str, Any], told: bool) -> None:  # noqa: FBT001
     assert ("whole number of samples apart" in advised(excited(**excitation))) == told
 
 
 def test_many_false_alarms_devalue_latencies() -> None:
     run = made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[10, 20, 30, 404], theta=GOOD_THETA)
-    assert "may be chance" in advised(run)
+    assert "may be coincidence" in advised(run)
 
 
-def test_change_that_could_not_be_seen_is_named() -> None:
-    assert "K at 400 could not be seen" in advised(made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA))
+def test_undetectable_change_is_named() -> None:
+    assert "K at 400 is not judged: not detectable" in advised(
+        made_run(np.zeros(800), [(0, FRONT), (400, SOFT)], theta=GOOD_THETA)
+    )
 
 
-def test_estimate_that_is_no_suspension_is_named() -> None:
+def test_implausible_estimate_is_named() -> None:
     assert "samples 0-799 describes no mass" in advised(made_run(LOADED, [(0, FRONT)]))
 
 
 @pytest.mark.parametrize(("frequency_hz", "told"), [(20.0, True), (200.0, False)])
-def test_warm_up_that_ends_before_the_second_edge_is_told(frequency_hz: float, told: bool) -> None:  # noqa: FBT001
+def test_warm_up_that_ends_before_the_second_edge_is_named(frequency_hz: float, told: bool) -> None:  # noqa: FBT001
     run = excited(clock="card", frequency_hz=frequency_hz)
     estimator = {**run.conditions.dut["estimator"], "warm_up_n": 150}
     dut = {**run.conditions.dut, "estimator": estimator}
     run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, dut=dut))
-    assert ("warm-up of 150 samples ends before 2 edges" in advised(run)) == told
+    assert ("warm-up of 150 samples ends before edge 2" in advised(run)) == told

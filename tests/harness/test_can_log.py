@@ -1,4 +1,4 @@
-"""CAN logs: in the tools that their users have, judged and replayed, damaged and strange."""
+"""CAN logs: read by other tools, imported, judged and replayed, damaged and foreign."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from analogrig.devices.dut import open_dut
 from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.judging.verdict import judge
-from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, captured_run, retold
+from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, import_run, replace_scenario
 from analogrig.reporting.summary import summary
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
@@ -55,7 +55,7 @@ def played(*listeners: Callable[[can.Message], object], device: str = DEVICE, **
 
 @pytest.fixture(scope="module")
 def traffic() -> tuple[Run, list[can.Message]]:
-    """A run, and its frames."""
+    """Run, and its frames."""
     frames: list[can.Message] = []
     return played(frames.append), frames
 
@@ -71,7 +71,7 @@ def written(path: Path, frames: Iterable[can.Message]) -> Path:
 
 def captured(path: Path, **how: Any) -> Run:
     with open_rig("emulator") as rig:
-        return captured_run(path, SCENARIO, rig, **how)
+        return import_run(path, SCENARIO, rig, **how)
 
 
 def identifier(name: str) -> int:
@@ -79,12 +79,12 @@ def identifier(name: str) -> int:
 
 
 def nth(frames: Sequence[can.Message], name: str, n: int) -> int:
-    """Where the n-th frame of that name is."""
+    """Position of the n-th frame of that name."""
     return [i for i, frame in enumerate(frames) if frame.arbitration_id == identifier(name)][n]
 
 
 def contradicting(frame: can.Message, *, later: int = 0) -> can.Message:
-    """It says something else of the same thing, with a sequence number that is so much later."""
+    """Copy of ``frame`` with another value, and a sequence number larger by ``later``."""
     other = copy.copy(frame)
     seq, *between, changed, last = frame.data
     other.data = bytearray(((seq + later) % 256, *between, changed ^ 1, last))
@@ -140,7 +140,7 @@ def test_asammdf_decodes_a_measurement_with_our_dbc(tmp_path: Path, traffic: tup
 
 
 def test_asammdf_is_not_imported_before_a_measurement_is_written(tmp_path: Path) -> None:
-    """Its pandas takes longer than a run."""
+    """Importing pandas takes longer than a run."""
     pytest.importorskip("asammdf", reason="asammdf is absent: pip install analogrig[mf4]")
     told = """
 import sys
@@ -195,14 +195,16 @@ def test_log_of_another_exchange_holds_the_same_run(tmp_path: Path, device: str,
     np.testing.assert_array_equal(again.flags, run.flags)
 
 
-def test_estimator_is_as_the_device_said_it_was(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+def test_estimator_settings_come_from_the_captured_messages(
+    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
+) -> None:
     run, frames = traffic
     said = captured(written(tmp_path / "can.log", frames)).conditions.dut["estimator"]
     assert singled(said) == singled(run.conditions.dut["estimator"])
 
 
 def singled(table: Mapping[str, Any]) -> dict[str, Any]:
-    """In single precision, as it travels."""
+    """Settings in single precision, as transmitted."""
     return {key: float(np.float32(value)) if isinstance(value, float) else value for key, value in table.items()}
 
 
@@ -212,7 +214,7 @@ def test_capture_without_the_handshake_has_a_note(tmp_path: Path, traffic: tuple
     assert "not in the log" not in summary(whole, judge(whole))
     later = captured(written(tmp_path / "can.log", frames[nth(frames, "Sample", 0) :]))
     n = len(list(EstimatorConfig().settings()))
-    said = f"note: {n} settings of the device are not in the log and were taken to be as by default"
+    said = f"note: {n} settings of the device are not in the log and were replaced by the default"
     assert said in summary(later, judge(later))
 
 
@@ -226,7 +228,7 @@ def test_settings_give_the_estimator_back() -> None:
         assert EstimatorConfig.from_settings(dict(estimator.settings()), "here") == estimator
 
 
-def test_setting_that_is_no_number_is_refused() -> None:
+def test_non_finite_setting_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="here: na = nan is no setting of an estimator"):
         EstimatorConfig.from_settings({Key.NA: float("nan")}, "here")
 
@@ -246,14 +248,12 @@ def test_setting_that_is_no_number_is_refused() -> None:
         (Key.C1, 1e38),
     ],
 )
-def test_setting_that_no_device_can_have_is_refused(key: Key, value: float) -> None:
+def test_setting_out_of_range_is_refused(key: Key, value: float) -> None:
     with pytest.raises(ConfigurationError, match=rf"^here: {key.name.lower()} = .* is no setting of an estimator$"):
         EstimatorConfig.from_settings({key: value}, "here")
 
 
-def test_parameters_for_which_the_device_has_no_room_are_refused(
-    tmp_path: Path, traffic: tuple[Run, list[can.Message]]
-) -> None:
+def test_more_parameters_than_theta_max_are_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     with pytest.raises(ConfigurationError, match="^here: 19 parameters, of at most 17$"):
         EstimatorConfig.from_settings({Key.NB: 16.0}, "here")
     frames = list(traffic[1])
@@ -269,7 +269,7 @@ def test_parameters_for_which_the_device_has_no_room_are_refused(
 def test_foreign_frames_and_times_of_others_change_nothing(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]]
 ) -> None:
-    """Other names of the channel, seconds since 1970, and a bus on which others talk."""
+    """Import a log with another channel name, absolute times and foreign frames."""
     run, frames = traffic
     rng = random.Random(3)  # noqa: S311
     lines = []
@@ -291,7 +291,7 @@ def test_foreign_frames_and_times_of_others_change_nothing(
 def test_log_with_identifiers_of_another_dbc_is_understood(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]]
 ) -> None:
-    """A bench that has the messages elsewhere, with 29 bits: by name they are the same."""
+    """Import a log whose DBC has the same messages under 29-bit identifiers."""
     run, frames = traffic
     text = DBC.read_text()
     for layout in LAYOUTS.values():
@@ -322,7 +322,7 @@ def test_log_with_identifiers_of_another_dbc_is_understood(
 def test_value_that_our_message_cannot_have_counts_as_dropped(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], force: int
 ) -> None:
-    """A bench whose codes have 32 bits and a sign."""
+    """Import a log whose DBC has signed 32-bit codes."""
     dbc = tmp_path / "bench.dbc"
     dbc.write_text(
         DBC.read_text()
@@ -359,7 +359,7 @@ def test_frame_that_was_not_captured_makes_the_run_inconclusive(
 
 
 @pytest.mark.parametrize("name", ["Configured", "Sample", "Estimate", "Stepped", "Alarm", "Status"])
-def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconclusive(
+def test_second_sender_makes_the_run_inconclusive(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
 ) -> None:
     frames = list(traffic[1])
@@ -369,11 +369,11 @@ def test_frame_of_somebody_else_with_the_number_of_the_next_makes_the_run_inconc
     assert judge(captured(twice)).outcome == "passed"
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]])))
     assert verdict.outcome == "inconclusive"
-    assert "have the same number: two speak as the " in verdict.reasons[0]
+    assert "have the same number: more than one " in verdict.reasons[0]
 
 
 @pytest.mark.parametrize("name", ["Sample", "Estimate", "Stepped"])
-def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
+def test_contradictory_messages_make_the_run_inconclusive(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
 ) -> None:
     frames = list(traffic[1])
@@ -381,13 +381,11 @@ def test_sample_of_which_two_things_are_said_is_no_loss_that_may_be_allowed(
     other = contradicting(frames[at], later=50)
     verdict = judge(captured(written(tmp_path / "can.log", [*frames[:at], other, *frames[at:]]), most_lost_n=5))
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons[0].endswith("twice, and not the same")
+    assert verdict.reasons[0].endswith((" with two values", " with different values", " with different codes"))
 
 
 @pytest.mark.parametrize("name", ["Estimate", "Stepped", "Alarm"])
-def test_number_that_is_none_counts_as_damaged(
-    tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str
-) -> None:
+def test_non_finite_number_counts_as_damaged(tmp_path: Path, traffic: tuple[Run, list[can.Message]], name: str) -> None:
     frames = list(traffic[1])
     at = nth(frames, name, 0)
     frames[at] = copy.copy(frames[at])
@@ -433,7 +431,7 @@ def test_capture_without_the_counters_of_the_device_is_inconclusive(
         assert reason.startswith("the device's counters updated, refused, alarms, samples_lost after the run are not")
 
 
-def test_damaged_lines_are_passed_over_and_counted(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+def test_damaged_lines_are_skipped_and_counted(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     run, frames = traffic
     log = written(tmp_path / "can.log", frames)
     lines = log.read_text().splitlines()
@@ -490,8 +488,8 @@ def outcome_or_error(path: Path) -> str:
         return str(error)
 
 
-def test_runs_without_samples_take_no_room(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
-    """A device that is started over and over, which a hostile log may say hundreds of thousands of times."""
+def test_runs_without_samples_take_no_memory(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+    """A hostile log may start the device hundreds of thousands of times."""
     log = written(tmp_path / "can.log", traffic[1][: nth(traffic[1], "Sample", 0)])
     with log.open("a") as file:
         for i in range(5000):
@@ -505,10 +503,10 @@ def test_runs_without_samples_take_no_room(tmp_path: Path, traffic: tuple[Run, l
     assert most_bytes < 5000 * 200
 
 
-def test_several_runs_in_a_log_are_told_apart(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
+def test_runs_of_a_log_are_selected_by_number(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     run, frames = traffic
     twice = written(tmp_path / "can.log", [*frames, *frames])
-    with pytest.raises(RecordingError, match=r"can\.log: holds 2 runs: say --run 1 to 2"):
+    with pytest.raises(RecordingError, match=r"can\.log: holds 2 runs: select one with --run 1 to 2"):
         captured(twice)
     for number in (1, 2):
         assert captured(twice, number=number).theta_hash() == run.theta_hash()
@@ -521,7 +519,7 @@ def test_device_of_another_catalogue_is_refused(tmp_path: Path, traffic: tuple[R
     at = nth(frames, "Hello", 0)
     hello = pack(Hello(0, 18, 0, 0x12345678))
     frames[at] = can.Message(arbitration_id=hello[0], data=hello[1:], is_extended_id=False)
-    with pytest.raises(RecordingError, match=r"can\.log: the device speaks catalogue 0x12345678, .* say --dbc"):
+    with pytest.raises(RecordingError, match=r"can\.log: the device uses catalogue 0x12345678, .* with --dbc"):
         captured(written(tmp_path / "can.log", frames))
 
 
@@ -559,7 +557,7 @@ def test_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, t
         ),
     ],
 )
-def test_dbc_that_does_not_serve_is_refused_in_one_line(
+def test_unsuitable_dbc_is_refused_in_one_line(
     tmp_path: Path, traffic: tuple[Run, list[can.Message]], text: str | None, said: str
 ) -> None:
     if text is not None:
@@ -574,14 +572,12 @@ def test_dbc_that_does_not_serve_is_refused_in_one_line(
 def test_scenario_with_fewer_samples_is_refused(tmp_path: Path, traffic: tuple[Run, list[can.Message]]) -> None:
     shorter = dataclasses.replace(SCENARIO, samples=599)
     with open_rig("emulator") as rig, pytest.raises(ConfigurationError, match="has 600 samples, scenario thesis 599"):
-        captured_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
+        import_run(written(tmp_path / "can.log", traffic[1]), shorter, rig)
     with pytest.raises(ConfigurationError, match="the recording has 600 samples"):
-        retold(traffic[0], shorter)
+        replace_scenario(traffic[0], shorter)
 
 
-def test_disk_that_is_full_is_told_when_the_log_is_closed(
-    traffic: tuple[Run, list[can.Message]], tmp_path: Path
-) -> None:
+def test_full_disk_is_reported_when_the_log_is_closed(traffic: tuple[Run, list[can.Message]], tmp_path: Path) -> None:
     log = CanLog(tmp_path / "gone" / "can.log")  # a folder that is not there
     log.begin()
     for frame in traffic[1][:10]:

@@ -49,7 +49,7 @@ def simulate(
         parts = [(place, force_n[k]), (1.0 - place, force_n[k + 1])]
         for part, force in parts:
             if part > 0.0:
-                state = SampledPlant.of(plant, part * PERIOD_S).next(state, float(force))
+                state = SampledPlant.from_plant(plant, part * PERIOD_S).next(state, float(force))
     noise = rng.normal(size=(2, samples))
     return Signals(
         N_PER_LSB * np.round(force_n[:-1] / N_PER_LSB + noise[0]),
@@ -303,7 +303,7 @@ def test_gentle_turn_of_a_hand_is_found_from_its_begin_to_its_end() -> None:
     """Least jerk, as of a hand: 0.9 % of the path after a tenth of the time."""
     times = (np.arange(300) + 0.5) / 300.0
     done = times**3 * (10.0 - 15.0 * times + 6.0 * times**2)
-    way = [(600 + k, FRONT.on_the_way(SOFT, part)) for k, part in enumerate(done.tolist())]
+    way = [(600 + k, FRONT.interpolate(SOFT, part)) for k, part in enumerate(done.tolist())]
     signals = simulate_path([(0, FRONT), *way, (900, SOFT)], 1600)
     out = date_turn(signals, FRONT, SOFT, range(450, 1050))
     assert isinstance(out, TurnInstants), out
@@ -340,11 +340,11 @@ def simulate_path(plants: Sequence[tuple[int, Plant]], samples: int) -> Signals:
     starts = dict(plants)
     signals = simulate([(0, FRONT)], samples, seed=23)
     level_n = np.where(signals.force_n > 1500.0, 2910.0, 30.0)
-    state, out, plant = (0.0, 0.0), np.empty(samples), SampledPlant.of(FRONT, PERIOD_S)
+    state, out, plant = (0.0, 0.0), np.empty(samples), SampledPlant.from_plant(FRONT, PERIOD_S)
     for k in range(samples):
         out[k] = state[0]
         if k in starts:
-            plant = SampledPlant.of(starts[k], PERIOD_S)
+            plant = SampledPlant.from_plant(starts[k], PERIOD_S)
         state = plant.next(state, float(level_n[k]))
     noise = np.random.default_rng(24).normal(size=samples)
     return dataclasses.replace(signals, displacement_m=M_PER_LSB * np.round(out / M_PER_LSB + noise))

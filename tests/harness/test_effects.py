@@ -1,4 +1,4 @@
-"""analogrig effects: text, JSON and a picture of the same table."""
+"""Command ``effects``: text, JSON and picture of the same figures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from analogrig.cli import main
 
 
-def test_text_json_and_picture_tell_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_json_and_picture_have_the_same_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = tmp_path / "effects.svg"
     assert main(["effects", "--set", "shock", "--json", "--out", str(picture)]) == 0
     rows = json.loads(capsys.readouterr().out)["sets"]["shock"]

@@ -46,7 +46,7 @@ def run_json(*arguments: str | Path, cwd: Path, status: int = 0) -> dict[str, An
 
 
 def refusal(*arguments: str | Path, cwd: Path, status: int = 2) -> str:
-    """What the command says when it refuses: one line, no traceback."""
+    """Error message of a refused command: one line, no traceback."""
     done = analogrig(*arguments, cwd=cwd)
     assert done.returncode == status, done.stdout + done.stderr
     (line,) = done.stderr.splitlines()

@@ -1,4 +1,4 @@
-"""Exposure: the samples in which a false alarm could have come."""
+"""Exposure: samples in which the trigger was armed."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ SQUARE_N = np.where(np.arange(600) // 50 % 2, 2000.0, 200.0)
 
 
 def made(**changes: object) -> Run:
-    """600 samples with edges of the force every 50."""
+    """Run of 600 samples with an edge of the force every 50."""
     estimator = {**ESTIMATOR, "edge_codes": 64.0, **{key: value for key, value in changes.items() if key != "alarms"}}
     return made_run(SQUARE_N, [(0, FRONT)], estimator=estimator, alarms=changes.get("alarms", ()))  # type: ignore[arg-type]
 
 
-def test_before_the_first_edge_and_in_the_warm_up_no_alarm_can_come() -> None:
+def test_no_exposure_before_the_first_edge_and_in_the_warm_up() -> None:
     assert exposure(made()).armed == 550
     assert exposure(made(warm_up_n=150)).armed == 450
     assert exposure(made(warm_up_n=600)).armed == 0
-    assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).no_evidence
+    assert "its warm-up takes 600" in exposure(made(warm_up_n=600)).lack_of_evidence
 
 
-def test_after_an_alarm_none_can_come_while_it_is_held_off() -> None:
+def test_no_exposure_during_the_hold_off() -> None:
     assert exposure(made(hold_off_n=30, alarms=(300, 310, 590))).armed == 550 - 39 - 9
 
 
-def test_sample_with_an_alarm_was_armed_whatever_else_is_known() -> None:
+def test_sample_with_an_alarm_is_armed() -> None:
     assert exposure(made(warm_up_n=600, alarms=(20, 70))).armed == 2
     assert exposure(made(trigger="none")).armed == 0
 
@@ -63,16 +63,16 @@ def test_every_record_has_a_warm_up_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("idle_n", [0, 400])
-def test_force_that_never_moves_is_no_evidence_even_where_the_device_does_not_say_so(idle_n: int) -> None:
+def test_constant_force_gives_no_exposure_even_without_the_idle_flag(idle_n: int) -> None:
     estimator = {**ESTIMATOR, "edge_codes": 64.0, "idle_n": idle_n}
     run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
     found = exposure(run)
     assert (found.armed, found.unexcited) == (0, 600)
-    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.no_evidence
+    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.lack_of_evidence
     assert not rate_below(0.5, [Played(run)], confidence=0.9)
 
 
-def test_samples_that_the_device_calls_idle_are_not_exposed_within_this_process_either() -> None:
+def test_idle_samples_of_a_device_in_this_process_are_not_exposed() -> None:
     """Pulses 1400 samples apart, where the device calls it lost after 1000: what it says, sample by sample, is the
     reference for trials that have no messages."""
     healthy = Scenario.load("healthy")
@@ -106,18 +106,18 @@ def test_run_in_which_no_alarm_could_come_is_inconclusive(estimator: dict[str, o
 
 
 @pytest.mark.parametrize("lost", ["theta", "innovation", "statistic"])
-def test_estimate_that_is_no_number_is_no_evidence(lost: str) -> None:
+def test_non_finite_estimate_makes_the_run_inconclusive(lost: str) -> None:
     run = made()
     array = getattr(run, lost).copy()
     array[400:] = np.nan
     broken = dataclasses.replace(run, **{lost: array})
     assert exposure(broken).armed == exposure(run).armed - 200
-    assert judge(broken).reasons == ("in 200 of 600 samples what the device estimated was no number",)
+    assert judge(broken).reasons == ("the device reported non-finite estimates in 200 of 600 samples",)
     assert judge(broken).outcome == "inconclusive"
 
 
-def test_noise_of_the_card_is_no_edge_whatever_the_device_takes_for_one() -> None:
-    """2000 samples of a force that stands still but for noise of 1 LSB, to a device for which 1 code is an edge."""
+def test_noise_of_the_card_is_no_edge_even_with_tiny_edge_codes() -> None:
+    """Constant force with noise of 1 LSB; the device takes 1 code for an edge."""
     force_n = 1400.0 + np.random.default_rng(4).normal(0.0, 2940.0 / 4096, 2000)
     run = made_run(force_n, [(0, FRONT)], estimator={**ESTIMATOR, "edge_codes": 1.0, "idle_n": 1000})
     assert exposure(run).armed == 0

@@ -51,7 +51,7 @@ def test_as_many_lost_answers_as_there_are_sequence_numbers_are_noticed(first: i
     faults = WireFaults(tuple(WireFault("drop", "from", number) for number in range(first, first + 7 * 256)))
     played = play(Case(faults, "stream", samples=448))
     assert played.outcome == "inconclusive"
-    assert "the device took in 448 samples, where 224 were heard of" in played.why
+    assert "the device counted 448 updates, the harness received 224" in played.why
 
 
 def test_collision_on_the_last_message_of_a_run_is_noticed() -> None:

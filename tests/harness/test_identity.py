@@ -91,13 +91,13 @@ def test_judge_says_who_judged_and_who_recorded(tmp_path: Path, capsys: pytest.C
 
 def test_neither_hash_nor_verdict_depends_on_identity(recorded_thesis: Path) -> None:
     run = Run.load(recorded_thesis)
-    other = run.made_by(SOMEBODY)
+    other = run.with_identity(SOMEBODY)
     assert other.theta_hash() == run.theta_hash()
     assert judge(other) == judge(run)
 
 
 def test_identity_survives_the_file_and_is_escaped_on_the_page(recorded_thesis: Path, tmp_path: Path) -> None:
-    run = Run.load(recorded_thesis).made_by(SOMEBODY)
+    run = Run.load(recorded_thesis).with_identity(SOMEBODY)
     run.save(tmp_path / "run.npz")
     assert Run.load(tmp_path / "run.npz").conditions.identity == SOMEBODY
     page = render(run, judge(run))

@@ -23,15 +23,15 @@ SOFT = Plant(115.0, 3021.0, 18000.0)
 def test_sampled_plant_is_the_exact_zero_order_hold(plant: Plant) -> None:
     m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
     exact = expm(np.array([[0, 1, 0], [-k / m, -b / m, 1 / m], [0, 0, 0]]) * 0.01)
-    sampled = SampledPlant.of(plant, 0.01)
+    sampled = SampledPlant.from_plant(plant, 0.01)
     assert np.reshape(sampled.transition, (2, 2)) == pytest.approx(exact[:2, :2], rel=1e-12)
     assert np.array(sampled.response) == pytest.approx(exact[:2, 2], rel=1e-12)
     assert sampled.next(AT_REST, 100.0) == pytest.approx(tuple(100.0 * exact[:2, 2]), rel=1e-12)
 
 
 @pytest.mark.parametrize("plant", [FRONT, Plant(2.0, 900.0, 12250.0), Plant(30.0, 2123.0, 20000.0)], ids=str)
-def test_theta_of_the_exact_discretisation_reads_as_the_plant(plant: Plant) -> None:
-    """Thesis Equ 4.3, 4.8 as recomputed; scipy discretises, we read back."""
+def test_theta_of_the_exact_discretisation_gives_the_plant(plant: Plant) -> None:
+    """Discretise with scipy and convert back; thesis Equ 4.3, 4.8 as recomputed."""
     m, b, k = plant.mass_kg, plant.damping_n_s_per_m, plant.stiffness_n_per_m
     (numerator,), denominator, _ = cont2discrete(([1.0], [m, b, k]), 0.01, "zoh")
     n_per_code, m_per_code = 0.7, 5e-5
@@ -46,7 +46,7 @@ def test_theta_of_the_exact_discretisation_reads_as_the_plant(plant: Plant) -> N
     [[0.0] * 6, [-1.7, -0.1, 0.1, 0.1, 0.1, 0.0], [-1.75, 0.77, -0.1, -0.1, 0.0, 0.0], [np.nan] * 6],
     ids=["zero", "unstable", "negative gain", "nan"],
 )
-def test_theta_that_is_no_suspension_reads_as_nan(theta: list[float]) -> None:
+def test_implausible_theta_gives_nan(theta: list[float]) -> None:
     assert np.isnan(physical_parameters(np.array([theta], np.float32), {"na": 2, "nb": 3}, 1.0, 1e-4, 0.01)).all()
 
 
@@ -55,7 +55,7 @@ def test_information_of_a_stiffness_change_under_a_settled_load() -> None:
     second-order system (zeta = 1.05), (x0' - x0)(1 - exp(-s t)(cosh r t + s / r sinh r t))."""
     force_n, noise_lsb = 2940.0, 1.0
     run = made_run(force_n=np.full(600, force_n), plants=[(0, FRONT), (400, SOFT)], noise_lsb=noise_lsb)
-    (gathered,) = information.changes(run)
+    (gathered,) = information.change_information(run)
     lsb_m = run.conditions.channels["displacement"].lsb
     s = SOFT.damping_n_s_per_m / (2.0 * SOFT.mass_kg)
     r = math.sqrt(s * s - SOFT.stiffness_n_per_m / SOFT.mass_kg)
@@ -72,14 +72,14 @@ def test_clipped_samples_carry_no_information() -> None:
     force = np.full(600, 2940.0)
     whole = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)])
     holed = made_run(force_n=force, plants=[(0, FRONT), (400, SOFT)], clipped=clipped)
-    (all_of_it,), (rest,) = information.changes(whole), information.changes(holed)
+    (all_of_it,), (rest,) = information.change_information(whole), information.change_information(holed)
     assert (rest[:9] == 0.0).all()
     assert rest[20] == pytest.approx(all_of_it[20] - all_of_it[8])
 
 
-def test_change_of_an_unloaded_suspension_cannot_be_seen() -> None:
+def test_change_of_an_unloaded_suspension_is_not_detectable() -> None:
     run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
-    (gathered,) = information.changes(run)
+    (gathered,) = information.change_information(run)
     assert information.first_reaching(gathered, math.log(1e5)) is None
 
 
@@ -92,8 +92,8 @@ def test_first_reaching_counts_from_one() -> None:
 @pytest.mark.parametrize(
     "after", [SOFT, Plant(92.0, 3021.0, 24500.0), Plant(115.0, 2400.0, 24500.0), Plant(115.0, 2400.0, 20000.0)], ids=str
 )
-def test_isolation_bound_is_where_the_best_rival_falls_behind_by_ln_20(after: Plant) -> None:
-    """Against scipy: the plants by expm, the best magnitude of each rival by a search of its own."""
+def test_isolation_bound_is_the_sample_with_ln_20_against_the_best_rival(after: Plant) -> None:
+    """Compare with scipy: plants by expm, the best factor of each rival by a numerical search."""
     force = np.where(np.arange(700) // 50 % 2, 2900.0, 0.0)
     run = made_run(force_n=force, plants=[(0, FRONT), (420, after)])
     (bound_n,) = information.isolation_bounds(run)
@@ -129,6 +129,6 @@ def test_isolation_bound_is_where_the_best_rival_falls_behind_by_ln_20(after: Pl
     assert least(bound_n - 1) < math.log(20.0) * 1.02
 
 
-def test_change_of_an_unloaded_suspension_cannot_be_told_from_others() -> None:
+def test_change_of_an_unloaded_suspension_cannot_be_isolated() -> None:
     run = made_run(force_n=np.zeros(600), plants=[(0, FRONT), (400, SOFT)])
     assert information.isolation_bounds(run) == [None]

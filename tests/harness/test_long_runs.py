@@ -15,7 +15,7 @@ from analogrig.config import locate
 from analogrig.judging.verdict import judge
 from analogrig.plant import Plant
 from analogrig.reporting import render
-from analogrig.reporting.points import MOST_POINTS, Piece, condensed, pieces
+from analogrig.reporting.payload import MOST_POINTS, Piece, condense, pieces
 from analogrig.run import Run, Segment
 from tests.harness.long_runs import FIRM, long_run
 from tests.harness.reported import Page
@@ -178,12 +178,12 @@ def test_pieces_hold_every_sample_once_and_few_points(samples: int, seed: int) -
 
 def test_bucket_is_shown_by_its_least_and_greatest_finite_value() -> None:
     values = np.array([3.0, 1.0, np.nan, 7.0, np.inf, np.nan, np.nan, np.nan, 5.0, 4.0])
-    np.testing.assert_array_equal(condensed(values, 4), [1.0, 7.0, np.nan, np.nan, 4.0, 5.0])
+    np.testing.assert_array_equal(condense(values, 4), [1.0, 7.0, np.nan, np.nan, 4.0, 5.0])
 
 
 def test_points_of_a_piece_are_counted_as_they_are_made() -> None:
     for piece in (Piece(0, 10, 4), Piece(3, 11, 4), Piece(0, 7, 1)):
-        made = sum(len(condensed(np.zeros(part.stop - part.start), piece.size)) for part in piece.parts())
+        made = sum(len(condense(np.zeros(part.stop - part.start), piece.size)) for part in piece.parts())
         assert made == piece.points
 
 

@@ -164,27 +164,27 @@ def with_ramp(ramp_n: int) -> Run:
 
 def test_information_on_a_ramp_is_that_of_a_plant_that_changes_a_little_every_sample() -> None:
     """Against a staircase of jumps of a sixtieth each, whose plants this test makes by itself."""
-    (ramped_information,) = information.changes(with_ramp(60))
+    (ramped_information,) = information.change_information(with_ramp(60))
     period_s = 5e-5 * 200.0
     unchanged = changed = (0.0, 0.0)
     force_n = np.round(SQUARE_N / (2940.0 / 4096)) * (2940.0 / 4096)
-    before = SampledPlant.of(FRONT, period_s)
+    before = SampledPlant.from_plant(FRONT, period_s)
     for force in force_n[:410]:
         unchanged = before.next(unchanged, force)
     changed, total = unchanged, 0.0
     for k, force in enumerate(force_n[410:480]):
         stiffness = 24500.0 - 6500.0 * min((k + 0.5) / 60, 1.0)
-        now = SampledPlant.of(Plant(115.0, 3021.0, stiffness), period_s)
+        now = SampledPlant.from_plant(Plant(115.0, 3021.0, stiffness), period_s)
         unchanged, changed = before.next(unchanged, force), now.next(changed, force)
         total += ((changed[0] - unchanged[0]) / (0.1996 / 4096)) ** 2 / (2 * (1 + 1 / 12))
         assert ramped_information[k] == pytest.approx(total, rel=1e-9)
 
 
 def test_information_of_a_jump_is_that_of_a_ramp_of_no_length() -> None:
-    (jump,) = information.changes(made_run(SQUARE_N, [(0, FRONT), (410, SOFT)]))
-    (ramp,) = information.changes(with_ramp(0))
+    (jump,) = information.change_information(made_run(SQUARE_N, [(0, FRONT), (410, SOFT)]))
+    (ramp,) = information.change_information(with_ramp(0))
     assert np.array_equal(jump, ramp)
-    longer = information.changes(with_ramp(2000))[0]
+    longer = information.change_information(with_ramp(2000))[0]
     assert len(longer) == len(jump)
     assert (longer <= jump).all()
 
@@ -201,11 +201,11 @@ def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(
     with open_rig("emulator-ideal") as rig:
         volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
     state, plants = (0.0, 0.0), [FRONT] * 300
-    plants += [FRONT.on_the_way(after, (k + 0.5) / 60) for k in range(60)] + [after] * 340
+    plants += [FRONT.interpolate(after, (k + 0.5) / 60) for k in range(60)] + [after] * 340
     seen = []
     for plant, force_v in zip(plants, volts[:, 0], strict=True):
         seen.append(state[0] / 0.01996)
-        state = SampledPlant.of(plant, 0.01).next(state, force_v * 294.0)
+        state = SampledPlant.from_plant(plant, 0.01).next(state, force_v * 294.0)
     error_lsb = np.abs(np.array(seen) - volts[:, 1]) / (10.0 / 4096)
     assert error_lsb[:300].max() < 0.01
     assert error_lsb[300:].max() < limit_lsb

@@ -1,4 +1,4 @@
-"""Records that are not gap-free one after the other: the device begins each afresh, and the verdict knows it."""
+"""Runs of several records: the device restarts in each, and the verdict treats each as a run of its own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RECORD_N = 700
 
 
 class Recorder:
-    """Plays a scenario of the emulated computer once for each record, from rest every time."""
+    """Rig that plays the scenario on the emulated computer once for each record, from rest."""
 
     capabilities = frozenset({"tweak"})
 

@@ -91,18 +91,18 @@ def test_marks_are_those_of_the_run(read: Page) -> None:
 
 
 def test_change_is_listed_with_latency_bound_and_ratio(read: Page) -> None:
-    assert read.row("1200") == ["1200", "K 24500 → 18000 N/m", "3", "2", "1.50", "✓ noticed"]
+    assert read.row("1200") == ["1200", "K 24500 → 18000 N/m", "3", "2", "1.50", "✓ detected"]
 
 
 def test_missed_change_is_marked(read: Page) -> None:
     assert read.row("1500") == ["1500", "M 115 → 30 kg", "–", "4", "–", "✗ MISSED"]
 
 
-def test_change_that_nobody_could_see_is_not_marked_as_missed(run: Run) -> None:
+def test_undetectable_change_is_not_marked_as_missed(run: Run) -> None:
     verdict = reported_verdict(run)
     unseen = replace(verdict.tweaks[1], bound_n=None)
     read = Page(render(run, replace(verdict, tweaks=(unseen,))))
-    assert read.row("1500")[-1] == "could not be seen"
+    assert read.row("1500")[-1] == "not detectable"
     assert "MISSED" not in read.text
 
 
@@ -120,10 +120,10 @@ def test_diagnosis_is_listed_against_the_truth(run: Run, read: Page) -> None:
     assert ["1200", "K", "several", "–", "–", "17", "9", "-1", "✗ WRONG"] in again.rows
 
 
-def test_device_that_names_no_change_is_said_to(run: Run) -> None:
+def test_page_states_that_there_is_no_diagnosis(run: Run) -> None:
     silent = tuple(replace(tweak, diagnosis=None) for tweak in reported_verdict(run).tweaks)
     read = Page(render(run, replace(reported_verdict(run), tweaks=silent)))
-    assert "The device did not say what had changed." in read.text
+    assert "The device reported no diagnosis." in read.text
 
 
 def test_false_alarms_are_listed(read: Page) -> None:
@@ -131,7 +131,7 @@ def test_false_alarms_are_listed(read: Page) -> None:
     assert "1 in 1,800 samples" in read.text
 
 
-def test_long_list_of_false_alarms_is_cut_and_says_so(run: Run) -> None:
+def test_long_list_of_false_alarms_is_cut_with_a_note(run: Run) -> None:
     alarms = np.arange(100, 600, dtype=np.int64)
     many = replace(
         run,
@@ -165,7 +165,7 @@ def test_conditions_name_what_ran(run: Run, read: Page) -> None:
     assert read.value("device.estimator.ceiling") == "11.512925"
 
 
-def test_firmware_is_named_with_its_hash_as_people_write_it(run: Run) -> None:
+def test_firmware_hash_is_hexadecimal(run: Run) -> None:
     dut = {**run.conditions.dut, "identity": {"firmware": "HOST", "catalogue_hash": 0xFE94}}
     known = replace(run, conditions=replace(run.conditions, dut=dut))
     read = Page(render(known, reported_verdict(run)))
@@ -182,12 +182,12 @@ def test_outcome_stands_first_and_alone(run: Run, outcome: Outcome) -> None:
     assert read.raw["title"][0].startswith(outcome.upper())
 
 
-def test_inconclusive_run_says_that_it_is_no_result() -> None:
+def test_page_of_an_inconclusive_run_states_that_it_proves_nothing() -> None:
     run = with_fault(reported_run(), "the device was reset")
     read = Page(render(run, judge(run)))
     assert "This run is not valid" in read.text
     assert "the device was reset" in read.text
-    assert "of 2 changes noticed" not in read.text
+    assert "of 2 changes detected" not in read.text
 
 
 def test_run_without_a_sample_has_a_page() -> None:

@@ -108,7 +108,7 @@ def test_mean_interval_is_that_of_student() -> None:
     mean, low, high = mean_interval(values, 0.9)
     assert mean == pytest.approx(values.mean())
     assert (low, high) == pytest.approx(stats.t.interval(0.9, 6, values.mean(), stats.sem(values)))
-    with pytest.raises(ValueError, match="one value"):
+    with pytest.raises(ValueError, match="at least two values"):
         mean_interval([1.0], 0.9)
 
 

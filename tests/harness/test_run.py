@@ -1,4 +1,4 @@
-"""Recordings: what is saved is what is loaded, and damage is found."""
+"""Recordings: lossless, and checked when they are loaded."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_recording_truncated_anywhere_is_refused_in_one_line(run: Run, tmp_path:
         assert "\n" not in str(caught.value)
 
 
-def test_flipped_bytes_are_noticed(run: Run, tmp_path: Path) -> None:
+def test_flipped_bytes_are_detected(run: Run, tmp_path: Path) -> None:
     """The archive's CRC-32 covers every array and the header."""
     path = tmp_path / "run.npz"
     run.save(path)
@@ -68,7 +68,7 @@ def test_flipped_bytes_are_noticed(run: Run, tmp_path: Path) -> None:
 
 
 def rewritten(path: Path, header: object, **arrays: np.ndarray) -> None:
-    """The recording at ``path`` with another header, or other arrays."""
+    """Rewrite the recording at ``path`` with another header, or other arrays."""
     with np.load(path) as file:
         members = {name: file[name] for name in file.files}
     members |= {"header": np.array(json.dumps(header) if header is not None else str(members["header"]))} | arrays
@@ -137,14 +137,14 @@ def test_recording_from_before_diagnoses_has_none(run: Run, tmp_path: Path) -> N
         ("diagnosis_change", np.array([3, Change.UNDECIDED], np.uint8)),
     ],
 )
-def test_diagnosis_that_cannot_be_is_refused(run: Run, tmp_path: Path, name: str, values: np.ndarray) -> None:
+def test_impossible_diagnosis_is_refused(run: Run, tmp_path: Path, name: str, values: np.ndarray) -> None:
     run.save(tmp_path / "run.npz")
     rewritten(tmp_path / "run.npz", None, **{name: values})
     with pytest.raises(RecordingError, match="its diagnoses do not fit together"):
         Run.load(tmp_path / "run.npz")
 
 
-def test_archive_that_would_swell_is_refused(run: Run, tmp_path: Path) -> None:
+def test_compressed_archive_is_refused(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     run.save(path)
     with np.load(path) as file:

@@ -77,7 +77,7 @@ def test_random_plants_are_those_that_the_device_is_held_to() -> None:
     [
         (lambda _: True, {"samples": 700, "tweaks": 1}),
         (lambda scenario: len(scenario.tweaks) == 2, {"tweaks": 2}),
-        (lambda scenario: any("mass_kg" in tweak.given() for tweak in scenario.tweaks), {"tweaks": 1}),
+        (lambda scenario: any("mass_kg" in tweak.overrides() for tweak in scenario.tweaks), {"tweaks": 1}),
     ],
 )
 def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(

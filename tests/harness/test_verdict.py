@@ -1,4 +1,4 @@
-"""The verdict, on runs made by hand."""
+"""Verdicts on synthetic runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_alarm_after_the_change_is_its_detection() -> None:
     assert verdict.outcome == "passed"
 
 
-def test_alarm_at_the_instant_of_the_change_is_a_false_one() -> None:
+def test_alarm_at_the_instant_of_the_change_is_false() -> None:
     """The sample at which a pot jumps was taken before the jump could act."""
     verdict = judge(made_run(LOADED, CHANGE, alarms=[400, 404]))
     assert verdict.false_alarms == (400,)
@@ -43,19 +43,19 @@ def test_alarm_at_the_instant_of_the_change_is_a_false_one() -> None:
     assert verdict.outcome == "failed"
 
 
-def test_second_alarm_after_a_change_is_a_false_one() -> None:
+def test_second_alarm_after_a_change_is_false() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[404, 405, 700]))
     assert verdict.false_alarms == (405, 700)
 
 
-def test_change_that_could_be_seen_and_was_not_is_missed() -> None:
+def test_detectable_change_without_an_alarm_is_missed() -> None:
     verdict = judge(made_run(LOADED, CHANGE))
     assert verdict.tweaks[0].missed
     assert verdict.outcome == "failed"
     assert verdict.reasons == ("missed 1 of 1 change (K at 400), at most 0 expected",)
 
 
-def test_change_without_information_is_not_held_against_the_device() -> None:
+def test_undetectable_change_without_an_alarm_passes() -> None:
     verdict = judge(made_run(np.zeros(800), CHANGE))
     assert verdict.tweaks[0].bound_n is None
     assert not verdict.tweaks[0].missed
@@ -66,15 +66,15 @@ def test_late_alarm_fails_and_names_its_deadline() -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[500]))
     assert verdict.tweaks[0].late
     assert verdict.outcome == "failed"
-    assert "K at 400 was noticed after 100 samples, later than" in verdict.reasons[0]
+    assert "K at 400 was detected after 100 samples, later than" in verdict.reasons[0]
 
 
-def test_expectations_of_the_scenario_count() -> None:
+def test_scenario_sets_the_limits_of_missed_changes_and_false_alarms() -> None:
     expect = {"missed": 1, "false_alarms": 2}
     assert judge(made_run(LOADED, CHANGE, alarms=[10, 20], expect=expect)).outcome == "passed"
 
 
-def test_bound_is_that_of_the_triggers_own_arl0() -> None:
+def test_bound_assumes_the_arl0_of_the_trigger() -> None:
     strict = judge(made_run(LOADED, CHANGE, estimator={**ESTIMATOR, "ceiling": math.log(1e12)}))
     usual = judge(made_run(LOADED, CHANGE))
     assert strict.tweaks[0].bound_n is not None and usual.tweaks[0].bound_n is not None
@@ -91,7 +91,7 @@ def test_bound_is_that_of_the_triggers_own_arl0() -> None:
     ],
     ids=["fault", "short", "clipped"],
 )
-def test_run_that_was_not_valid_is_inconclusive_however_good_it_looks(changes: dict[str, object], reason: str) -> None:
+def test_invalid_run_is_inconclusive_even_with_perfect_detections(changes: dict[str, object], reason: str) -> None:
     verdict = judge(made_run(LOADED, CHANGE, alarms=[404], **changes))  # type: ignore[arg-type]
     assert verdict.outcome == "inconclusive"
     assert not verdict.valid
@@ -104,15 +104,15 @@ def test_run_that_was_not_valid_is_inconclusive_however_good_it_looks(changes: d
         ([30, 31], 2, 2, ()),
         ([30, 799], 2, 1, ()),
         ([30, 31], 1, 2, ("2 samples were lost on the way to the device, more than 1",)),
-        ([], 0, 3, ("the device never saw 3 samples, where 0 are known to be lost",)),
-        ([30], 5, 0, ("the device never saw 0 samples, where 1 are known to be lost",)),
+        ([], 0, 3, ("the device counted 3 lost samples, the harness 0",)),
+        ([30], 5, 0, ("the device counted 0 lost samples, the harness 1",)),
     ],
     ids=["allowed", "last", "too many", "unknown", "untrue"],
 )
-def test_lost_samples_are_counted_against_what_is_allowed(
+def test_lost_samples_must_match_the_device_and_stay_within_the_limit(
     lost: list[int], most: int, counted: int, reasons: tuple[str, ...]
 ) -> None:
-    """The device cannot know of what was lost after the last sample that it heard."""
+    """The device cannot count samples lost after the last one it received."""
     run = made_run(LOADED, CHANGE, alarms=[404])
     run.flags[lost] |= LOST
     conditions = dataclasses.replace(
@@ -135,7 +135,7 @@ def test_theta_hash_is_sha256_of_the_float32_bits() -> None:
     assert judge(made_run(LOADED[:2], [(0, FRONT)], theta=theta)).theta_hash == expected
 
 
-def test_json_carries_what_the_documentation_promises() -> None:
+def test_json_has_the_documented_keys() -> None:
     out = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))
     promised = {"sample": 400, "what": "K", "from": {"K": 24500.0}, "to": {"K": 18000.0}, "latency": 4}
     assert out["tweaks"][0].items() >= promised.items()
@@ -148,7 +148,7 @@ def test_json_carries_what_the_documentation_promises() -> None:
 def told(
     *diagnoses: tuple[int, Change, int, float], after: Plant = SOFT, alarms: Sequence[int] = (404,)
 ) -> DiagnosisVerdict | None:
-    """What the verdict makes of them where the plant changes at sample 400 of an excited run."""
+    """Verdict on ``diagnoses`` of an excited run whose plant changes at sample 400."""
     force = np.where(np.arange(800) // 50 % 2, 2900.0, 0.0)
     verdict = judge(made_run(force, [(0, FRONT), (400, after)], alarms=alarms, diagnoses=diagnoses))
     return verdict.tweaks[0].diagnosis
@@ -179,7 +179,7 @@ def test_several_is_right_if_more_than_one_has_changed() -> None:
     assert (said.named, said.right) == ("several", False)
 
 
-def test_diagnosis_before_the_alarm_or_of_no_noticed_change_is_of_something_else() -> None:
+def test_diagnosis_without_a_detection_is_not_attributed() -> None:
     assert told((403, Change.STIFFNESS, 395, 0.75)) is None
     assert told((420, Change.STIFFNESS, 395, 0.75), alarms=()) is None
     assert told() is None

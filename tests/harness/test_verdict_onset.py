@@ -1,4 +1,4 @@
-"""The verdict where the instant of a change was learned from the samples, and is not exact."""
+"""Verdicts on changes whose instant is known only as an interval."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SWITCHED = np.where(np.arange(800) // 50 % 2, 2900.0, 0.0)
 
 
 def learned(*segments: Segment, alarms: Sequence[int], force_n: Any = LOADED, **made: Any) -> Run:
-    """A run that begins with the front suspension, then these."""
+    """Run that begins with the front suspension, followed by ``segments``."""
     run = made_run(force_n, [(0, FRONT)], alarms=alarms, **made)
     return dataclasses.replace(
         run, conditions=dataclasses.replace(run.conditions, segments=(Segment(0, FRONT), *segments))
@@ -42,7 +42,7 @@ def between(low: int, likeliest: int, high: int, **more: Any) -> Segment:
 
 
 def deadline_of(start: int) -> int:
-    """The last sample at which an alarm is in time, of a change known to have come at ``start``."""
+    """Latest sample of an alarm that is not late, for a change at exactly ``start``."""
     (tweak,) = judge(learned(Segment(start, SOFT), alarms=[start + 2])).tweaks
     assert tweak.deadline_n is not None
     return start + tweak.deadline_n
@@ -54,13 +54,13 @@ def test_latency_is_an_interval_from_the_latest_to_the_earliest_instant() -> Non
     assert tweak.result == "noticed"
 
 
-def test_instant_that_is_exact_is_judged_once() -> None:
+def test_exact_instant_is_judged_once() -> None:
     (tweak,) = judge(learned(Segment(400, SOFT), alarms=[404])).tweaks
-    assert tweak.others == ()
+    assert tweak.alternatives == ()
     assert (tweak.between, tweak.latencies_n, tweak.result) == ((400, 400), (4, 4), "noticed")
 
 
-def test_alarm_before_the_earliest_instant_is_a_false_one() -> None:
+def test_alarm_before_the_earliest_instant_is_false() -> None:
     verdict = judge(learned(between(395, 400, 402), alarms=[395, 404]))
     assert (verdict.false_alarms, verdict.doubtful_alarms) == ((395,), ())
     assert verdict.outcome == "failed"
@@ -70,10 +70,10 @@ def test_alarm_after_the_latest_instant_passes_if_it_is_in_time_even_for_the_ear
     assert judge(learned(between(395, 400, 402), alarms=[deadline_of(395)])).outcome == "passed"
 
 
-def test_device_is_late_only_if_it_is_so_for_the_latest_instant() -> None:
+def test_detection_is_late_only_if_late_for_the_latest_instant() -> None:
     late = judge(learned(between(395, 400, 402), alarms=[deadline_of(402) + 1]))
     assert (late.outcome, late.tweaks[0].result) == ("failed", "late")
-    assert "K at 400 was noticed after" in late.reasons[0]
+    assert "K at 400 was detected after" in late.reasons[0]
 
 
 @pytest.mark.parametrize("alarm", [deadline_of(395) + 1, deadline_of(402)], ids=["just after", "just before"])
@@ -81,7 +81,7 @@ def test_between_the_deadlines_of_earliest_and_latest_instant_a_run_is_inconclus
     verdict = judge(learned(between(395, 400, 402), alarms=[alarm]))
     assert verdict.outcome == "inconclusive"
     assert verdict.tweaks[0].result == "undecided"
-    assert verdict.reasons == ("K between 395 and 402 was late or noticed, depending on when it came",)
+    assert verdict.reasons == ("K between 395 and 402 was late or noticed, depending on its instant",)
 
 
 def test_alarm_between_earliest_and_latest_instant_is_false_or_the_detection() -> None:
@@ -100,19 +100,19 @@ def test_alarm_that_is_late_for_one_instant_and_false_for_another_may_be_in_time
     assert exact.outcome == "passed"
 
 
-def test_of_two_alarms_after_the_earliest_instant_one_is_false_whichever() -> None:
+def test_one_of_two_alarms_after_the_earliest_instant_is_false() -> None:
     verdict = judge(learned(between(380, 400, 402), alarms=[390, 404]))
     assert verdict.outcome == "failed"
     assert verdict.reasons == ("1 false alarm, at most 0 expected",)
     assert judge(learned(between(380, 400, 402), alarms=[390, 404], expect={"false_alarms": 1})).outcome == "passed"
 
 
-def test_change_that_is_missed_whenever_it_came_is_missed() -> None:
+def test_change_missed_under_all_hypotheses_is_missed() -> None:
     verdict = judge(learned(between(380, 400, 402), alarms=[]))
     assert (verdict.outcome, verdict.tweaks[0].result) == ("failed", "missed")
 
 
-def test_one_change_that_is_missed_fails_the_run_whatever_is_undecided() -> None:
+def test_missed_change_fails_a_run_with_undecided_changes() -> None:
     undecided = between(380, 400, 402)
     verdict = judge(learned(undecided, Segment(600, LIGHT), alarms=[deadline_of(402)], force_n=SWITCHED))
     assert verdict.tweaks[1].result == "missed"
@@ -148,7 +148,7 @@ def test_truth_of_the_plant_before_ends_at_the_earliest_instant() -> None:
 
 
 def test_instants_stay_within_the_record_and_the_run() -> None:
-    """As if the search had begun with the first sample of a record, from which on the device is fresh."""
+    """The search interval may begin before the record of the change."""
     run = learned(between(300, 310, 320), Segment(790, LIGHT, start_low=700, start_high=900), alarms=[313, 795])
     run = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, records=(0, 300)))
     assert [tweak.between for tweak in judge(run).tweaks] == [(301, 320), (700, 799)]
@@ -167,7 +167,7 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     text, page, verdict = shown(run)
     line = next(line for line in text.splitlines() if "24500 -> 18000" in line)
     assert line.split()[-2:] == ["2-9", str(verdict.tweaks[0].bound_n)]
-    assert "between 395 and 402, the likeliest instant is shown: noticed" in text
+    assert "between 395 and 402 (the likeliest instant is shown): noticed" in text
     assert ">395–402</button>" in page and ">2–9</td>" in page
     (tweak,) = as_json(verdict)["tweaks"]
     wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "noticed"}
@@ -175,10 +175,10 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     assert _latency(verdict.tweaks[0]) == "2..9"
 
 
-def test_doubt_is_shown_wherever_the_result_is() -> None:
+def test_undecided_result_is_shown_in_summary_and_page() -> None:
     text, page, verdict = shown(learned(between(380, 400, 402), alarms=[390]))
-    assert "depending on when the changes came: alarms at 390" in text
-    assert "? depends on when it came" in page and "the alarms at 390 are such" in page
+    assert "depending on the instants of the changes: alarms at 390" in text
+    assert "? depends on its instant" in page and "the alarms at 390 are false" in page
     assert as_json(verdict)["doubtful_alarms"] == [390]
     assert as_json(verdict)["tweaks"][0]["result"] == "undecided"
 
@@ -190,7 +190,7 @@ def test_change_that_was_not_found_is_shown_with_the_reason() -> None:
     assert as_json(verdict)["tweaks"][0]["unseen"] == "nothing to be seen"
 
 
-def test_exact_instants_are_shown_as_ever() -> None:
+def test_exact_instants_are_shown_without_an_interval() -> None:
     run = learned(Segment(400, SOFT), alarms=[404])
     text, page, verdict = shown(run)
     assert "between" not in text and ">400</button>" in page
@@ -200,7 +200,7 @@ def test_exact_instants_are_shown_as_ever() -> None:
 # ---- findings of a test
 
 
-def test_detection_within_is_judged_for_every_instant() -> None:
+def test_detection_limit_is_checked_for_every_instant() -> None:
     (tweak,) = judge(learned(between(395, 400, 402), alarms=[404])).tweaks
     assert [each.bound_n for each in tweak.possible] == [1, 1, 1]
     assert [each.latency_n for each in tweak.possible] == [9, 4, 2]  # of them 1 more than so many bounds is allowed
@@ -213,7 +213,7 @@ def test_detection_within_is_judged_for_every_instant() -> None:
     assert late.detects(within=1.0).why == "K at 400: 8 samples, allowed 2"
 
 
-def test_quiet_is_not_said_of_a_run_with_an_alarm_that_may_be_false() -> None:
+def test_run_with_a_possibly_false_alarm_is_not_quiet() -> None:
     allowed = {"missed": 1, "false_alarms": 1}
     played = Played(learned(between(380, 400, 402), alarms=[390], expect=allowed))
     assert played.verdict.outcome == "passed"

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from analogrig.bench import Bench, uninterrupted
+from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns.plan import Case, device_as_planned, open_table
 from analogrig.campaigns.trials import Trials, are_possible
 from analogrig.devices.description import DeviceDescription
@@ -124,7 +124,7 @@ class Players(threading.local):
             raise
         if run.conditions.faults:
             self._devices.drop(case.device)
-        return uninterrupted(run)
+        return raise_if_interrupted(run)
 
     def close(self) -> None:
         """Let go of all that this thread has opened."""

@@ -30,7 +30,7 @@ from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, DeviceError
-from analogrig.judging.exposure import Heard, exposed
+from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance
 from analogrig.run import CHANNELS
@@ -155,8 +155,8 @@ class _Climbs:
         self._samples += end
         numbers = np.isfinite(steps.innovation) & np.isfinite(steps.statistic)
         force = self._play.codes[:end, CHANNELS.index("force")]
-        heard = Heard(force, flags_of(steps.status), numbers, steps.alarms)
-        if fault := exposed(heard, self._settings.as_table(), self._noise_lsb).no_evidence:
+        heard = ObservedRecord(force, flags_of(steps.status), numbers, steps.alarms)
+        if fault := record_exposure(heard, self._settings.as_table(), self._noise_lsb).lack_of_evidence:
             raise DeviceError(fault)
         alarms = steps.alarms[steps.alarms >= first]
         end = int(alarms[0]) + 1 if len(alarms) else end

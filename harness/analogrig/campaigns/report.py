@@ -11,7 +11,7 @@ from pathlib import Path
 from analogrig.campaigns.results import COLUMNS, CONFIDENCE, Results, Summary, label
 from analogrig.errors import ConfigurationError
 from analogrig.identity import Identity
-from analogrig.reporting.page import FOLDER, assembled
+from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
 from analogrig.storage import replacing
 
@@ -75,7 +75,7 @@ def render(results: Results, played_by: Sequence[Identity] = ()) -> str:
     """The page as text."""
     spec, total = results.plan.spec, results.total()
     scenario = str(results.plan.scenario["name"])
-    return assembled(
+    return assemble_page(
         _TEMPLATE,
         (FOLDER / "page.css",),
         (),

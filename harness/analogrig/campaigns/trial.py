@@ -13,7 +13,7 @@ from analogrig.campaigns.rows import Row, row, row_of_none
 from analogrig.campaigns.trials import Trials
 from analogrig.errors import ConfigurationError, DeviceError, LinkError, RigError
 from analogrig.judging.exposure import Exposure, exposure
-from analogrig.judging.verdict import judge, no_evidence
+from analogrig.judging.verdict import evidence_gaps, judge
 
 _players = Players()
 
@@ -69,7 +69,7 @@ def count_alarms(case: Case) -> Count:
 
 def _counted(trials: Trials, case: Case) -> Count:
     seen, scenario = trials.watched(case.scenario, case.seed), case.scenario
-    reasons = no_evidence(seen.exposure, scenario.expect, refused=seen.refused, missing=seen.missing)
+    reasons = evidence_gaps(seen.exposure, scenario.expect, refused=seen.refused, missing=seen.missing)
     return _count(len(seen.alarms), seen.exposure, case.seed, [*scenario.caveats, *reasons])
 
 

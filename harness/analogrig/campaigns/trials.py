@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from analogrig.catalogue import SteppedFlag, Trigger
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator, EstimatorOutput, StepStatus
-from analogrig.judging.exposure import Exposure, Heard, exposed
+from analogrig.judging.exposure import Exposure, ObservedRecord, record_exposure
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run, missing_to_device
+from analogrig.run import CHANNELS, Conditions, Run, missing_samples
 from analogrig.scenario import Scenario
 
 BLOCK_SAMPLES = 16_384
@@ -95,8 +95,8 @@ class Trials:
                 )
             )
         flags, alarms = flags_of(status), np.concatenate(found)
-        shown = exposed(
-            Heard(force, flags, np.isfinite(innovation) & np.isfinite(statistic), alarms),
+        shown = record_exposure(
+            ObservedRecord(force, flags, np.isfinite(innovation) & np.isfinite(statistic), alarms),
             self._tables[1]["estimator"],
             performance.channels["force"].noise_lsb,
         )
@@ -157,7 +157,7 @@ class Trials:
 
 def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
     """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
-    return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_to_device(block.clipped)
+    return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_samples(block.clipped)
 
 
 def flags_of(status: NDArray[np.uint8]) -> NDArray[np.uint8]:

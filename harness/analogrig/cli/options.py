@@ -261,7 +261,7 @@ def recorded(arguments: argparse.Namespace) -> Run:
     :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.
     """
     from analogrig.errors import ConfigurationError
-    from analogrig.recordings import captured_run, retold
+    from analogrig.recordings import import_run, replace_scenario
     from analogrig.rigs.description import open_rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
@@ -269,11 +269,11 @@ def recorded(arguments: argparse.Namespace) -> Run:
     scenario = None if arguments.scenario is None else Scenario.load(arguments.scenario)
     if not is_capture(arguments.file):
         run = Run.load(arguments.file)
-        return run if scenario is None else retold(run, scenario)
+        return run if scenario is None else replace_scenario(run, scenario)
     if scenario is None:
         raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
     with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
-        return captured_run(
+        return import_run(
             arguments.file,
             scenario,
             rig,

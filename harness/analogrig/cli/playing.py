@@ -51,7 +51,7 @@ def play(
     from analogrig.errors import ConfigurationError
     from analogrig.signals import held
 
-    if arguments.can_log is not None and log is not None and not log.has_heard:
+    if arguments.can_log is not None and log is not None and not log.has_frames:
         raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
     identity = replace(output.identity(), devices=dut.files())
     if log is not None:
@@ -59,7 +59,7 @@ def play(
     bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
     run = bench.play(scenario, seed)
     with held():
-        return conclude(_with_log(run, log, output).made_by(identity), output, identity, arguments)
+        return conclude(_with_log(run, log, output).with_identity(identity), output, identity, arguments)
 
 
 def _with_log(run: Run, log: CanLog | None, output: OutputFolder) -> Run:

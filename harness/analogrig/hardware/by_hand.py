@@ -157,7 +157,7 @@ def doubts(signals: Signals, tweaks: Sequence[Tweak], first: int) -> list[str]:
 
 def _is_plain(signals: Signals, tweak: Tweak, stretch: range) -> bool:
     """Whether a change could not have stayed unseen."""
-    plants = [SampledPlant.of(plant, signals.period_s) for plant in (tweak.before, tweak.after)]
+    plants = [SampledPlant.from_plant(plant, signals.period_s) for plant in (tweak.before, tweak.after)]
     states = [AT_REST, AT_REST]
     information = 0.0
     for k in range(stretch.stop):

@@ -69,8 +69,8 @@ class Wired:
             )
         computer = SuspensionComputer(scenario.plant.set)
         with emulator_errors(where):
-            computer.set(**settings_of(computer, scenario.plant.given()))
-            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+            computer.set(**settings_of(computer, scenario.plant.overrides()))
+            excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         self._check_force(excitation, where)
         start = dict(computer.dials)
         self._check_dials(start, where)
@@ -83,9 +83,9 @@ class Wired:
             if tweak.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):
-                dials = computer.dials_for(**settings_of(computer, tweak.given()))
+                dials = computer.dials_for(**settings_of(computer, tweak.overrides()))
             self._check_dials(dials, place)
-            before, plant = plant, dataclasses.replace(plant, **tweak.given())
+            before, plant = plant, dataclasses.replace(plant, **tweak.overrides())
             tweaks.append(Tweak(tweak.sample, dials, before, plant))
         truth = None if isinstance(self._description.pots, InstrumentPots) else [Segment(0, scenario.plant.plant())]
         return Plan(scenario, computer, excitation, start, tuple(tweaks), [], truth)

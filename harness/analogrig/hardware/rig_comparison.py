@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench, uninterrupted
+from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.campaigns.comparison import Comparison, compare
 from analogrig.campaigns.rows import Row, changes, row
 from analogrig.judging.statistics import mean_interval, rate_interval, upper_rate
@@ -137,7 +137,7 @@ def compare_rigs(
     rows: list[tuple[Row, Row]] = []
     invalid = []
     for done, seed in enumerate(seeds, start=1):
-        pair = uninterrupted(a.play(scenario, seed)), uninterrupted(b.play(scenario, seed))
+        pair = raise_if_interrupted(a.play(scenario, seed)), raise_if_interrupted(b.play(scenario, seed))
         judged = row(pair[0], judge(pair[0])), row(pair[1], judge(pair[1]))
         why = [_why_invalid(*each) for each in zip(pair, judged, strict=True) if each[1]["outcome"] == "inconclusive"]
         if why:

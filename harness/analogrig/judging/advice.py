@@ -1,10 +1,11 @@
-"""What a user should know beyond the verdict: settings that do not fit together, and what could not be seen."""
+"""Advice beyond the verdict: inconsistent settings, undetectable changes, implausible estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
@@ -14,32 +15,32 @@ from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
 NOISE_MARGIN = 1.05
-"""The device may be set for this much less noise than there is before it matters."""
+"""Largest ratio of the measured to the configured noise variance that needs no advice."""
 
 WARM_UP_EDGES = 2
-"""Without so many the estimate knows next to nothing of the plant."""
+"""Edges of the excitation that the estimate needs to converge."""
 
 MOST_EDGE_SHIFT = 1.5e-3
-"""From one edge to the next, in samples: 30 ppm of drift at an edge every 50 samples."""
+"""Largest deviation of an edge interval from whole samples: 30 ppm of drift with an edge every 50 samples."""
 
-_SAMPLES_LOOKED_AT = 4000
+_EXAMINED_SAMPLES = 4000
 
 
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
-    """Sentences, the gravest first; empty if all is well."""
+    """Sentences of advice, the most severe first; empty if there is nothing to advise."""
     return (
-        *_assumed(run),
+        *_assumed_settings(run),
         *_overloads(verdict),
-        *_noise(run),
-        *_edges(run),
+        *_noise_setting(run),
+        *_edge_spacing(run),
         *_warm_up(run),
-        *_false_alarms(verdict),
-        *_unseen(verdict),
-        *_unidentified(verdict),
+        *_false_alarm_rate(verdict),
+        *_undetectable_changes(verdict),
+        *_implausible_estimates(verdict),
     )
 
 
-def _assumed(run: Run) -> Iterator[str]:
+def _assumed_settings(run: Run) -> Iterator[str]:
     assumed_n = run.conditions.dut.get("assumed_n", 0)
     if assumed_n:
         settings = number_of(
@@ -48,8 +49,8 @@ def _assumed(run: Run) -> Iterator[str]:
             "settings of the device are not in the log and were",
         )
         yield (
-            f"{settings} taken to be as by default:"
-            " if they were not, bounds and estimates are wrong; capture from the handshake on"
+            f"{settings} replaced by the default; if that is wrong, so are bounds and estimates:"
+            " capture from the handshake on"
         )
 
 
@@ -57,64 +58,72 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
     if verdict.overloads:
         names = ", ".join(sorted(verdict.overloads))
         yield (
-            f"{names} overloaded from sample {min(verdict.overloads.values())} on: the computer was then not the plant"
-            " of the scenario, and estimates and alarms may be true to it"
+            f"{names} overloaded from sample {min(verdict.overloads.values())} on: the computer no longer matched the"
+            " plant of the scenario, so estimates and alarms may be correct for the overloaded computer"
         )
 
 
-def _noise(run: Run) -> Iterator[str]:
-    there = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
+def _noise_setting(run: Run) -> Iterator[str]:
+    measured = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
     expected = float(run.conditions.dut["estimator"].get("noise_variance", np.inf))
-    if there > NOISE_MARGIN * expected:
+    if measured > NOISE_MARGIN * expected:
         yield (
-            f"the rig's noise has a variance of {there:.2g} codes^2, the device is set for {expected:.2g}:"
-            " false alarms are to be expected until its noise_variance is raised"
+            f"the rig's noise has a variance of {measured:.2g} codes^2, the device is set for {expected:.2g}:"
+            " expect false alarms; raise noise_variance"
         )
 
 
-def _edges(run: Run) -> Iterator[str]:
-    estimator = run.conditions.dut["estimator"]
-    if "excitation" not in run.conditions.scenario or estimator.get("edge_instants") == "anywhere":
+def _edge_spacing(run: Run) -> Iterator[str]:
+    excitation = _excitation(run)
+    if excitation is None or excitation.clock == "card":
         return
-    excitation = config.build(Excitation, run.conditions.scenario["excitation"], "the recorded excitation")
-    if excitation.clock == "card":
+    if run.conditions.dut["estimator"].get("edge_instants") == "anywhere":
         return
-    rate_hz = 1.0 / run.conditions.sample_period_s
-    instants = excitation.edges(0, _SAMPLES_LOOKED_AT * TICKS_PER_SAMPLE, rate_hz).ticks[1:] / TICKS_PER_SAMPLE
-    intervals = np.diff(instants)
+    intervals = np.diff(_edge_instants(run, excitation))
     if len(intervals) and np.abs(intervals - np.round(intervals)).max() > MOST_EDGE_SHIFT:
         yield (
-            "the edges of the excitation do not come a whole number of samples apart: false alarms are to be expected"
-            ' until the device is set to edge_instants = "anywhere" (as the device any-edges is)'
+            "the edges of the excitation are not a whole number of samples apart: expect false alarms;"
+            ' set edge_instants = "anywhere" (as the device any-edges does)'
         )
 
 
 def _warm_up(run: Run) -> Iterator[str]:
-    warm_up_n = run.conditions.dut["estimator"].get("warm_up_n")
-    if "excitation" not in run.conditions.scenario or warm_up_n is None:
+    excitation, warm_up_n = _excitation(run), run.conditions.dut["estimator"].get("warm_up_n")
+    if excitation is None or warm_up_n is None:
         return
-    excitation = config.build(Excitation, run.conditions.scenario["excitation"], "the recorded excitation")
-    rate_hz = 1.0 / run.conditions.sample_period_s
-    instants = excitation.edges(0, _SAMPLES_LOOKED_AT * TICKS_PER_SAMPLE, rate_hz).ticks[1:] / TICKS_PER_SAMPLE
+    instants = _edge_instants(run, excitation)
     if len(instants) < WARM_UP_EDGES or instants[WARM_UP_EDGES - 1] >= warm_up_n:
         yield (
-            f"the device's warm-up of {number_of(warm_up_n, 'sample')} ends before {WARM_UP_EDGES} edges of the"
-            " excitation came: false alarms are to be expected at the first ones until its warm_up_n is longer"
+            f"the device's warm-up of {number_of(warm_up_n, 'sample')} ends before edge {WARM_UP_EDGES} of the"
+            " excitation: expect false alarms at the first edges; raise warm_up_n"
         )
 
 
-def _false_alarms(verdict: Verdict) -> Iterator[str]:
+def _excitation(run: Run) -> Excitation | None:
+    """Recorded excitation; None if the scenario has none."""
+    table = run.conditions.scenario.get("excitation")
+    return None if table is None else config.build(Excitation, table, "the recorded excitation")
+
+
+def _edge_instants(run: Run, excitation: Excitation) -> NDArray[np.float64]:
+    """Edges after the first level, (e,) in samples, up to sample 4000."""
+    edges = excitation.edges(0, _EXAMINED_SAMPLES * TICKS_PER_SAMPLE, 1.0 / run.conditions.sample_period_s)
+    return np.asarray(edges.ticks[1:] / TICKS_PER_SAMPLE)
+
+
+def _false_alarm_rate(verdict: Verdict) -> Iterator[str]:
     if len(verdict.false_alarms) > max(2, len(verdict.tweaks)):
-        yield "with so many false alarms, an alarm soon after a change may be chance and its latency no merit"
+        yield "with so many false alarms, an alarm soon after a change may be coincidence; ignore its latency"
 
 
-def _unseen(verdict: Verdict) -> Iterator[str]:
+def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
     for tweak in verdict.tweaks:
         if tweak.bound_n is None and not tweak.unseen:
-            yield f"{tweak.what} at {tweak.sample} could not be seen before the next change or the end: not judged"
+            yield f"{tweak.what} at {tweak.sample} is not judged: not detectable before the next change or the end"
 
 
-def _unidentified(verdict: Verdict) -> Iterator[str]:
+def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
     for segment in verdict.estimates:
         if segment.estimate is None:
-            yield f"the last estimate of samples {segment.start}-{segment.end - 1} describes no mass, damper and spring"
+            samples = f"{segment.start}-{segment.end - 1}"
+            yield f"the last estimate of samples {samples} describes no mass, damper and spring"

@@ -1,7 +1,7 @@
-"""In which samples a false alarm could have come: the exposure, of which every rate of false alarms is one.
+"""Exposure: samples in which the trigger was armed. Denominator of every false-alarm rate.
 
-A device that is warming up, is held off after an alarm, has no equation for want of the samples before, or is not
-excited, raises no alarm whatever it is worth: its silence is no evidence.
+No device can raise an alarm during warm-up, during the hold-off after an alarm, without the earlier samples of its
+equation, or without excitation. Zero alarms in such samples prove nothing.
 """
 
 from __future__ import annotations
@@ -19,76 +19,77 @@ from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, Run
 from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
-"""Of the noise of the force: less is no edge, whatever the device takes for one. By chance two samples differ as much
-once in 5e9 times."""
+"""Smallest edge, in rms values of the noise of the force. Noise alone makes two samples differ as much once in 5e9
+pairs."""
 
 _QUANTISATION_LSB = 12.0**-0.5
 
 _FORCE = CHANNELS.index("force")
 
-_NOT_HEARD = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
+_NOT_PROCESSED = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """Of one run."""
+    """Exposure of one run, in samples."""
 
     samples: int
     armed: int
     """Samples in which the trigger was armed."""
     unexcited: int
-    """Samples before the force had moved, or after its edges had ceased."""
-    numberless: int
-    """Samples after which estimate, innovation or statistic was no number, without an alarm."""
+    """Samples before the first edge of the force, or more than ``idle_n`` after the last one."""
+    non_finite: int
+    """Samples without an alarm whose estimate, innovation or statistic was non-finite."""
     estimator: Mapping[str, Any]
-    """The device's settings, as ``EstimatorConfig.as_table`` gives them."""
+    """Estimator settings of the device (``EstimatorConfig.as_table``)."""
 
     @property
-    def no_evidence(self) -> str:
-        """Why its silence is no evidence of anything, in one line; empty if it is."""
+    def lack_of_evidence(self) -> str:
+        """Reason that zero alarms prove nothing, in one line; empty if they are evidence."""
         of = number_of(self.samples, "sample")
-        if self.numberless:
-            return f"in {self.numberless} of {of} what the device estimated was no number"
-        return "" if self.armed else f"no alarm could come in any of {of}: {self._because()}"
+        if self.non_finite:
+            return f"the device reported non-finite estimates in {self.non_finite} of {of}"
+        return "" if self.armed else f"no alarm could come in any of {of}: {self._unarmed_reason()}"
 
-    def _because(self) -> str:
+    def _unarmed_reason(self) -> str:
+        """Main reason that the trigger was never armed."""
         if self.estimator.get("trigger") == "none":
             return "the device has no trigger"
         if 2 * self.unexcited <= self.samples:
             return f"its warm-up takes {self.estimator.get('warm_up_n', 0)}"
         edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
         return (
-            f"in {self.unexcited} it was not excited (the force had no edge of {edge_codes:g} codes, or none for"
+            f"in {self.unexcited} it was not excited (no edge of the force of {edge_codes:g} codes, or none for"
             f" {number_of(idle_n, 'sample')})"
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
-    """What is known of one record of n samples, from the first on."""
+class ObservedRecord:
+    """Inputs and answers of one gap-free record of n samples."""
 
     force: NDArray[np.uint16]
     """(n,) codes."""
     flags: NDArray[np.uint8]
-    """(n,) as of a Run."""
-    are_numbers: NDArray[np.bool_]
-    """(n,): estimate, innovation and statistic are numbers."""
+    """(n,) as ``Run.flags``."""
+    are_finite: NDArray[np.bool_]
+    """(n,): estimate, innovation and statistic are finite."""
     alarms: NDArray[np.int64]
-    """(a,) the samples with an alarm; each was armed, whatever else is known of it."""
+    """(a,) sample indices of the alarms. The trigger was armed in each of them."""
 
 
 def exposure(run: Run) -> Exposure:
-    """Of all records, each of which is a run of its own to the device."""
+    """Exposure of a run: the sum over its records, each of which the device starts afresh."""
     estimator, noise_lsb = run.conditions.dut["estimator"], run.conditions.channels["force"].noise_lsb
-    numbers = np.isfinite(run.innovation) & np.isfinite(run.statistic)
+    are_finite = np.isfinite(run.innovation) & np.isfinite(run.statistic)
     for column in run.theta.T:
-        numbers &= np.isfinite(column)
+        are_finite &= np.isfinite(column)
     parts = [
-        exposed(
-            Heard(
+        record_exposure(
+            ObservedRecord(
                 run.codes[start:end, _FORCE],
                 run.flags[start:end],
-                numbers[start:end],
+                are_finite[start:end],
                 run.alarm_index[(run.alarm_index >= start) & (run.alarm_index < end)] - start,
             ),
             estimator,
@@ -96,56 +97,60 @@ def exposure(run: Run) -> Exposure:
         )
         for start, end in run.records
     ]
-    armed, unexcited, numberless = (
-        sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "numberless")
+    armed, unexcited, non_finite = (
+        sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "non_finite")
     )
-    return Exposure(run.samples, armed, unexcited, numberless, estimator)
+    return Exposure(run.samples, armed, unexcited, non_finite, estimator)
 
 
-def exposed(heard: Heard, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
-    """Of one record; ``noise_lsb`` is that of the force."""
-    known = (heard.flags & _NOT_HEARD) == 0
+def record_exposure(record: ObservedRecord, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
+    """Exposure of one record; ``noise_lsb`` is the noise of the force channel, rms in LSB."""
+    known = (record.flags & _NOT_PROCESSED) == 0
     edge_codes = float(estimator.get("edge_codes", 0.0))
     if edge_codes:
         edge_codes = max(edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
-    excited = _excited(heard.force, known, edge_codes, int(estimator.get("idle_n", 0)))
-    excited &= (heard.flags & SteppedFlag.IDLE) == 0
-    watched = _watched(known & ((heard.flags & SteppedFlag.GATHERING) == 0), heard.alarms, estimator)
-    armed = watched & excited & heard.are_numbers & (estimator.get("trigger") != "none")
-    armed[heard.alarms] = True
-    numberless = ~heard.are_numbers
-    numberless[heard.alarms] = False  # which is what it should say of them
-    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(numberless.sum()), estimator)
+    excited = _excitation_mask(record.force, known, edge_codes, int(estimator.get("idle_n", 0)))
+    excited &= (record.flags & SteppedFlag.IDLE) == 0
+    watched = _beyond_hold_off(known & ((record.flags & SteppedFlag.GATHERING) == 0), record.alarms, estimator)
+    armed = watched & excited & record.are_finite & (estimator.get("trigger") != "none")
+    armed[record.alarms] = True
+    non_finite = ~record.are_finite
+    non_finite[record.alarms] = False  # an alarm is the required response to a non-finite estimate
+    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(non_finite.sum()), estimator)
 
 
-def _excited(force: NDArray[np.uint16], heard: NDArray[np.bool_], edge_codes: float, idle_n: int) -> NDArray[np.bool_]:
-    """(n,): the force has moved by what is an edge, and the last edge was not too long ago."""
+def _excitation_mask(
+    force: NDArray[np.uint16], known: NDArray[np.bool_], edge_codes: float, idle_n: int
+) -> NDArray[np.bool_]:
+    """(n,): the force has had an edge, and the last one is at most ``idle_n`` samples ago."""
     codes = force.astype(np.int32)
-    edges = np.flatnonzero((np.abs(np.diff(codes)) >= edge_codes) & heard[1:] & heard[:-1]) + 1
+    edges = np.flatnonzero((np.abs(np.diff(codes)) >= edge_codes) & known[1:] & known[:-1]) + 1
     excited = np.ones(len(codes), np.bool_)
     if len(edges):
         excited[: edges[0]] = False
     else:
-        known = codes[heard]
-        excited[heard] = np.maximum.accumulate(known) - np.minimum.accumulate(known) >= edge_codes
+        levels = codes[known]
+        excited[known] = np.maximum.accumulate(levels) - np.minimum.accumulate(levels) >= edge_codes
     if idle_n:
         bounds = np.concatenate(([0], edges, [len(codes)]))
         for i in np.flatnonzero(np.diff(bounds) > idle_n).tolist():
             idle = slice(bounds[i], bounds[i + 1])
-            excited[idle] &= np.cumsum(heard[idle], dtype=np.int32) - heard[bounds[i]] < idle_n
+            excited[idle] &= np.cumsum(known[idle], dtype=np.int32) - known[bounds[i]] < idle_n
     return excited
 
 
-def _watched(
+def _beyond_hold_off(
     equations: NDArray[np.bool_], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
 ) -> NDArray[np.bool_]:
-    """(n,): of the samples with an equation those beyond warm-up and hold-off, which count equations."""
+    """(n,): samples with an equation after warm-up and hold-off, both counted in equations."""
     count = np.cumsum(equations, dtype=np.int32)
     watched = equations & (count > int(estimator.get("warm_up_n", 0)))
     hold_off_n = int(estimator.get("hold_off_n", 0))
     if hold_off_n and len(alarms):
         for first in range(0, len(count), CHUNK_SAMPLES):
             part = slice(first, min(first + CHUNK_SAMPLES, len(count)))
-            last = np.searchsorted(alarms, np.arange(part.start, part.stop)) - 1  # of the alarms before the sample
+            last = (
+                np.searchsorted(alarms, np.arange(part.start, part.stop)) - 1
+            )  # index of the last alarm before the sample
             watched[part] &= (last < 0) | (count[part] > count[alarms[last]] + hold_off_n)
     return watched

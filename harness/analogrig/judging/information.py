@@ -1,14 +1,14 @@
-"""How soon a change can be seen at all, and how soon it can be told what has changed.
+"""Information bounds: the earliest sample at which any device can detect a change, and isolate it.
 
-No detector whose mean time between false alarms is ARL0 can, to first order, raise the alarm before the information
+Detection: with a mean time between false alarms of ARL0, no detector can, to first order, raise the alarm before
 
     I(n) = sum over the first n samples of (y_changed - y_unchanged)^2 / (2 sigma^2)
 
-between the plant as it was and the plant as it has become reaches ln ARL0 (Lorden 1971; Moustakides 1986; Lai 1998).
-It depends on where in the excitation the change fell, so it is computed for that very change in that very run.
+reaches ln ARL0 (Lorden 1971; Moustakides 1986; Lai 1998). I(n) compares the plant before and after the change. It
+depends on the phase of the excitation, so it is computed for each change in each run.
 
-Which parameter has changed can be told, with 95 % confidence, once the same information between the plant as it has
-become and the likeliest plant in which another parameter alone had changed reaches ln 20.
+Isolation: the changed parameter is known with 95 % confidence once I(n) between the true plant and its best rival
+reaches ln 20. A rival is a plant with one other parameter changed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, sampled
+from analogrig.plant import AT_REST, PARAMETERS, Plant, SampledPlant, State, discretise
 from analogrig.run import CHUNK_SAMPLES, Run
 from analogrig_emulator import PROGRAMS, TICKS_PER_SAMPLE, Edges
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 QUANTISATION_VARIANCE_LSB2 = 1.0 / 12.0
 
-
-LN_CERTAIN = math.log(20.0)
+ISOLATION_INFORMATION = math.log(20.0)
+"""Information at which a rival hypothesis is rejected with 95 % confidence."""
 
 ISOLATION_HORIZON_N = 300
-"""A change that cannot be told from others within so many samples counts as one that never can."""
+"""Samples after a change in which it must be isolated; later counts as never."""
 
 _RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 221))
-"""Magnitudes of a rival; the best is interpolated."""
+"""Factors on the rival parameter; the most similar one is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -47,55 +47,56 @@ class _Change:
 
     before: Plant
     after: Plant
-    turning: Sequence[SampledPlant]
-    """The plant in each of the sample periods after it while it lasts."""
+    ramp: Sequence[SampledPlant]
+    """Plant in each sample period of the ramp; empty for a jump."""
     state: State
-    """In which it finds the plant."""
+    """State of the plant at the change."""
     force_n: NDArray[np.float64]
-    """(n,) as it was measured."""
+    """(n,) measured force in newtons."""
     weight: NDArray[np.float64]
-    """(n,) of a squared metre of displacement, after each of these forces: information; 0 for a missing sample."""
+    """(n,) information per squared metre of displacement after each force; 0 for a missing sample."""
 
 
-def changes(run: Run) -> list[NDArray[np.float64]]:
-    """For each change of the plant in ``run``: I(1), I(2), ... up to the next change or the end.
+def change_information(run: Run) -> list[NDArray[np.float64]]:
+    """I(1), I(2), ... of each change of ``run``, up to the next change or the end: float64 arrays.
 
-    Both plants start from the state in which the change finds the true one and feel the force that was measured.
-    Samples that the device could not use carry no information.
+    Both plants start from the true state at the change and follow the measured force. Samples that the device could
+    not use carry no information.
     """
     period_s = run.conditions.sample_period_problem_s
-    return [_information(change, period_s) for change in _changes(run)]
+    return [_information(change, period_s) for change in _run_changes(run)]
 
 
 def _information(change: _Change, period_s: float) -> NDArray[np.float64]:
-    """I(1), I(2), ... of one change."""
-    changed = _Motion.after(change, period_s)
-    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.of(change.before, period_s)))
+    """I(1), I(2), ... of one change, float64."""
+    changed = _Motion.of_change(change, period_s)
+    unchanged = _Motion(change.state, itertools.repeat(SampledPlant.from_plant(change.before, period_s)))
     out = np.empty(len(change.force_n))
     gathered = 0.0
     for first in range(0, len(out), CHUNK_SAMPLES):
         part = slice(first, first + CHUNK_SAMPLES)
-        difference_m = changed.under(change.force_n[part]) - unchanged.under(change.force_n[part])
+        difference_m = changed.displacement_m(change.force_n[part]) - unchanged.displacement_m(change.force_n[part])
         out[part] = np.cumsum(np.append(gathered, difference_m**2 * change.weight[part]))[1:]
         gathered = float(out[part][-1])
     return out
 
 
 class _Motion:
-    """Displacement of a plant under a force, part by part."""
+    """Simulation of a plant under a force, chunk by chunk."""
 
     def __init__(self, state: State, steps: Iterator[SampledPlant]) -> None:
-        """From ``state`` on; ``steps`` are the plant in one sample period after the other."""
+        """Start from ``state``; ``steps`` yields the plant of each sample period."""
         self.state = state
         self._steps = steps
 
     @classmethod
-    def after(cls, change: _Change, period_s: float) -> _Motion:
-        settled = itertools.repeat(SampledPlant.of(change.after, period_s))
-        return cls(change.state, itertools.chain(change.turning, settled))
+    def of_change(cls, change: _Change, period_s: float) -> _Motion:
+        """Motion of the true plant from the change on."""
+        settled = itertools.repeat(SampledPlant.from_plant(change.after, period_s))
+        return cls(change.state, itertools.chain(change.ramp, settled))
 
-    def under(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) metres, after each of the n forces that come next."""
+    def displacement_m(self, force_n: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement after each of the next n forces, (n,) metres."""
         state = self.state
         out = np.empty(len(force_n))
         for k, (force, step) in enumerate(zip(force_n.tolist(), self._steps, strict=False)):
@@ -121,11 +122,14 @@ def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v
 def predicted_bounds(
     scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096, rate_hz: float = 20e3
 ) -> list[int | None]:
-    """For each change of a scenario the samples after which it can be seen; None: not before the next or the end."""
+    """Predicted information bound of each change of a scenario; None: not detectable before the next one or the end.
+
+    Parameters as ``detectable``; ``rate_hz`` is the sample rate.
+    """
     scales = PROGRAMS[scenario.plant.set].scales
     lsb_m = lsb_v / scales.volts("displacement")
     weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
-    volts = _levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
+    volts = _mean_levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
     force_n = volts / scales.volts("force")
     segments = scenario.segments()
     stretches = [
@@ -138,51 +142,53 @@ def predicted_bounds(
     period_s = scales.time / rate_hz
     return [
         first_reaching(_information(change, period_s), math.log(arl0))
-        for change in _courses_of(stretches, ramps_n, force_n, weight, period_s)
+        for change in _changes_between(stretches, ramps_n, force_n, weight, period_s)
     ]
 
 
-def _levels(edges: Edges, samples: int) -> NDArray[np.float64]:
-    """(n,) volts in the period after each sample, on average."""
+def _mean_levels(edges: Edges, samples: int) -> NDArray[np.float64]:
+    """Mean voltage in the period after each sample, (n,) volts."""
     ticks = np.append(edges.ticks, samples * TICKS_PER_SAMPLE).astype(np.float64) / TICKS_PER_SAMPLE
     integral = np.interp(np.arange(samples + 1), ticks, np.append(0.0, np.cumsum(edges.levels_v * np.diff(ticks))))
     return np.asarray(np.diff(integral))
 
 
 def isolation_bounds(run: Run) -> list[int | None]:
-    """For each change of the plant in ``run``: the samples after which it can be told from a change of any other one
-    parameter, be it by the factor that looks most like it; None: not before the next change or the end.
+    """Isolation bound of each change of ``run`` in samples; None: not before the next change or the end.
+
+    The rival hypotheses are changes of one other parameter by any factor from 1/4 to 4.
     """
     period_s = run.conditions.sample_period_problem_s
     out: list[int | None] = []
-    for (start, _, _), change in zip(run.segments[1:], _changes(run), strict=True):
+    for (start, _, _), change in zip(run.segments[1:], _run_changes(run), strict=True):
         if start in run.conditions.records or change.before == change.after:
-            out.append(None)  # nothing for the device to tell: it begins afresh with each record
+            out.append(None)  # the device restarts with each record and has nothing to isolate
             continue
         changed = tuple(change.before.changes_to(change.after))
-        course = _Motion.after(change, period_s).under(change.force_n[:ISOLATION_HORIZON_N])
+        course = _Motion.of_change(change, period_s).displacement_m(change.force_n[:ISOLATION_HORIZON_N])
         least = np.full(len(course), np.inf)
         for name in PARAMETERS:
             if changed != (name,):
-                apart = (_courses(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
-                least = np.minimum(least, _least(np.cumsum(apart, axis=1)))
-        out.append(first_reaching(least, LN_CERTAIN))
+                apart = (_rival_displacements(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
+                least = np.minimum(least, _interpolated_minimum(np.cumsum(apart, axis=1)))
+        out.append(first_reaching(least, ISOLATION_INFORMATION))
     return out
 
 
-def _changes(run: Run) -> Iterator[_Change]:
+def _run_changes(run: Run) -> Iterator[_Change]:
+    """Changes of the plant in ``run``, including those at the start of a record."""
     conditions = run.conditions
     force_n = run.channel("force")
     displacement = conditions.channels["displacement"]
     variance_m2 = (displacement.noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * displacement.lsb**2
     weight = np.where(run.missing, 0.0, 1.0 / (2.0 * variance_m2))
     ramps_n = {segment.start: segment.ramp_n for segment in conditions.segments}
-    return _courses_of(
+    return _changes_between(
         run.segments, ramps_n, force_n, weight, conditions.sample_period_problem_s, records=conditions.records
     )
 
 
-def _courses_of(
+def _changes_between(
     stretches: Iterable[tuple[int, int, Plant]],
     ramps_n: Mapping[int, int],
     force_n: NDArray[np.float64],
@@ -190,42 +196,42 @@ def _courses_of(
     period_s: float,
     records: Sequence[int] = (0,),
 ) -> Iterator[_Change]:
-    """The changes between stretches (start, end, plant) under a force; with each of the records it begins at rest."""
+    """Changes between stretches (start, end, plant) under a force. The plant is at rest at the start of each record."""
     state = AT_REST
     before: Plant | None = None
     for start, end, plant in stretches:
         if start in records:
             state = AT_REST
-        turning = _turning(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
-        change = _Change(before or plant, plant, turning, state, force_n[start : end - 1], weight[start + 1 : end])
+        ramp = _ramp_plants(before or plant, plant, ramps_n.get(start, 0), end - start, period_s)
+        change = _Change(before or plant, plant, ramp, state, force_n[start : end - 1], weight[start + 1 : end])
         if before is not None:
             yield change
         if end < len(force_n):
-            motion = _Motion.after(change, period_s)
+            motion = _Motion.of_change(change, period_s)
             for first in range(start, end, CHUNK_SAMPLES):
-                motion.under(force_n[first : min(first + CHUNK_SAMPLES, end)])
+                motion.displacement_m(force_n[first : min(first + CHUNK_SAMPLES, end)])
             state = motion.state
         before = plant
 
 
-def _turning(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
-    """The plant in each of the sample periods of a ramp, in the middle of the period."""
-    return SampledPlant.of_each(
-        [before.on_the_way(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
+def _ramp_plants(before: Plant, after: Plant, ramp_n: int, samples: int, period_s: float) -> list[SampledPlant]:
+    """Plant in the middle of each sample period of a ramp."""
+    return SampledPlant.from_plants(
+        [before.interpolate(after, (k + 0.5) / ramp_n) for k in range(min(ramp_n, samples))], period_s
     )
 
 
 def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
-    """The first n with I(n) >= level, or None."""
+    """Smallest n with I(n) >= level, or None."""
     reached = np.flatnonzero(np.asarray(information) >= level)
     return int(reached[0]) + 1 if len(reached) else None
 
 
-def _courses(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
-    """(f, n) metres, had ``M``, ``B`` or ``K`` alone changed by each of the rival factors; up to the horizon."""
+def _rival_displacements(change: _Change, name: str, period_s: float) -> NDArray[np.float64]:
+    """Displacement if only the parameter ``name`` had changed, for each rival factor: (f, n) metres, to the horizon."""
     plants = np.tile(list(change.before.parameters().values()), (len(_RIVAL_FACTORS), 1))
     plants[:, PARAMETERS.index(name)] *= _RIVAL_FACTORS
-    (xx, xv, xf), (vx, vv, vf) = sampled(plants, period_s).transpose(1, 2, 0)
+    (xx, xv, xf), (vx, vv, vf) = discretise(plants, period_s).transpose(1, 2, 0)
     x, v = (np.full(len(plants), value) for value in change.state)
     forces = change.force_n[:ISOLATION_HORIZON_N].tolist()
     out = np.empty((len(plants), len(forces)))
@@ -235,8 +241,8 @@ def _courses(change: _Change, name: str, period_s: float) -> NDArray[np.float64]
     return out
 
 
-def _least(information: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(f, n) at evenly spaced f: the least over f (n,), by a parabola through the three lowest."""
+def _interpolated_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Minimum over evenly spaced f of (f, n), interpolated by a parabola through three points: (n,)."""
     at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
     low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))
     curvature = low + high - 2.0 * mid

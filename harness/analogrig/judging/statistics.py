@@ -1,14 +1,11 @@
-"""What runs say about a rate, with proof: exact bounds for a length fixed beforehand, and tests that may stop early.
+"""Confidence bounds and tests for event rates: fixed sample size, and sequential.
 
-Clopper-Pearson bounds and ``Design`` are for a number of samples that was fixed before the first one was looked at. Who
-looks while samples come, and stops when it suits, uses a ``SequentialTest`` (two rates, fixed error probabilities) or a
-``ConfidenceSequence`` (a bound that holds at all times at once). Sources: Clopper and Pearson, Biometrika 26 (1934);
-Wald, Sequential Analysis (1947); Robbins, Annals of Mathematical Statistics 41 (1970).
-Where a rate is estimated and not counted (analogrig.campaigns.rare), ``mean_bounds`` are those of the mean of many
-estimates.
+Clopper-Pearson bounds and ``Design`` require a sample size fixed in advance. A test that may stop early needs a
+``SequentialTest`` (two rates, fixed error probabilities) or a ``ConfidenceSequence`` (bounds valid at all times at
+once). ``mean_bounds`` bounds a rate that is estimated, not counted (analogrig.campaigns.rare). Sources: Clopper and
+Pearson, Biometrika 26 (1934); Wald, Sequential Analysis (1947); Robbins, Annals of Mathematical Statistics 41 (1970).
 
-False alarms are counted as events among samples: after each the estimator begins anew, so that they are as good as
-independent.
+False alarms are counted as events among samples. The estimator restarts after each, so they are nearly independent.
 """
 
 from __future__ import annotations
@@ -24,27 +21,27 @@ from numpy.typing import ArrayLike
 MOST_EVENTS = 10**9
 
 LEAST_FOR_MEAN = 8
-"""Estimates from which bounds of their mean can be had."""
+"""Fewest estimates that ``mean_bounds`` accepts."""
 
 LEAST_SKEWNESS = 1e-6
-"""Less of it is none."""
+"""Smaller skewness is not corrected."""
 
 
 class Decision(enum.Enum):
-    """What can be said of a rate."""
+    """Decision of a test: the rate is below or above the limit, or the test is still open."""
 
     BELOW = "below"
     ABOVE = "above"
     OPEN = "open"
 
 
-# ------------------------------------------------------------------------------------------- for a length fixed before
+# ---------------------------------------------------------------------------------------------------- fixed sample size
 
 
 def upper_rate(events: int, trials: int, confidence: float) -> float:
-    """The largest rate per trial with which so few events are not a surprise (Clopper and Pearson, one-sided).
+    """Upper confidence bound of a rate per trial (Clopper and Pearson, one-sided).
 
-    :raises ValueError: impossible counts, or a confidence that is none.
+    :raises ValueError: impossible counts, or ``confidence`` not between 0 and 1.
     """
     _check(events, trials, confidence)
     if events == trials:
@@ -55,7 +52,7 @@ def upper_rate(events: int, trials: int, confidence: float) -> float:
 
 
 def lower_rate(events: int, trials: int, confidence: float) -> float:
-    """The smallest rate per trial with which so many events are not a surprise; errors as ``upper_rate``."""
+    """Lower confidence bound of a rate per trial; errors as ``upper_rate``."""
     _check(events, trials, confidence)
     if events == 0:
         return 0.0
@@ -65,8 +62,7 @@ def lower_rate(events: int, trials: int, confidence: float) -> float:
 
 
 def poisson_mean(events: int, confidence: float) -> float:
-    """The largest mean number of rare events with which so few are not a surprise: ``upper_rate`` times trials, for
-    many of them; errors as there."""
+    """Upper confidence bound of a Poisson mean: limit of ``trials * upper_rate`` for many trials; errors as there."""
     _check(events, MOST_EVENTS, confidence)
     from scipy.special import gammaincinv
 
@@ -74,19 +70,19 @@ def poisson_mean(events: int, confidence: float) -> float:
 
 
 def rate_interval(events: int, trials: int, confidence: float) -> tuple[float, float]:
-    """Both bounds, each wrong with half of 1 - confidence; errors as ``upper_rate``."""
+    """Two-sided confidence interval of a rate (Clopper and Pearson); errors as ``upper_rate``."""
     one_sided = 0.5 * (1.0 + confidence)
     return lower_rate(events, trials, one_sided), upper_rate(events, trials, one_sided)
 
 
 def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, float]:
-    """One-sided bounds of what independent unbiased estimates, none negative, have for mean, each with this confidence.
+    """Lower and upper one-sided confidence bound of the mean of independent, unbiased, non-negative estimates.
 
-    Student's t after Hall's transformation, which takes out the skewness (Journal of the Royal Statistical Society B
-    54, 1992; after Johnson, JASA 73, 1978). Unlike those of counts these bounds are not exact: what is left of the
-    error falls with the number of estimates.
+    Student's t after Hall's transformation, which corrects the skewness (Journal of the Royal Statistical Society B
+    54, 1992; after Johnson, JASA 73, 1978). These bounds are approximate; their error falls with the number of
+    estimates.
 
-    :raises ValueError: fewer than LEAST_FOR_MEAN estimates, or a confidence that is none.
+    :raises ValueError: fewer than LEAST_FOR_MEAN estimates, or ``confidence`` not between 0 and 1.
     """
     count = len(estimates)
     if count < LEAST_FOR_MEAN:
@@ -100,12 +96,12 @@ def mean_bounds(estimates: Sequence[float], confidence: float) -> tuple[float, f
     third = math.fsum(each**3 for each in off) * count / ((count - 1) * (count - 2))
     skewness = third / deviation**3 / math.sqrt(count) if deviation > 0.0 else 0.0
     quantile, error = float(stdtrit(count - 1, confidence)), deviation / math.sqrt(count)
-    low, high = (mean - _without_skewness(at, skewness) * error for at in (quantile, -quantile))
+    low, high = (mean - _invert_hall(at, skewness) * error for at in (quantile, -quantile))
     return max(low, 0.0), high
 
 
-def _without_skewness(quantile: float, skewness: float) -> float:
-    """The quantile of (mean - truth) / error, whose skewness is that of a mean: Hall's transformation, inverted."""
+def _invert_hall(quantile: float, skewness: float) -> float:
+    """Inverse of Hall's transformation: Student's quantile, corrected for the skewness of the mean."""
     if abs(skewness) < LEAST_SKEWNESS:
         return quantile
     return 3.0 / skewness * (math.cbrt(1.0 + skewness * (quantile - skewness / 6.0)) - 1.0)
@@ -113,10 +109,10 @@ def _without_skewness(quantile: float, skewness: float) -> float:
 
 @dataclass(frozen=True)
 class Design:
-    """A test of fixed length: so many trials, of which at most ``allowed`` may have an event."""
+    """Test of fixed length, passed with at most ``allowed`` events. ValueError: a value is out of range."""
 
     rate: float
-    """To be shown: the rate is not above it."""
+    """Claimed upper limit of the rate."""
     confidence: float
     allowed: int = 0
 
@@ -127,7 +123,7 @@ class Design:
 
     @property
     def trials(self) -> int:
-        """The fewest that show it: then the upper bound with ``allowed`` events is not above the rate."""
+        """Fewest trials that prove the claim: the upper bound with ``allowed`` events is at most ``rate``."""
         low, high = self.allowed + 1, self.allowed + 2
         while upper_rate(self.allowed, high, self.confidence) > self.rate:
             low, high = high, 2 * high
@@ -139,22 +135,16 @@ class Design:
                 high = middle
         return high
 
-    def chance_to_pass(self, true_rate: float) -> float:
-        """The probability that a device with that rate passes; at ``rate`` it is 1 - confidence."""
-        from scipy.stats import binom
-
-        return float(binom.cdf(self.allowed, self.trials, true_rate))
-
 
 def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:
-    """The mean of two values or more and both bounds of it, each wrong with half of 1 - confidence (Student 1908).
+    """Mean with its two-sided confidence interval, as (mean, low, high) (Student 1908).
 
-    :raises ValueError: fewer values, or a confidence that is none.
+    :raises ValueError: fewer than two values, or ``confidence`` not between 0 and 1.
     """
     sample = np.asarray(values, dtype=np.float64)
     _check(0, len(sample), confidence)
     if len(sample) < 2:
-        raise ValueError("one value says nothing about the next")
+        raise ValueError("there must be at least two values, not one")
     from scipy.special import stdtrit
 
     mean, error = float(sample.mean()), float(sample.std(ddof=1)) / math.sqrt(len(sample))
@@ -162,15 +152,16 @@ def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, f
     return mean, mean - margin, mean + margin
 
 
-# ---------------------------------------------------------------------------------------------- where stopping is free
+# ----------------------------------------------------------------------------------------------------------- sequential
 
 
 @dataclass
 class SequentialTest:
-    """Wald's test of a good rate against a bad one; it may be looked at after every trial.
+    """Wald's sequential test of a good rate against a bad one; may be evaluated after every trial.
 
-    The probability to call a rate of ``bad`` or more BELOW is at most ``miss``, to call one of ``good`` or less ABOVE
-    at most ``false_alarm`` (Wald 1947, section 3.2: with 1 / false_alarm and miss for A and B, both hold).
+    BELOW for a rate of ``bad`` or more has a probability of at most ``miss``. ABOVE for a rate of ``good`` or less has
+    a probability of at most ``false_alarm``. Source: Wald 1947, section 3.2, with A = 1 / false_alarm and B = miss.
+    ValueError: a value is out of range.
     """
 
     good: float
@@ -187,7 +178,7 @@ class SequentialTest:
             raise ValueError("the error probabilities must be between 0 and 0.5")
 
     def add(self, trials: int, events: int) -> Decision:
-        """What can be said after so many more."""
+        """Add the counts of more trials; return the decision."""
         _check_counts(events, trials)
         self.trials += trials
         self.events += events
@@ -195,31 +186,27 @@ class SequentialTest:
 
     @property
     def log_ratio(self) -> float:
-        """Logarithm of the likelihood of the bad rate over that of the good one."""
+        """Log-likelihood ratio of the bad rate to the good one."""
         return self.events * math.log(self.bad / self.good) + (self.trials - self.events) * (
             math.log1p(-self.bad) - math.log1p(-self.good)
         )
 
     @property
     def decision(self) -> Decision:
+        """Decision after the trials so far."""
         if self.log_ratio <= math.log(self.miss):
             return Decision.BELOW
         if self.log_ratio >= -math.log(self.false_alarm):
             return Decision.ABOVE
         return Decision.OPEN
 
-    @property
-    def fewest_trials(self) -> int:
-        """Without any event it says BELOW after so many."""
-        return math.ceil(math.log(self.miss) / (math.log1p(-self.bad) - math.log1p(-self.good)))
-
 
 @dataclass
 class ConfidenceSequence:
-    """Bounds of a rate that hold with ``confidence`` after every trial at once: Robbins' mixture over Beta(a, b).
+    """Confidence sequence of a rate: bounds valid after every trial at once (Robbins' mixture over Beta(a, b)).
 
-    By Ville's inequality the true rate is ever outside with a probability of at most 1 - confidence. The mixture is
-    meant for rare events: ``expected_rate`` says where the bounds shall be tightest.
+    By Ville's inequality the true rate ever leaves the bounds with a probability of at most 1 - confidence. The bounds
+    are tightest near ``expected_rate``. ValueError: a value is out of range.
     """
 
     confidence: float
@@ -236,7 +223,7 @@ class ConfidenceSequence:
         self._b = self._a * (1.0 - self.expected_rate) / self.expected_rate
 
     def add(self, trials: int, events: int) -> tuple[float, float]:
-        """The bounds after so many more."""
+        """Add the counts of more trials; return the bounds."""
         _check_counts(events, trials)
         self.trials += trials
         self.events += events
@@ -244,21 +231,21 @@ class ConfidenceSequence:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """The rates that are not refuted yet: those whose martingale has stayed below 1 / (1 - confidence)."""
+        """Interval of the rates whose martingale is below 1 / (1 - confidence)."""
         if self.trials == 0:
             return 0.0, 1.0
         most_likely = self.events / self.trials
-        low = 0.0 if self.events == 0 else self._edge(most_likely, 0.0)
-        high = 1.0 if self.events == self.trials else self._edge(most_likely, 1.0)
+        low = 0.0 if self.events == 0 else self._bisect_bound(most_likely, 0.0)
+        high = 1.0 if self.events == self.trials else self._bisect_bound(most_likely, 1.0)
         return low, high
 
     def decision(self, rate: float) -> Decision:
-        """Of the true rate against that one."""
+        """Decision whether the true rate is below or above ``rate``."""
         low, high = self.bounds
         return Decision.BELOW if high <= rate else Decision.ABOVE if low > rate else Decision.OPEN
 
-    def _edge(self, inside: float, outside: float) -> float:
-        """Where the martingale reaches its limit between a rate that is in and one that is out."""
+    def _bisect_bound(self, inside: float, outside: float) -> float:
+        """Rate at which the martingale reaches its limit, by bisection between ``inside`` and ``outside``."""
         for _ in range(200):
             middle = 0.5 * (inside + outside)
             if middle in (inside, outside):
@@ -270,6 +257,7 @@ class ConfidenceSequence:
         return outside
 
     def _log_martingale(self, rate: float) -> float:
+        """Logarithm of the mixture likelihood over the likelihood of ``rate``."""
         failures = self.trials - self.events
         mixed = _log_beta(self._a + self.events, self._b + failures) - _log_beta(self._a, self._b)
         return mixed - self.events * math.log(rate) - failures * math.log1p(-rate)
@@ -282,7 +270,7 @@ def _log_beta(a: float, b: float) -> float:
 def _check(events: int, trials: int, confidence: float) -> None:
     _check_counts(events, trials)
     if trials < 1:
-        raise ValueError("nothing is known without a trial")
+        raise ValueError("there must be at least one trial")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must be between 0 and 1, not {confidence:g}")
 

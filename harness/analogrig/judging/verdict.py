@@ -1,13 +1,13 @@
 """The verdict on a Run, computed from the Run alone, so that a recording can be judged again.
 
-An alarm belongs to the change in whose segment it falls; the first one there is its detection, every other alarm is a
-false alarm, but for those while a change lasts. The device is late when the information that had accumulated by its
-alarm was many times what is needed.
+An alarm is attributed to the change in whose segment it falls. The first alarm of a segment is the detection. Every
+other alarm is a false alarm, except alarms during a ramp. A detection is late if the information I(n) accumulated
+until the alarm was many times the information needed.
 
-Where nobody knows the instant of a change, but between which instants it lies, the run is judged three times: as if all
-changes had come at their earliest, their likeliest, their latest instants. What all three say holds: an alarm before
-the earliest instant is a false one, and a device is late if it is late even for the latest. Where they differ the run
-is INCONCLUSIVE, and so it is where a change cannot be found in the samples at all.
+If the instant of a change is known only as an interval, the run is judged under three hypotheses: all changes at their
+earliest, their likeliest, and their latest instants. A finding holds if it holds under all three: an alarm before the
+earliest instant is false, and a detection is late if it is late even for the latest instant. The run is INCONCLUSIVE
+if the hypotheses disagree, or if a change cannot be found in the samples.
 """
 
 from __future__ import annotations
@@ -31,41 +31,40 @@ from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
 
 LARGEST_LEVEL = 700.0
-"""exp() of more does not fit a float."""
+"""Largest argument of exp() whose result is finite."""
 
 Outcome = Literal["passed", "failed", "inconclusive"]
 
 Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not judged"]
-"""Of a change: unseeable carried too little information; undecided depends on its instant, which is not known so well;
-not judged was not found in the samples."""
+"""Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
+instant, which is known only as an interval. ``not judged``: the change was not found in the samples."""
 
-
-NAMES = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
-"""What a device can say has changed."""
+DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
+"""Changes that a device can diagnose, with their names in verdicts."""
 
 
 @dataclass(frozen=True)
 class DiagnosisVerdict:
-    """What the device said had changed, after the alarm that noticed the change."""
+    """Verdict on the first diagnosis after the detection of a change."""
 
     named: str
     """``M``, ``B``, ``K`` or ``several``."""
     right: bool
     delay_n: int
-    """Samples from the change until it was said."""
+    """Samples from the change to the diagnosis."""
     bound_n: int | None
-    """The isolation bound of this very change; None: it could not be told from others before the next or the end."""
+    """Isolation bound of this change; None: it could not be isolated before the next change or the end."""
     onset_error_n: int
-    """Of the sample that was named, in samples."""
+    """Diagnosed minus true sample of the change."""
     extent: float | None
-    """New over old, as it was said; None if several, or non-finite."""
+    """Diagnosed ratio of the new to the old value; None if several parameters were named, or non-finite."""
     extent_error: float | None
-    """Relative; None unless one parameter has changed and was named."""
+    """Relative error of ``extent``; None unless exactly one parameter changed and was named."""
 
 
 @dataclass(frozen=True)
 class TweakVerdict:
-    """Verdict on one change of the plant. Latencies and bounds are in samples, from the change to the alarm."""
+    """Verdict on one change of the plant. Latencies and bounds are in samples after the change."""
 
     sample: int
     what: str
@@ -75,52 +74,53 @@ class TweakVerdict:
     latency_n: int | None
     """None: no alarm before the next change or the end."""
     bound_n: int | None
-    """The information bound of this very change; None: it could not be seen before the next change or the end."""
+    """Information bound of this change; None: not detectable before the next change or the end."""
     deadline_n: int | None
-    """A later alarm is late."""
+    """Latest alarm that is not late; None: no alarm is late."""
     diagnosis: DiagnosisVerdict | None = None
-    """None: the device did not say, for lack of certainty or because it does not isolate."""
-    others: tuple[TweakVerdict, ...] = ()
-    """The same for the earliest and the latest instant at which it may have come; none if it is known."""
+    """None: the device reported no diagnosis."""
+    alternatives: tuple[TweakVerdict, ...] = ()
+    """Verdicts for the earliest and the latest possible instant; empty if the instant is exact."""
     unseen: str = ""
-    """Why nobody knows whether and when it came; it is then not judged."""
+    """Reason that the change was not found in the samples and is not judged; empty otherwise."""
 
     @property
-    def possible(self) -> tuple[TweakVerdict, ...]:
-        """For each instant that it is judged for, in order of time."""
-        return tuple(sorted((self, *self.others), key=lambda each: each.sample))
+    def hypotheses(self) -> tuple[TweakVerdict, ...]:
+        """Verdicts under all hypotheses, in order of time."""
+        return tuple(sorted((self, *self.alternatives), key=lambda each: each.sample))
 
     @property
     def between(self) -> tuple[int, int]:
-        """The earliest and the latest instant."""
-        return self.possible[0].sample, self.possible[-1].sample
+        """Earliest and latest possible sample of the change."""
+        return self.hypotheses[0].sample, self.hypotheses[-1].sample
 
     @property
     def latencies_n(self) -> tuple[int, int] | None:
-        """The least and the greatest that it may be; None: no alarm belongs to it."""
-        known = [each.latency_n for each in self.possible if each.latency_n is not None]
+        """Smallest and largest possible latency; None: no alarm is attributed to the change."""
+        known = [each.latency_n for each in self.hypotheses if each.latency_n is not None]
         return (min(known), max(known)) if known else None
 
     @property
     def result(self) -> Result:
-        """For every instant that it is judged for."""
+        """Result under all hypotheses; ``undecided`` if they differ."""
         if self.unseen:
             return "not judged"
-        results = {_result(each) for each in self.possible}
+        results = {_result_at_instant(each) for each in self.hypotheses}
         return results.pop() if len(results) == 1 else "undecided"
 
     @property
     def missed(self) -> bool:
-        """It could be seen, and was not."""
+        """True if the change was detectable and raised no alarm."""
         return self.latency_n is None and self.bound_n is not None
 
     @property
     def late(self) -> bool:
+        """True if the first alarm came after the deadline."""
         return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
 
 
-def _result(tweak: TweakVerdict) -> Result:
-    """For the very instant that it has."""
+def _result_at_instant(tweak: TweakVerdict) -> Result:
+    """Result of the change if ``tweak.sample`` is its true instant."""
     if tweak.missed:
         return "missed"
     if tweak.late:
@@ -130,7 +130,7 @@ def _result(tweak: TweakVerdict) -> Result:
 
 @dataclass(frozen=True)
 class SegmentEstimate:
-    """M, B, K at the end of a stretch in which the plant did not change, samples ``start`` <= k < ``end``."""
+    """Last estimate of M, B, K in a segment of constant plant, samples ``start`` <= k < ``end``."""
 
     start: int
     end: int
@@ -140,7 +140,7 @@ class SegmentEstimate:
 
     @property
     def error(self) -> Mapping[str, float]:
-        """Relative errors, by name; empty without an estimate."""
+        """Relative errors of M, B, K by name; empty without an estimate."""
         if self.estimate is None:
             return {}
         return {name: self.estimate[name] / truth - 1.0 for name, truth in self.truth.items()}
@@ -155,57 +155,58 @@ class Verdict:
 
     outcome: Outcome
     reasons: tuple[str, ...]
-    """Why it is not ``passed``; empty if it is."""
+    """Reasons for any outcome but ``passed``; empty if passed."""
     tweaks: tuple[TweakVerdict, ...]
     false_alarms: tuple[int, ...]
-    """Sample indices; of those that are so whenever the changes came."""
+    """Sample indices of the alarms that are false under all hypotheses."""
     estimates: tuple[SegmentEstimate, ...]
     arl0: float
-    """The mean time between false alarms that the bounds assume."""
+    """Mean time between false alarms assumed by the bounds, in samples."""
     ceiling: float | None
-    """Of the trigger's statistic; None without a trigger."""
+    """Alarm threshold of the trigger's statistic; None without a trigger."""
     missing_n: int
     theta_hash: str
     overloads: Mapping[str, int] = field(default_factory=dict)
-    """Amplifier to the first sample that was taken with its overload lamp lit."""
+    """First sample with a lit overload lamp, by amplifier."""
     doubtful_alarms: tuple[int, ...] = ()
-    """Sample indices of those that are false ones, or not, depending on when a change came."""
+    """Sample indices of the alarms that are false under some hypotheses only."""
 
     @property
     def valid(self) -> bool:
+        """True if the run permits a verdict on the device."""
         return self.outcome != "inconclusive"
 
 
 def is_captured(run: Run) -> bool:
-    """Whether it was read from a CAN log, whose gaps say nothing of what the device had."""
+    """True if the run was read from a CAN log. Gaps in a log do not prove that the device lost samples."""
     return bool(run.conditions.dut.get("kind") == "log")
 
 
 def missing_text(run: Run) -> str:
-    """What the samples are that count as missing."""
+    """Predicate for the missing samples of ``run``, for messages."""
     return "missing for the device or not in the log" if is_captured(run) else MISSING
 
 
 def judge(run: Run) -> Verdict:
-    """Verdict on ``run`` by the expectations of its scenario. The same run gives the same verdict.
+    """Verdict on ``run`` against the expectations of its scenario. Deterministic.
 
-    :raises ConfigurationError: the recorded scenario has an expectation that is wrong.
+    :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
     trigger = run.conditions.dut["estimator"]
     level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
-    judged = _judged(run, expect, level)
-    invalid = _invalidities(run, expect)
-    outcome, reasons = _concluded(judged, expect)
-    certain = set(judged[0].false_alarms).intersection(*(each.false_alarms for each in judged))
-    possible = {index for each in judged for index in each.false_alarms}
+    results = _evaluate_hypotheses(run, expect, level)
+    invalid = _invalid_reasons(run, expect)
+    outcome, reasons = _decide_outcome(results, expect)
+    certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
+    possible = {index for each in results for index in each.false_alarms}
     return Verdict(
         outcome="inconclusive" if invalid else outcome,
         reasons=(*invalid, *reasons),
-        tweaks=_with_others(judged),
+        tweaks=_merge_hypotheses(results),
         false_alarms=tuple(sorted(certain)),
         doubtful_alarms=tuple(sorted(possible - certain)),
-        estimates=_segment_estimates(run.supposing(Segment.earliest)),
+        estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
         missing_n=int(run.missing.sum()),
@@ -215,7 +216,7 @@ def judge(run: Run) -> Verdict:
 
 
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-    """M, B, K after every sample, or those named: (n, 3), NaN where theta describes no mass, damper and spring."""
+    """Estimated M, B, K after each of ``samples``: (n, 3) float64; NaN if theta describes no mass, damper, spring."""
     channels = run.conditions.channels
     return physical_parameters(
         run.theta[samples],
@@ -227,7 +228,7 @@ def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArra
 
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
-    """The verdict in plain JSON types; latencies and bounds in samples."""
+    """Verdict in plain JSON types; latencies and bounds in samples."""
     return {
         "outcome": verdict.outcome,
         "valid": verdict.valid,
@@ -269,87 +270,92 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Judgement:
-    """Of a run whose changes came at these instants."""
+class _HypothesisResult:
+    """Result of a run under one hypothesis about the instants of its changes."""
 
     tweaks: tuple[TweakVerdict, ...]
     false_alarms: tuple[int, ...]
     failures: tuple[str, ...]
 
 
-def _judged(run: Run, expect: Expectations, level: float) -> list[_Judgement]:
-    """At the likeliest instants; and at the earliest and the latest, where they are not exact."""
+def _evaluate_hypotheses(run: Run, expect: Expectations, level: float) -> list[_HypothesisResult]:
+    """Results at the likeliest instants and, unless these are exact, at the earliest and the latest."""
     runs = [run]
     if not all(segment.is_exact for segment in run.conditions.segments):
-        runs += [run.supposing(Segment.earliest), run.supposing(Segment.latest)]
+        runs += [run.with_change_instants(Segment.earliest), run.with_change_instants(Segment.latest)]
     out = []
     for supposed in runs:
         tweaks, false_alarms = _attribute_alarms(supposed, expect, level)
-        out.append(_Judgement(tweaks, false_alarms, tuple(_failures(tweaks, false_alarms, expect))))
+        out.append(_HypothesisResult(tweaks, false_alarms, tuple(_failure_reasons(tweaks, false_alarms, expect))))
     return out
 
 
-def _concluded(judged: Sequence[_Judgement], expect: Expectations) -> tuple[Outcome, list[str]]:
-    """Outcome of a valid run, and why it is not ``passed``."""
-    tweaks = _with_others(judged)
+def _decide_outcome(results: Sequence[_HypothesisResult], expect: Expectations) -> tuple[Outcome, list[str]]:
+    """Outcome of a valid run, with the reasons unless it is ``passed``."""
+    tweaks = _merge_hypotheses(results)
     unseen = [f"{tweak.what} at {tweak.sample} is not judged: {tweak.unseen}" for tweak in tweaks if tweak.unseen]
-    if _surely_failed(judged, expect):
-        return "failed", [*judged[0].failures, *unseen]
-    undecided = [_doubt(tweak) for tweak in tweaks if tweak.result == "undecided"]
-    counts = sorted(len(each.false_alarms) for each in judged)
+    if _fails_under_all_hypotheses(results, expect):
+        return "failed", [*results[0].failures, *unseen]
+    undecided = [_undecided_reason(tweak) for tweak in tweaks if tweak.result == "undecided"]
+    counts = sorted(len(each.false_alarms) for each in results)
     if counts[0] <= expect.false_alarms < counts[-1]:
         undecided.append(
-            f"{counts[0]} or {number_of(counts[-1], 'false alarm')}, depending on when the changes came;"
+            f"{counts[0]} or {number_of(counts[-1], 'false alarm')}, depending on the instants of the changes;"
             f" at most {expect.false_alarms} expected"
         )
-    doubts = undecided if any(each.failures for each in judged) else []  # which then are some
+    doubts = undecided if any(each.failures for each in results) else []
     return ("inconclusive" if doubts or unseen else "passed"), [*doubts, *unseen]
 
 
-def _surely_failed(judged: Sequence[_Judgement], expect: Expectations) -> bool:
-    """Whether the same is wrong at every instant: one that is late for some and missed for others may be neither."""
-    instants = list(zip(*(each.tweaks for each in judged), strict=True))
-    missed = sum(all(tweak.missed and not tweak.unseen for tweak in each) for each in instants)
-    late = any(all(tweak.late and not tweak.unseen for tweak in each) for each in instants)
-    return late or missed > expect.missed or min(len(each.false_alarms) for each in judged) > expect.false_alarms
+def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Expectations) -> bool:
+    """True if one expectation is violated under every hypothesis.
+
+    A change that is late under one hypothesis and missed under another does not count: at the true instant it may be
+    neither.
+    """
+    by_change = list(zip(*(each.tweaks for each in results), strict=True))
+    missed = sum(all(tweak.missed and not tweak.unseen for tweak in each) for each in by_change)
+    late = any(all(tweak.late and not tweak.unseen for tweak in each) for each in by_change)
+    return late or missed > expect.missed or min(len(each.false_alarms) for each in results) > expect.false_alarms
 
 
-def _doubt(tweak: TweakVerdict) -> str:
-    """Why it is undecided."""
+def _undecided_reason(tweak: TweakVerdict) -> str:
+    """Message that the result of a change depends on its instant."""
     low, high = tweak.between
-    results = " or ".join(dict.fromkeys(_result(each) for each in tweak.possible))
-    return f"{tweak.what} between {low} and {high} was {results}, depending on when it came"
+    results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.hypotheses))
+    return f"{tweak.what} between {low} and {high} was {results}, depending on its instant"
 
 
-def _with_others(judged: Sequence[_Judgement]) -> tuple[TweakVerdict, ...]:
-    """The changes at their likeliest instants, each with what is said of it at the others."""
-    likeliest, *others = (each.tweaks for each in judged)
+def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[TweakVerdict, ...]:
+    """Verdicts at the likeliest instants, each with the differing verdicts of the other hypotheses."""
+    likeliest, *others = (each.tweaks for each in results)
     return tuple(
-        dataclasses.replace(tweak, others=tuple(each[i] for each in others if each[i] != tweak))
+        dataclasses.replace(tweak, alternatives=tuple(each[i] for each in others if each[i] != tweak))
         for i, tweak in enumerate(likeliest)
     )
 
 
 def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tuple[TweakVerdict, ...], tuple[int, ...]]:
+    """Verdict on each change, and the samples of the false alarms."""
     alarms = run.alarm_index.tolist()
-    begun = {segment.start: segment for segment in run.conditions.segments}
+    by_start = {segment.start: segment for segment in run.conditions.segments}
     detected: set[int] = set()
     tweaks = []
     isolation_bounds = information.isolation_bounds(run) if len(run.diagnosis_index) else [None] * len(run.segments)
     for (_, _, before), (start, end, after), gathered, isolation_bound_n in zip(
-        run.segments, run.segments[1:], information.changes(run), isolation_bounds, strict=False
+        run.segments, run.segments[1:], information.change_information(run), isolation_bounds, strict=False
     ):
         if start in run.conditions.records:
-            continue  # the device began afresh, and has seen no other plant before
-        # The sample at which a pot jumps was taken before the jump could act: it still speaks for the old plant.
-        mine = [index for index in alarms if start < index <= end]
-        detection = mine[0] if mine else None
-        detected |= _belonging(mine, start + begun[start].ramp_n)
+            continue  # a device that restarts has no earlier plant to compare with
+        # The sample at which a pot jumps was taken before the jump could act: it still measures the old plant.
+        in_segment = [index for index in alarms if start < index <= end]
+        detection = in_segment[0] if in_segment else None
+        detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
         late = information.first_reaching(gathered, expect.late_information_ratio * level)
         tweaks.append(
             TweakVerdict(
-                unseen=begun[start].unseen,
+                unseen=by_start[start].unseen,
                 sample=start,
                 what=", ".join(changed),
                 before={name: old for name, (old, _) in changed.items()},
@@ -359,23 +365,23 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None
-                else _diagnosis(run, start, (detection, end), changed, isolation_bound_n),
+                else _judge_diagnosis(run, start, (detection, end), changed, isolation_bound_n),
             )
         )
     return tuple(tweaks), tuple(sorted(set(alarms) - detected))
 
 
-def _diagnosis(
+def _judge_diagnosis(
     run: Run, start: int, span: tuple[int, int], changed: Mapping[str, tuple[float, float]], bound_n: int | None
 ) -> DiagnosisVerdict | None:
-    """The first that was said from the alarm to the end of the segment, both included in ``span``."""
-    said = np.flatnonzero((run.diagnosis_index >= span[0]) & (run.diagnosis_index <= span[1]))
-    if not len(said):
+    """Verdict on the first diagnosis within ``span`` (detection to end of the segment, inclusive); None without one."""
+    reported = np.flatnonzero((run.diagnosis_index >= span[0]) & (run.diagnosis_index <= span[1]))
+    if not len(reported):
         return None
-    first = said[0]
-    named = NAMES[Change(run.diagnosis_change[first])]
-    reported = float(run.diagnosis_extent[first])
-    extent = reported if named in PARAMETERS and math.isfinite(reported) else None
+    first = reported[0]
+    named = DIAGNOSABLE[Change(run.diagnosis_change[first])]
+    ratio = float(run.diagnosis_extent[first])
+    extent = ratio if named in PARAMETERS and math.isfinite(ratio) else None
     right = (named,) == tuple(changed) or (named == "several" and len(changed) > 1)
     error = extent * changed[named][0] / changed[named][1] - 1.0 if right and extent is not None else None
     return DiagnosisVerdict(
@@ -389,55 +395,59 @@ def _diagnosis(
     )
 
 
-def _belonging(alarms: Sequence[int], ramp_end: int) -> set[int]:
-    """Of the alarms after a change those that are no false ones: all while it lasts, and the first when it is over.
+def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
+    """Alarms attributed to a change: all until the end of its ramp, and the first one after it.
 
-    An alarm on a ramp makes the device learn a plant that goes on changing, which is to be noticed in its turn.
+    An alarm on a ramp restarts the device on a plant that keeps changing. It must detect that change again.
     """
-    over = [index for index in alarms if index > ramp_end]
-    return {index for index in alarms if index <= ramp_end} | set(over[:1])
+    after_ramp = [index for index in alarms if index > ramp_end]
+    return {index for index in alarms if index <= ramp_end} | set(after_ramp[:1])
 
 
-def _invalidities(run: Run, expect: Expectations) -> list[str]:
+def _invalid_reasons(run: Run, expect: Expectations) -> list[str]:
+    """Reasons that the run permits no verdict; empty if it is valid."""
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {number_of(run.conditions.samples_asked, 'sample')}")
-    reasons += _losses(run)
+    reasons += _loss_reasons(run)
     refused, missing = run.conditions.counters.get("refused", 0), int(run.missing.sum())
-    return reasons + no_evidence(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
+    return reasons + evidence_gaps(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
 
 
-def no_evidence(
+def evidence_gaps(
     shown: Exposure, expect: Expectations, *, refused: int, missing: int, words: str = MISSING
 ) -> list[str]:
-    """Why what a device made of its samples is no evidence, whatever else is known of the run; empty if it is.
+    """Reasons that the device's answers prove nothing; empty if they count as evidence.
 
-    :param refused: so many it refused.
-    :param missing: so many were missing; ``words`` say of what kind these are.
+    :param refused: number of samples that the device refused.
+    :param missing: number of missing samples; ``words`` is their predicate in the message.
     """
     refusals = [f"the device refused {number_of(refused, 'sample')}"] if refused else []
-    unarmed = [shown.no_evidence] if shown.no_evidence else []
-    return [*refusals, *expect.gaps(shown.samples, missing, words), *unarmed]
+    unarmed = [shown.lack_of_evidence] if shown.lack_of_evidence else []
+    return [*refusals, *expect.excess_missing(shown.samples, missing, words), *unarmed]
 
 
-def _losses(run: Run) -> list[str]:
-    """Samples that never came to the device: more than its description allows, or not those that the harness knows."""
+def _loss_reasons(run: Run) -> list[str]:
+    """Reasons for invalidity from lost samples: too many, or counts of device and harness that disagree."""
     most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
     where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
     reasons = [f"{number_of(lost, 'sample was', 'samples were')} {where}, more than {most}"] if lost > most else []
     after_n = int(np.argmin(run.lost[::-1])) if lost < run.samples else run.samples
-    known = lost - after_n  # of those after the last one heard it cannot know
+    known = lost - after_n  # the device cannot count samples lost after the last one it received
     missed = run.conditions.counters.get("samples_lost", known)
     if missed != known:
-        reasons.append(f"the device never saw {number_of(missed, 'sample')}, where {known} are known to be lost")
-    heard_of = int(((run.flags & (LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)) == 0).sum())
-    taken_in = run.conditions.counters.get("updated", heard_of)
-    if taken_in != heard_of:
-        reasons.append(f"the device took in {number_of(taken_in, 'sample')}, where {heard_of} were heard of")
+        reasons.append(f"the device counted {number_of(missed, 'lost sample')}, the harness {known}")
+    answered = int(((run.flags & (LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)) == 0).sum())
+    updated = run.conditions.counters.get("updated", answered)
+    if updated != answered:
+        reasons.append(f"the device counted {number_of(updated, 'update')}, the harness received {answered}")
     return reasons
 
 
-def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations) -> list[str]:
+def _failure_reasons(
+    tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
+) -> list[str]:
+    """Violated expectations under one hypothesis; empty if there are none."""
     reasons = []
     judged = [tweak for tweak in tweaks if not tweak.unseen]
     missed = [tweak for tweak in judged if tweak.missed]
@@ -446,7 +456,7 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
         of = number_of(len(judged), "change")
         reasons.append(f"missed {len(missed)} of {of} ({names}), at most {expect.missed} expected")
     reasons += [
-        f"{tweak.what} at {tweak.sample} was noticed after {number_of(tweak.latency_n or 0, 'sample')},"
+        f"{tweak.what} at {tweak.sample} was detected after {number_of(tweak.latency_n or 0, 'sample')},"
         f" later than {tweak.deadline_n} (bound {tweak.bound_n})"
         for tweak in judged
         if tweak.late
@@ -457,6 +467,7 @@ def _failures(tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], e
 
 
 def _segment_estimates(run: Run) -> tuple[SegmentEstimate, ...]:
+    """Last estimate of each segment whose plant is known."""
     unseen = {segment.start for segment in run.conditions.segments if segment.unseen}
     segments = [segment for segment in run.segments if segment[0] not in unseen]
     lasts = trajectory(run, [end - 1 for _, end, _ in segments])

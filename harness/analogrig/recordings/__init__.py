@@ -1,12 +1,11 @@
-"""CAN traffic in files: what a run leaves beside its recording, and what somebody's tool has captured on a bench.
+"""CAN logs: written during a run, or captured by another tool and imported as a run.
 
-Files are those of python-can: candump's .log, Vector's .asc and .blf, .mf4 (with asammdf), and to be read PEAK's .trc.
-A capture knows neither the rig nor the plant: the scenario and the description of the rig say what they were. What it
-lacks is as if it had been lost on the way to the device; from the numbers of the messages it is known what that is.
+File formats are those of python-can: candump's .log, Vector's .asc and .blf, .mf4 (with asammdf), and PEAK's .trc
+(read only). A capture has no data about rig and plant, so an import needs a scenario and the description of a rig.
+Messages missing from the capture count as lost. Their sequence numbers reveal them.
 """
 
-from analogrig.recordings.capture import captured_run, retold
-from analogrig.recordings.frames import READ, CapturedFrames
-from analogrig.recordings.log import WRITTEN, CanLog
+from analogrig.recordings.capture import import_run, replace_scenario
+from analogrig.recordings.files import READ, WRITTEN, CanLog, CapturedFrames
 
-__all__ = ["READ", "WRITTEN", "CanLog", "CapturedFrames", "captured_run", "retold"]
+__all__ = ["READ", "WRITTEN", "CanLog", "CapturedFrames", "import_run", "replace_scenario"]

@@ -1,4 +1,4 @@
-"""A run from a CAN log: with the truth of a scenario, and the units of a rig."""
+"""Import of a run from a CAN log, with the truth of a scenario and the units of a rig."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ import numpy as np
 from analogrig import catalogue
 from analogrig.devices.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings.dictionary import Dictionary
-from analogrig.recordings.frames import CapturedFrames
-from analogrig.recordings.talk import CapturedRun, CapturedTalk
+from analogrig.recordings.decoder import CaptureDecoder, CapturedRun, FrameDecoder
+from analogrig.recordings.files import CapturedFrames
 from analogrig.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
@@ -25,10 +24,10 @@ if TYPE_CHECKING:
 
 _MOST_NAMED = 3
 _COUNTERS = ("updated", "refused", "alarms", "samples_lost")
-"""Of the device; by these it is known whether all that it did was heard."""
+"""Counters of the device that prove whether the capture is complete."""
 
 
-def captured_run(
+def import_run(
     path: Path,
     scenario: Scenario,
     rig: Rig,
@@ -37,33 +36,37 @@ def captured_run(
     number: int | None = None,
     most_lost_n: int = 0,
 ) -> Run:
-    """The run that a CAN log holds, with the truth of ``scenario`` and the units of ``rig``.
+    """Run of a CAN log, with the truth of ``scenario`` and the units of ``rig``.
 
-    Samples without codes or without all of their answers are LOST, and those without codes missing. Velocity and net
-    force do not travel: their codes are zero, and marked as clipped.
+    Samples without codes or without all of their answers are LOST; those without codes are also missing. Velocity and
+    net force are not transmitted: their codes are zero and marked as clipped.
 
-    :param number: which of several runs, from 1; None: there is only one.
-    :raises RecordingError: the file cannot be read, or there is no such run in it.
-    :raises ConfigurationError: ``dbc`` is wrong, or the scenario is not the one of the log.
+    :param dbc: DBC of the log, if it differs from the catalogue of this build.
+    :param number: number of the run in the log, from 1; None: the log holds exactly one.
+    :param most_lost_n: largest number of lost samples in a valid run.
+    :raises RecordingError: the file cannot be read, or holds no such run.
+    :raises ConfigurationError: ``dbc`` is invalid, or the log is longer than the scenario.
     """
     frames = CapturedFrames(path)
     try:
-        talk = CapturedTalk(Dictionary(dbc), frames)
+        decoder = CaptureDecoder(FrameDecoder(dbc), frames)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
-    said = _chosen(talk, frames, number)
-    if said.extent > scenario.samples:
+    captured = _select_run(decoder, frames, number)
+    if captured.extent > scenario.samples:
         raise ConfigurationError(
-            f"{path}: has {number_of(said.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
-            " is it another one?"
+            f"{path}: has {number_of(captured.extent, 'sample')}, scenario {scenario.name} {scenario.samples}:"
+            " pass the scenario that was played"
         )
-    return _run(path, said, scenario, rig, most_lost_n=most_lost_n, line=_line(talk, frames), end=frames.end)
+    return _run(
+        path, captured, scenario, rig, most_lost_n=most_lost_n, line=_line_counts(decoder, frames), end=frames.end
+    )
 
 
-def retold(run: Run, scenario: Scenario) -> Run:
-    """A recorded run with what another scenario says of its plant and asks of its device.
+def replace_scenario(run: Run, scenario: Scenario) -> Run:
+    """The same run with the plant and the expectations of another scenario.
 
-    :raises ConfigurationError: it has fewer samples.
+    :raises ConfigurationError: ``scenario`` has fewer samples than the run.
     """
     if run.samples > scenario.samples:
         raise ConfigurationError(
@@ -78,50 +81,57 @@ def retold(run: Run, scenario: Scenario) -> Run:
     return dataclasses.replace(run, conditions=conditions)
 
 
-def _line(talk: CapturedTalk, frames: CapturedFrames) -> dict[str, int]:
-    """What else was seen, by name."""
-    seen = {**talk.line, "lines_damaged": len(frames.damaged)}
-    return {name: n for name, n in seen.items() if n}
+def _line_counts(decoder: CaptureDecoder, frames: CapturedFrames) -> dict[str, int]:
+    """Traffic other than intact messages of harness and device: counts by name."""
+    counts = {**decoder.line, "lines_damaged": len(frames.damaged)}
+    return {name: n for name, n in counts.items() if n}
 
 
-def _chosen(talk: CapturedTalk, frames: CapturedFrames, number: int | None) -> CapturedRun:
-    path, runs = frames.path, [run for run in talk.runs if run.samples]
+def _select_run(decoder: CaptureDecoder, frames: CapturedFrames, number: int | None) -> CapturedRun:
+    path, runs = frames.path, [run for run in decoder.runs if run.samples]
     if not runs:
-        raise RecordingError(f"{path}: holds no run of a device{_why(talk, frames)}")
+        raise RecordingError(f"{path}: holds no run of a device{_empty_reason(decoder, frames)}")
     if number is None and len(runs) > 1:
-        raise RecordingError(f"{path}: holds {len(runs)} runs: say --run 1 to {len(runs)}")
+        raise RecordingError(f"{path}: holds {len(runs)} runs: select one with --run 1 to {len(runs)}")
     if number is not None and not 1 <= number <= len(runs):
         raise RecordingError(f"{path}: has no run {number}: there are {len(runs)}")
     return runs[(number or 1) - 1]
 
 
-def _why(talk: CapturedTalk, frames: CapturedFrames) -> str:
-    """As far as that can be told."""
+def _empty_reason(decoder: CaptureDecoder, frames: CapturedFrames) -> str:
+    """Clause of a message: the likely reason that the log holds no run; empty if unknown."""
     if frames.end:
         return f": {frames.end}"
     if frames.damaged:
         first = ", ".join(map(str, frames.damaged[:_MOST_NAMED]))
         lines = number_of(len(frames.damaged), "line is no frame", "lines are no frames")
-        return f": {lines} (at {first}); candump -L writes what can be read"
-    foreign = talk.line["frames_foreign"]
+        return f": {lines} (at {first}); candump -L writes the expected format"
+    foreign = decoder.line["frames_foreign"]
     others = number_of(foreign, "frame has another identifier", "frames have other identifiers")
-    return f": {others}; --dbc says which are ours" if foreign else ""
+    return f": {others}; pass the DBC of the log with --dbc" if foreign else ""
 
 
 def _run(
-    path: Path, said: CapturedRun, scenario: Scenario, rig: Rig, *, most_lost_n: int, line: Mapping[str, int], end: str
+    path: Path,
+    captured: CapturedRun,
+    scenario: Scenario,
+    rig: Rig,
+    *,
+    most_lost_n: int,
+    line: Mapping[str, int],
+    end: str,
 ) -> Run:
-    most = min(MAX_PARAMETERS, said.identity.get("theta_max", MAX_PARAMETERS))
-    estimator = EstimatorConfig.from_settings(said.settings, str(path), most)
-    rows = _Rows(said, estimator.parameters)
-    counters = dict(said.counters)
+    most = min(MAX_PARAMETERS, captured.identity.get("theta_max", MAX_PARAMETERS))
+    estimator = EstimatorConfig.from_settings(captured.settings, str(path), most)
+    rows = _RunArrays(captured, estimator.parameters)
+    counters = dict(captured.counters)
     lost = int(((rows.flags & LOST) != 0).sum())
-    if lost > counters.get("samples_lost", lost):  # it has seen what the capture has not
+    if lost > counters.get("samples_lost", lost):  # the device received samples that the capture lacks
         counters = {name: value for name, value in counters.items() if name not in {"samples_lost", "updated"}}
-    faults = (*scenario.caveats, *said.faults, *_gaps(path, said), *([end] if end else []))
+    faults = (*scenario.caveats, *captured.faults, *_capture_faults(path, captured), *([end] if end else []))
     performance = rig.perform(scenario, 0)
-    alarms = [alarm for alarm in said.alarms if 0 <= alarm[0] < said.extent]
-    diagnoses = [each for each in said.diagnoses if 0 <= each[0] < said.extent]
+    alarms = [alarm for alarm in captured.alarms if 0 <= alarm[0] < captured.extent]
+    diagnoses = [each for each in captured.diagnoses if 0 <= each[0] < captured.extent]
     return Run(
         conditions=Conditions(
             seed=0,
@@ -135,11 +145,11 @@ def _run(
             dut={
                 "name": "captured",
                 "kind": "log",
-                "report_interval_n": said.report_interval_n,
+                "report_interval_n": captured.report_interval_n,
                 "most_lost_n": most_lost_n,
                 "estimator": estimator.as_table(),
-                "assumed_n": sum(key not in said.settings for key, _ in estimator.settings()),
-                "identity": dict(said.identity),
+                "assumed_n": sum(key not in captured.settings for key, _ in estimator.settings()),
+                "identity": dict(captured.identity),
             },
             link=str(path),
             counters=counters,
@@ -152,17 +162,17 @@ def _run(
         innovation=rows.values[:, -1],
         statistic=rows.statistic,
         flags=rows.flags,
-        **_columns(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
-        **_columns(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
+        **_event_arrays(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
+        **_event_arrays(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
     )
 
 
-def _gaps(path: Path, said: CapturedRun) -> Iterator[str]:
-    """What the device did by its counters and the capture does not hold."""
-    alarms = said.counters.get("alarms", len(said.alarms))
-    if alarms != len(said.alarms):
-        yield f"the device raised {number_of(alarms, 'alarm')}, {path} holds {len(said.alarms)}"
-    lacking = [name for name in _COUNTERS if name not in said.counters]
+def _capture_faults(path: Path, captured: CapturedRun) -> Iterator[str]:
+    """Faults: alarms missing from the capture, or counters that cannot confirm it."""
+    alarms = captured.counters.get("alarms", len(captured.alarms))
+    if alarms != len(captured.alarms):
+        yield f"the device raised {number_of(alarms, 'alarm')}, {path} holds {len(captured.alarms)}"
+    lacking = [name for name in _COUNTERS if name not in captured.counters]
     if lacking:
         yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"
 
@@ -170,17 +180,17 @@ def _gaps(path: Path, said: CapturedRun) -> Iterator[str]:
 _TYPES = {"index": np.int64, "onset": np.int64, "kind": np.uint8, "change": np.uint8}
 
 
-def _columns(rows: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
+def _event_arrays(rows: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
     columns: Iterable[Sequence[float]] = zip(*rows, strict=True) if rows else itertools.repeat(())
     types = [_TYPES.get(name.rpartition("_")[2], np.float32) for name in names]
     return {name: np.array(column, kind) for name, kind, column in zip(names, types, columns, strict=False)}
 
 
-class _Rows:
-    """The arrays of a run."""
+class _RunArrays:
+    """Arrays of a run, filled from a capture."""
 
-    def __init__(self, said: CapturedRun, parameters: int) -> None:
-        n, elements = said.extent, (*range(parameters), int(catalogue.Element.INNOVATION))
+    def __init__(self, captured: CapturedRun, parameters: int) -> None:
+        n, elements = captured.extent, (*range(parameters), int(catalogue.Element.INNOVATION))
         self.codes = np.zeros((n, len(CHANNELS)), np.uint16)
         self.clipped = np.ones((n, len(CHANNELS)), np.bool_)
         self.values = np.zeros((n, len(elements)), np.float32)
@@ -188,7 +198,7 @@ class _Rows:
         self.flags = np.zeros(n, np.uint8)
         used = [CHANNELS.index("force"), CHANNELS.index("displacement")]
         for k in range(n):
-            sample, estimate = said.samples.get(k), said.estimates.get(k, {})
+            sample, estimate = captured.samples.get(k), captured.estimates.get(k, {})
             is_whole = set(estimate) >= set(elements)
             if sample is not None:
                 self.codes[k, used], self.clipped[k, used] = sample[:2], sample[2]
@@ -198,8 +208,8 @@ class _Rows:
                 self.values[k] = [estimate[element] for element in elements]
             elif k:
                 self.values[k, :-1] = self.values[k - 1, :-1]
-            flags, self.statistic[k] = said.steps.get(k, (LOST, self.statistic[k - 1] if k else 0.0))
-            is_due = bool(estimate) or said.report_interval_n == 1
-            if sample is None or k in said.torn or (is_due and not is_whole):
+            flags, self.statistic[k] = captured.steps.get(k, (LOST, self.statistic[k - 1] if k else 0.0))
+            is_due = bool(estimate) or captured.report_interval_n == 1
+            if sample is None or k in captured.incomplete or (is_due and not is_whole):
                 flags |= LOST
             self.flags[k] = flags if is_whole or flags & LOST else flags | UNREPORTED

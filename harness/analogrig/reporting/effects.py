@@ -1,4 +1,4 @@
-"""The table "what matters at 12 bits" as text, plain values, and a picture."""
+"""Effect sizes at 12 bits (command ``effects``) as text, plain values, and a picture."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 
 __all__ = ["as_json", "measure", "text", "write_picture"]
 
-Table = Mapping[str, Sequence[Effect]]
-"""Rows by parameter set; each set has the same rows."""
+EffectsBySet = Mapping[str, Sequence[Effect]]
+"""Effects by parameter set; each set has the same effects in the same order."""
 
 _COLOURS = ("#2b6cb0", "#c05621")
 _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
 
-def measure(sets: Sequence[str]) -> Table:
-    """The table for these parameter sets, the largest effect first."""
+def measure(sets: Sequence[str]) -> EffectsBySet:
+    """Measure all effects for these parameter sets; the largest first."""
     found = {name: list(measure_effects(name)) for name in sets}
     largest = [max(row.median_lsb for row in rows) for rows in zip(*found.values(), strict=True)]
     order = sorted(range(len(largest)), key=lambda i: -largest[i])
     return {name: [rows[i] for i in order] for name, rows in found.items()}
 
 
-def as_json(table: Table) -> dict[str, Any]:
-    """The table in plain values, for machines."""
+def as_json(table: EffectsBySet) -> dict[str, Any]:
+    """Effects in plain JSON types."""
     return {
         "samples": SAMPLES,
         "unit": "LSB (10 V / 4096)",
@@ -48,34 +48,34 @@ def as_json(table: Table) -> dict[str, Any]:
     }
 
 
-def text(table: Table) -> str:
-    """The table for people."""
+def text(table: EffectsBySet) -> str:
+    """Effects as a table for the terminal."""
     lines = [
         f"Largest change of the displacement over {SAMPLES} samples, in LSB of 12 bits over 10 V",
-        "(of what is drawn: the median over draws)",
+        "(random effects: median over draws)",
         "",
         f"{'':34}" + "".join(f"{name:>10}" for name in table) + f"{'draws':>8}",
     ]
     for rows in zip(*table.values(), strict=True):
-        figures = "".join(f"{_rounded(row.median_lsb):>10}" for row in rows)
+        figures = "".join(f"{_format_lsb(row.median_lsb):>10}" for row in rows)
         lines.append(f"{rows[0].name:34}{figures}{rows[0].draws:>8}")
     return "\n".join(lines)
 
 
-def _rounded(lsb: float) -> str:
+def _format_lsb(lsb: float) -> str:
     return f"{lsb:.2g}" if lsb < 10 else f"{lsb:.0f}"
 
 
-def write_picture(table: Table, path: Path) -> None:
-    """Bars on a logarithmic scale, as SVG.
+def write_picture(table: EffectsBySet, path: Path) -> None:
+    """Write the effects as bars on a logarithmic scale, in SVG.
 
-    :raises RecordingError: it cannot be written.
+    :raises RecordingError: the file cannot be written.
     """
     with replacing(path) as file:
         file.write(_svg(table).encode("utf-8"))
 
 
-def _svg(table: Table) -> str:
+def _svg(table: EffectsBySet) -> str:
     row_px, top_px = 10 * len(table) + 8, 56
     names = [row.name for row in next(iter(table.values()))]
     height = top_px + row_px * len(names) + 30
@@ -105,11 +105,11 @@ def _bar(effect: Effect, y: float, colour: str) -> str:
     return (
         f'<rect x="{left:.1f}" y="{y}" width="{right - left:.1f}" height="9" fill="{colour}">'
         f"<title>{escape(effect.name)}: {effect.median_lsb:.3g} LSB</title></rect>"
-        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_rounded(effect.median_lsb)}</text>'
+        f'<text x="{right + 4:.1f}" y="{y + 8.5}" font-size="9" fill="#444">{_format_lsb(effect.median_lsb)}</text>'
     )
 
 
 def _x_px(lsb: float) -> float:
-    """Where a figure stands on the logarithmic axis; what is smaller than its left end stands there."""
+    """Position on the logarithmic axis, limited to its ends."""
     span = math.log10(_MOST_LSB / _LEAST_LSB)
     return 250.0 + 460.0 * min(max(math.log10(max(lsb, _LEAST_LSB) / _LEAST_LSB) / span, 0.0), 1.0)

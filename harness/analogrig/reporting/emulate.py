@@ -1,4 +1,4 @@
-"""The signals of a rig in a file, without any device."""
+"""Export of the signals of a rig, without a device."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def write_signals(
 ) -> dict[str, Any]:
     """Play ``scenario`` on ``rig`` and write volts, codes and clipping flags, one row a sample, as .csv or .npz.
 
-    :returns: ``samples``; ``clipped``, the samples in which any channel was clipped; ``overloads``, the amplifiers
-        whose overload lamp lit, with the sample at which it did.
-    :raises ConfigurationError: the file's ending is neither.
-    :raises RecordingError: it cannot be written.
+    :returns: ``samples``; ``clipped``, the number of samples with any channel clipped; ``overloads``, the first sample
+        with a lit overload lamp by amplifier.
+    :raises ConfigurationError: the suffix of ``path`` is neither .csv nor .npz.
+    :raises RecordingError: the file cannot be written.
     """
     if path.suffix not in (".csv", ".npz"):
         raise ConfigurationError(f"{path}: the file's name must end with .csv or .npz")

@@ -1,4 +1,4 @@
-"""The emulated computer as a SPICE deck: what a rig and a scenario make of it, for any other simulator."""
+"""SPICE deck of the emulated computer as a rig and a scenario configure it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotChange
 
 
 def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
-    """The circuit as the scenario sets it, with the components that the seed draws, its excitation and its tweaks.
+    """SPICE deck of a scenario: circuit with the components drawn from ``seed``, excitation and pot changes.
 
-    :raises ConfigurationError: the scenario cannot be played on this rig, or the rig has no circuit.
+    :raises ConfigurationError: the scenario cannot be played on this rig, or the rig is not emulated.
     """
     if not isinstance(rig, EmulatorRig):
         raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
@@ -23,13 +23,13 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
         samples=scenario.samples,
         sample_rate_hz=rate_hz,
         edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
-        turns=_turns(setup, scenario.samples),
+        turns=_dial_changes(setup, scenario.samples),
         title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
     )
 
 
-def _turns(setup: SetUp, samples: int) -> list[PotChange]:
-    """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
+def _dial_changes(setup: SetUp, samples: int) -> list[PotChange]:
+    """Dials after each sample at which one moves. A ramp becomes one step a sample, to the middle of its period."""
     dials = setup.computer.dials
     turns: list[PotChange] = []
     for sample, goals, ramp_n in setup.computer.plan(setup.changes, samples):

@@ -3,8 +3,8 @@
   const HEIGHT_PX = 210;
   const LEFT_PX = 84;
   const RIGHT_PX = 80;
-  const ROBUST_TAIL = 0.15; // of the estimates in view, on either side, may lie outside the plot ...
-  const ROBUST_SPREAD = 0.6; // ... and nothing farther than this from the truth widens it
+  const ROBUST_TAIL = 0.15; // share of the visible estimates on either side that may lie outside the plot
+  const ROBUST_SPREAD = 0.6; // relative distance from the truth beyond which an estimate does not widen the plot
   const CEILINGS_SHOWN = 2;
   const BUCKET_PX = 3;
   const { alarms, begin, cursor, curve, inks, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf } = plotting;
@@ -30,7 +30,7 @@
     return signals;
   }
 
-  // The sample of each point. Of a bucket of several samples there are two: the minimum and the maximum.
+  // Sample of each point. A bucket of several samples has two points: the minimum and the maximum.
   function placed() {
     const places = [];
     for (const [start, end, size] of run.pieces) {
@@ -42,7 +42,7 @@
     return places;
   }
 
-  // The first point at a sample or after it.
+  // First point at or after a sample.
   function pointAt(sample) {
     let [low, high] = [0, places.length];
     while (low < high) {
@@ -75,7 +75,7 @@
 
   function inView(values) {
     const [first, end] = [pointAt(view.min), pointAt(Math.floor(view.max) + 1)];
-    const seen = first < end ? values.slice(first, end) : values.slice(Math.max(0, first - 1), first + 1); // or beside
+    const seen = first < end ? values.slice(first, end) : values.slice(Math.max(0, first - 1), first + 1); // or the nearest neighbours
     return seen.filter((v) => v !== null);
   }
 
@@ -87,7 +87,7 @@
     return low === null || high === null ? [0, 1] : padded(low, high);
   }
 
-  // Before it has converged, and after every change, an estimate may be anything: such values must not squash the plot.
+  // Transients before convergence and after a change can be arbitrarily large. They must not squash the plot.
   function estimateRange(estimates, truths) {
     return (u, low, high) => {
       if (showEvery.checked) return plainRange(u, low, high);
@@ -119,7 +119,7 @@
   const wrong = marked(run.alarms.filter((alarm) => alarm.false));
   const marks = { changes, noticed, wrong };
 
-  // A lit lamp and the name of its amplifier, inside the plot: those of one sample below one another.
+  // Lit lamps with the names of their amplifiers, inside the plot. Those of one sample are stacked.
   function lamps(u, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
@@ -150,7 +150,7 @@
     ctx.restore();
   }
 
-  // Where two points stand for many samples and are so far apart that they look like a signal: shade, and words above.
+  // Shade and label the stretches in which two points represent many samples and could be taken for a signal.
   function buckets(u, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;

@@ -1,4 +1,4 @@
-"""The page as a whole: template, styles, scripts and data joined into one file."""
+"""Assembly of the page from template, styles, scripts and data."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from analogrig.storage import replacing
 
 FOLDER = Path(__file__).parent
 STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
-"""Of every page with plots."""
+"""Styles of every page with plots."""
 SCRIPTS = (FOLDER / "uPlot.iife.min.js", FOLDER / "plots.js")
-"""So too."""
+"""Scripts of every page with plots."""
 
 
 def write_report(run: Run, verdict: Verdict, path: Path) -> None:
-    """Write a run and its verdict as one HTML page without remote resources; the file appears whole or not at all.
+    """Write a run and its verdict as one HTML page without remote resources, atomically.
 
     The same run gives the same bytes.
 
-    :raises RecordingError: the page cannot be written, or the build has not put uPlot in its place.
+    :raises RecordingError: the page cannot be written, or uPlot is not installed by the build.
     """
     page = render(run, verdict)
     with replacing(path) as file:
@@ -35,11 +35,11 @@ def write_report(run: Run, verdict: Verdict, path: Path) -> None:
 
 
 def render(run: Run, verdict: Verdict) -> str:
-    """The page as text.
+    """HTML page of a run and its verdict.
 
-    :raises RecordingError: the build has not put uPlot in its place.
+    :raises RecordingError: uPlot is not installed by the build.
     """
-    return assembled(
+    return assemble_page(
         FOLDER / "page.html",
         STYLES,
         (*SCRIPTS, FOLDER / "page.js"),
@@ -57,10 +57,10 @@ def render(run: Run, verdict: Verdict) -> str:
     )
 
 
-def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
-    """A page that needs nothing but itself: ``template`` with its styles, scripts and texts; ``title`` is escaped.
+def assemble_page(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *, title: str, **texts: str) -> str:
+    """Self-contained page: ``template`` with its styles, scripts and texts. ``title`` must be escaped.
 
-    :raises RecordingError: the build has not put uPlot in its place.
+    :raises RecordingError: a file is missing, such as uPlot before the build.
     """
     style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
     head = Template(_part(FOLDER / "head.html")).substitute(
@@ -75,7 +75,7 @@ def assembled(template: Path, styles: Sequence[Path], scripts: Sequence[Path], *
 
 
 def _policy(styles: list[str], scripts: list[str]) -> str:
-    """A content security policy under which nothing is loaded and only these very styles and scripts work."""
+    """Content security policy that allows only these styles and scripts, and no network access."""
     return f"default-src 'none'; style-src {_hashes(styles)}; script-src {_hashes(scripts)}"
 
 

@@ -1,7 +1,11 @@
-"""The signals of a run as the page carries them: columns, deflated, in base64.
+"""Signals of a run for the plots of the page: columns, deflated, in base64.
 
-Codes travel as the card gave them (uint16) and are scaled in the page; what was computed travels as float32. The page
-has at most 5 MB: points, marks and steps of the truth are bounded in number, whatever the length of the run.
+Codes are embedded as uint16 and scaled in the page; computed signals as float32. The page has at most 5 MB, because
+points, marks and steps of the truth are bounded in number.
+
+A short run is shown sample by sample. A long run is divided into pieces: every sample near moments of interest, and
+elsewhere the minimum and the maximum of each bucket of consecutive samples. Zoomed out, a bucket is narrower than a
+pixel, so the plot looks the same as with all samples.
 """
 
 from __future__ import annotations
@@ -12,29 +16,123 @@ import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.verdict import TweakVerdict, Verdict, trajectory
 from analogrig.plant import PARAMETERS, Plant
-from analogrig.reporting.points import MOST_POINTS, Piece, condensed, condensed_clipping, pieces, spread
-from analogrig.run import CHANNELS, Run, missing_to_device
+from analogrig.run import CHANNELS, CHUNK_SAMPLES, Run, missing_samples
 
-_SHOWN = {"m": ("mm", 1000.0)}
-"""Units that read better as others."""
+MOST_POINTS = 100_000
+"""Longest run that is shown sample by sample."""
 
+_MOST_BUCKETS = 25_000
+_MOST_NEAR_MOMENTS = 50_000
+"""Samples shown near all moments together."""
+_MOST_MOMENTS = 100
+_LONGEST_REACH = 1_000
+"""Samples on either side of a moment."""
+
+
+class Piece(NamedTuple):
+    """Samples ``start`` <= k < ``end``, in buckets of ``size`` samples; the last bucket may be shorter."""
+
+    start: int
+    end: int
+    size: int
+    """1: the points are the samples themselves. Otherwise each bucket has two points, at its start and its middle."""
+
+    @property
+    def points(self) -> int:
+        """Number of points in the plot."""
+        return self.end - self.start if self.size == 1 else 2 * -(-(self.end - self.start) // self.size)
+
+    def parts(self) -> Iterator[slice]:
+        """Slices of whole buckets, each of about CHUNK_SAMPLES samples."""
+        step = max(1, CHUNK_SAMPLES // self.size) * self.size
+        for first in range(self.start, self.end, step):
+            yield slice(first, min(first + step, self.end))
+
+
+def pieces(samples: int, moments: Iterable[int]) -> tuple[Piece, ...]:
+    """Division of a run; ``moments`` are the samples of interest, the most important first."""
+    if samples <= MOST_POINTS:
+        return (Piece(0, samples, 1),)
+    size = -(-samples // _MOST_BUCKETS)
+    out: list[Piece] = []
+    end = 0
+    for begin, last in [*_spans_near(moments, samples), (samples, samples)]:
+        first = begin - ((begin - end) % size == 1)  # a bucket of one sample has no two points
+        if end < first:
+            out.append(Piece(end, first, size))
+        if first < last:
+            out.append(Piece(first, last, 1))
+        end = last
+    return tuple(out)
+
+
+def _spans_near(moments: Iterable[int], samples: int) -> list[tuple[int, int]]:
+    """Spans (first, end) around the most important moments, in order and apart."""
+    chosen = list(dict.fromkeys(moments))[:_MOST_MOMENTS]
+    reach = min(_LONGEST_REACH, _MOST_NEAR_MOMENTS // (2 * len(chosen))) if chosen else 0
+    out: list[tuple[int, int]] = []
+    for moment in sorted(chosen):
+        first, end = max(0, moment - reach), min(samples, moment + reach)
+        if out and first <= out[-1][1] + 1:
+            first = out.pop()[0]
+        out.append((first, end))
+    return out
+
+
+def condense(values: NDArray[Any], size: int) -> NDArray[Any]:
+    """(p, ...): minimum and maximum in turn of each bucket of (n, ...); NaN for a bucket without a finite value."""
+    if size == 1:
+        return values
+    if values.dtype.kind == "f":
+        values = np.where(np.isfinite(values), values, np.nan)
+    starts = range(0, len(values), size)
+    out = np.empty((2 * len(starts), *values.shape[1:]), values.dtype)
+    out[0::2] = np.fmin.reduceat(values, starts, axis=0)
+    out[1::2] = np.fmax.reduceat(values, starts, axis=0)
+    return out
+
+
+def condense_clipping(codes: NDArray[np.uint16], clipped: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    """(p, c): the points of ``condense(codes, size)`` that were clipped; a clipped code is an end of its range."""
+    if size == 1:
+        return clipped
+    starts = range(0, len(codes), size)
+    least, greatest = np.minimum.reduceat(codes, starts, axis=0), np.maximum.reduceat(codes, starts, axis=0)
+    bucket = np.arange(len(codes)) // size
+    out = np.empty((2 * len(starts), codes.shape[1]), np.bool_)
+    out[0::2] = np.logical_or.reduceat(clipped & (codes == least[bucket]), starts, axis=0)
+    out[1::2] = np.logical_or.reduceat(clipped & (codes == greatest[bucket]), starts, axis=0)
+    return out
+
+
+def thin_out(values: Sequence[int], samples: int, most: int) -> list[int]:
+    """At most ``most`` of ``values`` (sample indices), in order: the first in each equal part of the run."""
+    if len(values) <= most:
+        return sorted(values)
+    ordered = np.sort(np.asarray(values, np.int64))
+    _, firsts = np.unique(ordered * most // samples, return_index=True)
+    return [int(each) for each in ordered[firsts]]
+
+
+_DISPLAY_UNITS = {"m": ("mm", 1000.0)}
+"""Units that the page displays as others, with the factor."""
 
 _MOST_FALSE_ALARMS = 5_000
-"""Marks in the plots."""
+"""Largest number of false alarms marked in the plots."""
 _MOST_STEPS = 4_000
-"""Steps of the truth on all ramps together."""
+"""Largest number of steps of the truth on all ramps together."""
 
 
 @dataclass(frozen=True)
-class Column:
-    """One signal; the page shows ``offset + scale * values`` in ``unit``."""
+class PlotColumn:
+    """One signal of the plots; the page shows ``offset + scale * values`` in ``unit``."""
 
     name: str
     values: NDArray[Any]
@@ -45,10 +143,10 @@ class Column:
 
 
 def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
-    """All that the plots need, in plain JSON types without NaN."""
+    """Data of the plots in plain JSON types without NaN."""
     shown = _pieces(run, verdict)
     columns = _columns(run, shown)
-    noticed, false = _alarms(run, verdict)
+    detections, false = _alarms(run, verdict)
     return {
         "samples": run.samples,
         "points": sum(piece.points for piece in shown),
@@ -57,17 +155,18 @@ def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
             {"name": c.name, "type": c.values.dtype.name, "scale": c.scale, "offset": c.offset, "unit": c.unit}
             for c in columns
         ],
-        "deflated": deflated(column.values for column in columns),
+        "deflated": deflate(column.values for column in columns),
         "tweaks": [{"sample": tweak.sample, "label": direction(tweak)} for tweak in verdict.tweaks],
         "alarms": [
             {"sample": index, "false": is_false}
-            for index, is_false in sorted([*((each, False) for each in noticed), *((each, True) for each in false)])
+            for index, is_false in sorted([*((each, False) for each in detections), *((each, True) for each in false)])
         ],
         "overloads": [{"sample": sample, "label": name} for name, sample in sorted(verdict.overloads.items())],
         "segments": [
-            {"start": start, "end": end, **_finite_only(plant.parameters())} for start, end, plant in _truth(run)
+            {"start": start, "end": end, **_finite_values(plant.parameters())}
+            for start, end, plant in _true_segments(run)
         ],
-        "ceiling": finite(verdict.ceiling),
+        "ceiling": finite_or_none(verdict.ceiling),
     }
 
 
@@ -77,82 +176,82 @@ def is_thinned(run: Run) -> bool:
 
 
 def marked_alarms(run: Run, verdict: Verdict) -> int:
-    """Alarms with a mark in the plots."""
+    """Number of alarms with a mark in the plots."""
     return sum(map(len, _alarms(run, verdict)))
 
 
 def _alarms(run: Run, verdict: Verdict) -> tuple[list[int], list[int]]:
-    """Alarms to be marked: those that noticed a change, and false ones."""
+    """Alarms to be marked: detections, and false alarms."""
     false = set(verdict.false_alarms)
-    noticed = [index for index in run.alarm_index.tolist() if index not in false]
-    return noticed, spread(
+    detections = [index for index in run.alarm_index.tolist() if index not in false]
+    return detections, thin_out(
         [index for index in run.alarm_index.tolist() if index in false], run.samples, _MOST_FALSE_ALARMS
     )
 
 
 def _pieces(run: Run, verdict: Verdict) -> tuple[Piece, ...]:
-    """Every sample near the start, the changes, the lamps and the first alarms."""
-    noticed, false = _alarms(run, verdict)
+    """Pieces with every sample near the start, the changes, the lamps and the first alarms."""
+    detections, false = _alarms(run, verdict)
     changes = (tweak.sample for tweak in verdict.tweaks)
-    return pieces(run.samples, (0, *changes, *noticed, *verdict.overloads.values(), *false))
+    return pieces(run.samples, (0, *changes, *detections, *verdict.overloads.values(), *false))
 
 
-def _truth(run: Run) -> Iterator[tuple[int, int, Plant]]:
-    """The segments of the run. Every sample of a ramp is one, or a few samples where the ramps are long."""
+def _true_segments(run: Run) -> Iterator[tuple[int, int, Plant]]:
+    """True segments for the plots. A ramp is divided into steps of one sample, or of several if the ramps are long."""
     ramps_n = {segment.start: segment.ramp_n for segment in run.conditions.segments}
     step_n = max(1, -(-sum(ramps_n.values()) // _MOST_STEPS))
     before: Plant | None = None
     for start, end, plant in run.segments:
-        there = min(start + ramps_n.get(start, 0), end) if before is not None else start
-        for k in range(start, there, step_n):
-            yield k, min(k + step_n, there), (before or plant).on_the_way(plant, (k - start) / ramps_n[start])
-        if there < end:
-            yield there, end, plant
+        ramp_end = min(start + ramps_n.get(start, 0), end) if before is not None else start
+        for k in range(start, ramp_end, step_n):
+            yield k, min(k + step_n, ramp_end), (before or plant).interpolate(plant, (k - start) / ramps_n[start])
+        if ramp_end < end:
+            yield ramp_end, end, plant
         before = plant
 
 
 def as_script(data: Mapping[str, Any]) -> str:
-    """``data`` as JSON that cannot end the script element it stands in."""
+    """``data`` as JSON, escaped for use inside a script element."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def deflated(columns: Iterable[NDArray[Any]]) -> str:
-    """The columns one after another, little-endian, as a zlib stream in base64."""
+def deflate(columns: Iterable[NDArray[Any]]) -> str:
+    """Columns one after another, little-endian, as a zlib stream in base64."""
     raw = b"".join(np.ascontiguousarray(c, dtype=c.dtype.newbyteorder("<")).tobytes() for c in columns)
     return base64.b64encode(zlib.compress(raw, 9)).decode("ascii")
 
 
-def finite(value: float | None) -> float | None:
-    """``value``, or None when there is none, or JSON has no word for it."""
+def finite_or_none(value: float | None) -> float | None:
+    """``value``, or None if it is None or non-finite."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def direction(tweak: TweakVerdict) -> str:
-    """The change in a few characters, for a label in a plot: ``B ↓, K ↑``."""
+    """Label of a change in a plot: ``B ↓, K ↑``."""
     return ", ".join(f"{name} {'↑' if tweak.after[name] > old else '↓'}" for name, old in tweak.before.items())
 
 
-def _columns(run: Run, shown: Sequence[Piece]) -> Sequence[Column]:
+def _columns(run: Run, shown: Sequence[Piece]) -> Sequence[PlotColumn]:
     measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
     none = _points(run, slice(0), 1, measured)
     parts = [none, *(_points(run, part, piece.size, measured) for piece in shown for part in piece.parts())]
     values = {name: np.concatenate([part[name] for part in parts]) for name in none}
-    return [Column(name, points, **_units(run, name)) for name, points in values.items()]
+    return [PlotColumn(name, points, **_units(run, name)) for name, points in values.items()]
 
 
 def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[str, NDArray[Any]]:
-    """The signals of a part of a run in buckets of ``size`` samples, by name."""
+    """Signals of a part of a run in buckets of ``size`` samples, by name."""
     codes, clipped = run.codes[part][:, measured], run.clipped[part][:, measured]
-    shown = condensed(codes, size)
-    bits = np.packbits(condensed_clipping(codes, clipped, size), axis=1, bitorder="little")[:, 0]
-    missing = missing_to_device(run.clipped[part]).astype(np.uint8)
-    estimates = condensed(trajectory(run, part).astype(np.float32), size)
+    shown = condense(codes, size)
+    bits = np.packbits(condense_clipping(codes, clipped, size), axis=1, bitorder="little")[:, 0]
+    missing = missing_samples(run.clipped[part]).astype(np.uint8)
+    estimates = condense(trajectory(run, part).astype(np.float32), size)
     return {
         **{CHANNELS[channel]: shown[:, i] for i, channel in enumerate(measured)},
         "clipped": bits,
-        "missing": np.repeat(condensed(missing, size)[1::2], 2) if size > 1 else missing,
+        "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
         **{name: estimates[:, i] for i, name in enumerate(PARAMETERS)},
-        "statistic": condensed(run.statistic[part], size),
+        "statistic": condense(run.statistic[part], size),
     }
 
 
@@ -161,10 +260,10 @@ def _units(run: Run, name: str) -> dict[str, Any]:
     if name not in run.conditions.channels:
         return {}
     channel = run.conditions.channels[name]
-    unit, factor = _SHOWN.get(channel.unit, (channel.unit, 1.0))
+    unit, factor = _DISPLAY_UNITS.get(channel.unit, (channel.unit, 1.0))
     per_volt = channel.unit_per_v * factor
     return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit}
 
 
-def _finite_only(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: finite(value) for name, value in values.items()}
+def _finite_values(values: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: finite_or_none(value) for name, value in values.items()}

@@ -1,10 +1,10 @@
 "use strict";
-// What the pages with plots have in common: data unpacked, marks over the signals, print and dark scheme, troubles told.
+// Common parts of the pages with plots: decoding of the data, marks, print and dark scheme, error messages.
 const plotting = (() => {
   const FONT = "12px system-ui, sans-serif";
   const PRINT_WIDTH_PX = 700; // an A4 page between its margins
-  const DENSE_PX = 10; // wrong alarms that are nearer to each other than this ...
-  const DENSE_ALPHA = 0.2; // ... fade, at most to this
+  const DENSE_PX = 10; // smallest distance of false alarms that do not fade
+  const DENSE_ALPHA = 0.2; // opacity of the most faded alarms
 
   async function inflated(deflated) {
     const bytes = Uint8Array.from(atob(deflated), (c) => c.charCodeAt(0));
@@ -17,7 +17,7 @@ const plotting = (() => {
     return [low - margin, high + margin];
   }
 
-  // Marks: each is `at` a place of the x axis.
+  // Marks; `at` is the position on the x axis.
 
   function position(u, at) {
     return Math.round(u.valToPos(at, "x", true)) + 0.5;
@@ -55,7 +55,7 @@ const plotting = (() => {
     ctx.restore();
   }
 
-  // The context ready for letters; to be restored.
+  // Prepare the context for text; the caller restores it.
   function lettered({ ctx }, colour, align, baseline) {
     ctx.save();
     ctx.font = FONT.replace(/^\d+/, (size) => String(size * devicePixelRatio));
@@ -72,19 +72,19 @@ const plotting = (() => {
     for (const mark of marks) {
       const x = position(u, mark.at);
       const half = ctx.measureText(mark.label).width / 2;
-      if (x - half < free) continue; // it would cover its neighbour; zooming in makes room
+      if (x - half < free) continue; // the label would cover its neighbour; zooming in makes room
       ctx.fillText(mark.label, x, bbox.top - 2 * px);
       free = x + half + 6 * px;
     }
     ctx.restore();
   }
 
-  // Changes of the plant and alarms, as far as they are in view. Lines lie under the signals, flags and labels above.
+  // Visible changes of the plant and alarms. Lines are below the signals, flags and labels above.
   function alarms(u, { changes, noticed, wrong }, ink) {
     const { min, max } = u.scales.x;
     const [moved, right, other] = [changes, noticed, wrong].map((all) => all.filter(({ at }) => at >= min && at <= max));
     const room_px = u.bbox.width / devicePixelRatio / Math.max(1, other.length);
-    const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many of them must not hide the signals
+    const alpha = Math.min(1, Math.max(DENSE_ALPHA, room_px / DENSE_PX)); // many alarms must not hide the signals
     return {
       lines() {
         verticals(u, moved, { colour: ink("ink"), width: 1.25 });
@@ -99,7 +99,7 @@ const plotting = (() => {
     };
   }
 
-  // Curves, axes, and where they are drawn
+  // Curves, axes and layout
 
   function curve(label, stroke, more) {
     const value = (u, v) => (v === null || v === undefined ? "–" : v.toPrecision(5));
@@ -122,7 +122,7 @@ const plotting = (() => {
     };
   }
 
-  // The pointer reads all plots with the same key, and drags across them zoom.
+  // The pointer reads out all plots with the same key. Dragging zooms all of them.
   function cursor(key) {
     return { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } };
   }
@@ -148,7 +148,7 @@ const plotting = (() => {
     return isPrinting() ? PRINT_WIDTH_PX : place.clientWidth;
   }
 
-  // Draws again for print and another scheme, and fits the plots when the width of their place changes.
+  // Redraw for print and for another colour scheme; resize the plots with their container.
   function redrawn(draw, place, plots, height) {
     const printing = (on) => () => {
       document.documentElement.classList.toggle("printing", on);
@@ -170,7 +170,7 @@ const plotting = (() => {
     place.hidden = false;
   }
 
-  // `show` draws what was unpacked, and returns how many plots that are.
+  // `show` draws the decoded data and returns the number of plots.
   async function begin(deflated, show) {
     if (typeof DecompressionStream === "undefined") {
       return trouble("This browser is too old for the plots: it has no DecompressionStream.");

@@ -1,4 +1,4 @@
-"""A run and its verdict as a table for the terminal."""
+"""Summary of a run and its verdict for the terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHOWN_ALARMS = 10
 
 
 def summary(run: Run, verdict: Verdict) -> str:
-    """Several lines, without a final newline."""
+    """Summary of a run and its verdict: several lines, without a final newline."""
     conditions = run.conditions
     head = (
         f"{conditions.scenario['name']} on {conditions.rig['name']}, device {conditions.dut['name']}"
@@ -24,23 +24,23 @@ def summary(run: Run, verdict: Verdict) -> str:
     lines = [head, *(f"  {reason}" for reason in verdict.reasons), ""]
     if verdict.tweaks:
         lines += ["  sample  change                                       latency  bound  (samples)"]
-        lines += [line for tweak in verdict.tweaks for line in _tweak_lines(tweak)]
+        lines += [line for tweak in verdict.tweaks for line in _change_lines(tweak)]
     diagnoses = [_diagnosis_line(tweak.sample, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis]
     if diagnoses:
         lines += [
             "",
-            "  sample  named    right  extent   error  said after  bound  onset off by  (samples)",
+            "  sample  named    right  extent   error       delay  bound   onset error  (samples)",
             *diagnoses,
         ]
     lines += ["", f"  false alarms: {_false_alarms(verdict)} in {number_of(run.samples, 'sample')}"]
     if verdict.doubtful_alarms:
         at = ", ".join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))
-        lines += [f"  false or not, depending on when the changes came: alarms at {at}"]
+        lines += [f"  false or not, depending on the instants of the changes: alarms at {at}"]
     if verdict.missing_n:
         lines += [f"  {missing_text(run)}: {number_of(verdict.missing_n, 'sample')}"]
     if verdict.overloads:
         lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
-    if seen := line_text(conditions.link_counters):
+    if seen := traffic_text(conditions.link_counters):
         lines += [f"  on the line: {seen}"]
     load = load_of(run)
     if load is not None:
@@ -51,19 +51,19 @@ def summary(run: Run, verdict: Verdict) -> str:
     return "\n".join(lines)
 
 
-def line_text(link_counters: Mapping[str, int]) -> str:
-    """What was on the line besides the device's messages: ``12 frames foreign, 1 error frame``."""
+def traffic_text(link_counters: Mapping[str, int]) -> str:
+    """Other traffic on the line: ``12 frames foreign, 1 error frame``."""
     return ", ".join(number_named(n, name) for name, n in link_counters.items() if n)
 
 
 def lamps_text(overloads: Mapping[str, int]) -> str:
-    """The lamps that lit, in order of time: ``U1 from sample 51``."""
+    """Lit overload lamps in order of time: ``U1 from sample 51``; ``none`` without one."""
     in_order = sorted(overloads.items(), key=lambda lamp: (lamp[1], lamp[0]))
     return ", ".join(f"{amplifier} from sample {sample}" for amplifier, sample in in_order) or "none"
 
 
 def load_text(load: BusLoad) -> str:
-    """What the exchange asks of its CAN bus."""
+    """Load of the CAN bus by the exchange, in one line."""
     faster = "" if load.data_bitrate is None else f", data {load.data_bitrate} bit/s"
     late = "" if load.latency_s is None else f", answers within {load.latency_s * 1e3:.3g} ms"
     fits = load.utilisation <= 1.0
@@ -79,18 +79,18 @@ def _false_alarms(verdict: Verdict) -> str:
     return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
 
 
-def _tweak_lines(tweak: TweakVerdict) -> list[str]:
+def _change_lines(tweak: TweakVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
     change = _change(tweak.before, tweak.after)
     out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]
     low, high = tweak.between
     if low < high:
-        out += [f"          between {low} and {high}, the likeliest instant is shown: {tweak.result}"]
+        out += [f"          between {low} and {high} (the likeliest instant is shown): {tweak.result}"]
     return out
 
 
 def latency_text(tweak: TweakVerdict) -> str:
-    """``4``, ``1-9`` where the instant is not known better, ``missed``, or ``-``."""
+    """Latency as text: ``4``, ``1-9`` if the instant is an interval, ``missed``, ``unknown``, or ``-``."""
     if tweak.result in {"missed", "not judged"}:
         return {"missed": "missed", "not judged": "unknown"}[tweak.result]
     if tweak.latencies_n is None:

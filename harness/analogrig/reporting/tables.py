@@ -1,4 +1,4 @@
-"""The words and tables of the page. Every text that may come from a file is escaped here, in ``_text``."""
+"""Texts and tables of the page. ``_text`` escapes every text that may come from a file."""
 
 from __future__ import annotations
 
@@ -17,65 +17,62 @@ from analogrig.run import Run
 from analogrig.wording import number_of
 
 _MAX_FALSE_ALARMS = 20
-"""Rows of their table; the plots mark more."""
+"""Rows in the table of false alarms; the plots mark more."""
 
 _MOST_ROWS = 500
-"""Rows shown of any table."""
+"""Largest number of rows in any table."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
 
 _SENTENCES = {
-    "passed": "The device did what the scenario expects.",
-    "failed": "The device did not do what the scenario expects.",
-    "inconclusive": (
-        "This run is not valid. It says nothing about the device, neither good nor bad:"
-        " do not read what follows as a result."
-    ),
+    "passed": "The device met the expectations of the scenario.",
+    "failed": "The device did not meet the expectations of the scenario.",
+    "inconclusive": "This run is not valid. The figures below prove nothing about the device.",
 }
 
 
 def title(run: Run, verdict: Verdict) -> str:
-    """Title of the document, escaped."""
-    return f"{_text(verdict.outcome.upper())}: {_what_ran(run)}"
+    """Title of the page, escaped."""
+    return f"{_text(verdict.outcome.upper())}: {_run_title(run)}"
 
 
 def outcome(run: Run, verdict: Verdict) -> str:
-    """The banner: the outcome in words, the reasons, and what else to know."""
+    """Banner with the outcome, the reasons, and advice."""
     notes = (f"Note: {sentence}." for sentence in advice(run, verdict))
     reasons = "".join(f"<li>{_text(sentence)}</li>" for sentence in (*verdict.reasons, *notes))
     return (
         f'<section class="outcome {verdict.outcome}" aria-labelledby="outcome">'
         f'<h1 id="outcome"><span class="sign" aria-hidden="true">{_SIGNS[verdict.outcome]}</span>'
-        f" {_text(verdict.outcome.upper())}<small>{_what_ran(run)}</small></h1>"
+        f" {_text(verdict.outcome.upper())}<small>{_run_title(run)}</small></h1>"
         f"<p>{_SENTENCES[verdict.outcome]}</p>"
         f"{f'<ul>{reasons}</ul>' if reasons else ''}"
-        f"{_tally(run, verdict)}</section>"
+        f"{_figures_sentence(run, verdict)}</section>"
     )
 
 
 def conditions(run: Run, verdict: Verdict) -> str:
-    """What ran, and where."""
-    ran = run.conditions
-    description = ran.scenario.get("description")
+    """Table of the conditions: scenario, rig, device, link and provenance."""
+    context = run.conditions
+    description = context.scenario.get("description")
     load = load_of(run)
     rows = [
-        ("Scenario", f"{ran.scenario['name']}{f': {description}' if description else ''}"),
-        ("Rig", ran.rig["name"]),
-        ("Device", ran.dut["name"]),
-        ("Firmware", _pairs(ran.dut.get("identity", {})) or "unknown"),
-        ("Link", ran.link),
+        ("Scenario", f"{context.scenario['name']}{f': {description}' if description else ''}"),
+        ("Rig", context.rig["name"]),
+        ("Device", context.dut["name"]),
+        ("Firmware", _pairs(context.dut.get("identity", {})) or "unknown"),
+        ("Link", context.link),
         ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
-        ("Seed", ran.seed),
+        ("Seed", context.seed),
         ("Samples", _samples(run, verdict)),
         ("Overload lamps", lamps_text(verdict.overloads)),
         ("Theta hash", verdict.theta_hash),
-        *provenance(ran.identity),
+        *provenance(context.identity),
     ]
-    return _table("What ran, and where", "", (_named(name, value) for name, value in rows), kind="pairs")
+    return _table("Scenario, rig and device", "", (_pair_row(name, value) for name, value in rows), kind="pairs")
 
 
 def provenance(identity: Identity | None) -> list[tuple[str, str]]:
-    """What made a result: names and values, not escaped; empty if it is unknown."""
+    """Provenance of a result: names and values, not escaped; empty if unknown."""
     if identity is None:
         return []
     made_by = f"{identity.analogrig}, commit {identity.commit or 'unknown'}, Python {identity.python}"
@@ -88,38 +85,36 @@ def provenance(identity: Identity | None) -> list[tuple[str, str]]:
 
 
 def tweaks(verdict: Verdict) -> str:
-    """Each change of the plant, and how it was noticed."""
+    """Table of the changes of the plant, with latency, bound and result."""
     if not verdict.tweaks:
         return "<p>The plant did not change in this run.</p>"
     assumed = f"the bound assumes one false alarm in {verdict.arl0:,.0f} samples"
     caption = f"Latency and bound in samples from the change; {assumed}"
-    if any(tweak.others for tweak in verdict.tweaks):
-        caption += "; where the instant was learned from the samples, from the earliest to the latest"
+    if any(tweak.alternatives for tweak in verdict.tweaks):
+        caption += "; a range if the instant was estimated from the samples"
     head = _row(
         [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
     )
-    return _table(caption, head, (_tweak_row(tweak) for tweak in verdict.tweaks))
+    return _table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
 
 
 def diagnoses(verdict: Verdict) -> str:
-    """What the device said had changed, against the truth."""
-    said = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
-    if not said:
-        return "<p>The device did not say what had changed.</p>"
-    caption = (
-        "What the device said had changed; samples from the change, and the bound is that of telling it from others"
-    )
-    numbers = ("Extent", "Error", "Said after", "Bound", "Onset off by")
+    """Table of the diagnoses, compared with the truth."""
+    reported = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
+    if not reported:
+        return "<p>The device reported no diagnosis.</p>"
+    caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
+    numbers = ("Extent", "Error", "Delay", "Bound", "Onset error")
     head = _row([_head("Sample"), _head("Changed"), _head("Named"), *map(_number_head, numbers), _head("Result")])
-    return _table(caption, head, (_diagnosis_row(*each) for each in said))
+    return _table(caption, head, (_diagnosis_row(*each) for each in reported))
 
 
 def false_alarms(run: Run, verdict: Verdict) -> str:
-    """Every alarm that belongs to no change."""
+    """Table of the false alarms."""
     count = len(verdict.false_alarms)
     if not count and verdict.doubtful_alarms:
         at = ", ".join(map(str, verdict.doubtful_alarms[:_MAX_FALSE_ALARMS]))
-        return f"<p>None for certain; depending on when the changes came the alarms at {at} are such.</p>"
+        return f"<p>None for certain. Depending on the instants of the changes, the alarms at {at} are false.</p>"
     if not count:
         return f"<p>None in {number_of(run.samples, 'sample', form=',')}.</p>"
     statistics = dict(zip(run.alarm_index.tolist(), run.alarm_statistic.tolist(), strict=True))
@@ -132,7 +127,7 @@ def false_alarms(run: Run, verdict: Verdict) -> str:
 
 
 def estimates(verdict: Verdict) -> str:
-    """M, B and K at the end of each segment, against the truth."""
+    """Table of M, B and K at the end of each segment, compared with the truth."""
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
     groups = [f'<th scope="colgroup" colspan="3">{name} [{_text(UNITS[name])}]</th>' for name in PARAMETERS]
@@ -143,29 +138,29 @@ def estimates(verdict: Verdict) -> str:
 
 
 def settings(run: Run) -> str:
-    """Everything that was set and counted, as it stands in the recording."""
-    ran = run.conditions
-    channels = {name: vars(channel) for name, channel in ran.channels.items()}
+    """Table of all settings and counters in the recording."""
+    context = run.conditions
+    channels = {name: vars(channel) for name, channel in context.channels.items()}
     everything = {
-        "scenario": ran.scenario,
-        "rig": ran.rig,
-        "device": ran.dut,
+        "scenario": context.scenario,
+        "rig": context.rig,
+        "device": context.dut,
         "channel": channels,
-        "counter": ran.counters,
+        "counter": context.counters,
     }
-    rows = (_named(key, value) for key, value in _flat(everything))
+    rows = (_pair_row(key, value) for key, value in _flatten(everything))
     return _table("As recorded", "", rows, kind="pairs")
 
 
 def period(run: Run) -> str:
-    """How long one sample is."""
-    ran = run.conditions
-    problem_ms, machine_us = ran.sample_period_problem_s * 1e3, ran.sample_period_s * 1e6
+    """Sample period in problem time and at the machine, escaped."""
+    context = run.conditions
+    problem_ms, machine_us = context.sample_period_problem_s * 1e3, context.sample_period_s * 1e6
     return _text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
 
 
 def resolution(run: Run, verdict: Verdict) -> str:
-    """Sentences about what the plots leave out, with a space before; empty if they show everything."""
+    """Sentences about samples and alarms that the plots leave out, with a leading space; empty if none."""
     out = ""
     if is_thinned(run):
         out += (
@@ -178,18 +173,18 @@ def resolution(run: Run, verdict: Verdict) -> str:
     return out
 
 
-def _what_ran(run: Run) -> str:
-    ran = run.conditions
-    return f"{_text(ran.scenario['name'])} on {_text(ran.rig['name'])}, device {_text(ran.dut['name'])}"
+def _run_title(run: Run) -> str:
+    context = run.conditions
+    return f"{_text(context.scenario['name'])} on {_text(context.rig['name'])}, device {_text(context.dut['name'])}"
 
 
-def _tally(run: Run, verdict: Verdict) -> str:
-    """The figures in one sentence; none for a run that is not valid, since they would read like a result."""
+def _figures_sentence(run: Run, verdict: Verdict) -> str:
+    """Detections and false alarms in one sentence; empty for an invalid run, whose figures prove nothing."""
     if not verdict.valid:
         return ""
-    noticed = sum(tweak.result in {"noticed", "late"} for tweak in verdict.tweaks)
+    detected = sum(tweak.result in {"noticed", "late"} for tweak in verdict.tweaks)
     count = len(verdict.tweaks)
-    changes = f"{noticed} of {_plural(count, 'change')} noticed" if count else "No change to notice"
+    changes = f"{detected} of {_plural(count, 'change')} detected" if count else "No change to detect"
     false = _plural(len(verdict.false_alarms), "false alarm")
     return f"<p>{changes}, {false}, in {_plural(run.samples, 'sample')}.</p>"
 
@@ -204,11 +199,11 @@ def _samples(run: Run, verdict: Verdict) -> str:
     return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
-def _tweak_row(tweak: TweakVerdict) -> str:
+def _change_row(tweak: TweakVerdict) -> str:
     change = ", ".join(
         f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
     )
-    exact = not tweak.others and tweak.latency_n is not None and tweak.bound_n
+    exact = not tweak.alternatives and tweak.latency_n is not None and tweak.bound_n
     ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
     low, high = tweak.between
@@ -230,14 +225,14 @@ def _latency(tweak: TweakVerdict) -> str:
 
 
 def _result(tweak: TweakVerdict) -> tuple[str, str]:
-    """A word and a class of the style."""
+    """Result in words, and its style class."""
     return {
         "missed": ("✗ MISSED", "bad"),
         "late": (f"✗ LATE, after {tweak.deadline_n}", "bad"),
-        "unseeable": ("could not be seen", "neutral"),
-        "undecided": ("? depends on when it came", "neutral"),
+        "unseeable": ("not detectable", "neutral"),
+        "undecided": ("? depends on its instant", "neutral"),
         "not judged": ("? not judged: not found in the samples", "neutral"),
-        "noticed": ("✓ noticed", "good"),
+        "noticed": ("✓ detected", "good"),
     }[tweak.result]
 
 
@@ -250,33 +245,33 @@ def _segment_row(segment: SegmentEstimate) -> str:
 
 
 def _error(segment: SegmentEstimate, name: str) -> float | None:
-    """Relative, to a hundredth of a percent; never a negative zero."""
+    """Relative error, rounded to 0.01 %; never a negative zero."""
     error = segment.error.get(name)
     return None if error is None else round(error, 4) + 0.0
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """``a.b.c`` and value of everything in nested tables."""
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Paths ``a.b.c`` and values of nested tables."""
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
+            yield from _flatten(value, f"{prefix}{key}.")
         elif isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):
-            yield from _flat({str(i): item for i, item in enumerate(value)}, f"{prefix}{key}.")
+            yield from _flatten({str(i): item for i, item in enumerate(value)}, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
 
 
 def _pairs(table: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key.replace('_', ' ')} {_shown(key, value)}" for key, value in table.items())
+    return ", ".join(f"{key.replace('_', ' ')} {_format_value(key, value)}" for key, value in table.items())
 
 
-def _shown(key: str, value: object) -> str:
-    """Hashes and nonces as people compare them."""
+def _format_value(key: str, value: object) -> str:
+    """Value as text; hashes and nonces in hexadecimal."""
     return f"{value:#010x}" if isinstance(value, int) and key.endswith(("hash", "nonce")) else str(value)
 
 
 def _table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers") -> str:
-    """``head`` and ``rows`` are finished rows, of which the first are shown; ``kind`` is a class of the style."""
+    """HTML table of finished rows, of which the first are shown; ``kind`` is a style class."""
     shown = list(rows)
     if len(shown) > _MOST_ROWS:
         caption += f"; the first {_MOST_ROWS} of {len(shown):,} rows"
@@ -298,7 +293,7 @@ def _number_head(name: str) -> str:
     return f'<th scope="col" class="number">{_text(name)}</th>'
 
 
-def _named(name: str, value: object) -> str:
+def _pair_row(name: str, value: object) -> str:
     return _row([f'<th scope="row">{_text(name)}</th>', _cell(value, "text")])
 
 
@@ -311,7 +306,7 @@ def _number(value: float | None, form: str = ".4g") -> str:
 
 
 def _zoom(first: int, last: int | None = None) -> str:
-    """A heading of a row that takes the plots to these samples."""
+    """Row heading that zooms the plots to these samples."""
     shown = str(first) if last is None else f"{first}–{last}"
     until = "" if last is None else f' data-last="{last}"'
     goal = f'data-first="{first}"{until}'

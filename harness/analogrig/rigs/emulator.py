@@ -307,11 +307,11 @@ class EmulatorRig:
         """
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
-            excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+            excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         changes: list[PotChange] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = self._settings(computer, tweak.given())
+                settings = self._settings(computer, tweak.overrides())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             changes.append(PotChange(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
@@ -363,7 +363,7 @@ class EmulatorRig:
     def _repeated(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
         count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
         offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
-        excitation = scenario.excitation_drawn(Stream.EXCITATION.generator(seed))
+        excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         lit: dict[str, int] = {}
 
         def volts() -> Iterator[NDArray[np.float64]]:
@@ -382,7 +382,7 @@ class EmulatorRig:
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
         computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
-        start = settings_of(computer, scenario.plant.given())
+        start = settings_of(computer, scenario.plant.overrides())
         computer.set(**self._turned({**computer.program.values, **start}, scenario.plant.set))
         return computer
 

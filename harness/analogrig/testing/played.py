@@ -167,7 +167,7 @@ _UNKNOWN = "it depends on when the change came, which is not known better"
 
 def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
     """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
-    reasons = [_too_late(each, within) for each in tweak.possible]
+    reasons = [_too_late(each, within) for each in tweak.hypotheses]
     if all(reasons):
         return _too_late(tweak, within)
     low, high = tweak.between
@@ -213,7 +213,7 @@ def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Find
     events = sum(len(each.verdict.false_alarms) for each in plays)
     samples = sum(exposure(each.run).armed for each in plays)
     if not samples:
-        why = exposure(plays[0].run).no_evidence if plays else "there is none"
+        why = exposure(plays[0].run).lack_of_evidence if plays else "there is none"
         return Finding(holds=False, why=f"no alarm could be raised in any of {number_of(len(plays), 'play')}: {why}")
     bound = upper_rate(events, samples, confidence)
     why = f"{number_of(events, 'false alarm')} in {number_of(samples, 'sample')}"

@@ -327,4 +327,4 @@ def scenarios(
 
 def _after(plant: PlantChoice, tweak: Tweak) -> dict[str, float]:
     before = plant.plant().parameters()
-    return {FIELDS[name]: tweak.given().get(FIELDS[name], before[name]) for name in PARAMETERS}
+    return {FIELDS[name]: tweak.overrides().get(FIELDS[name], before[name]) for name in PARAMETERS}

@@ -181,7 +181,7 @@ class _Path:
         if middle is None:
             old, new = deviate(problem.before, guess.old), deviate(problem.after, guess.new)
             parts, offsets = np.linspace([0.0, guess.old[0]], [1.0, guess.new[0]], _POINTS).T.tolist()
-            plants = [old.on_the_way(new, part) for part in parts]
+            plants = [old.interpolate(new, part) for part in parts]
         else:
             # Each parameter of the middle plant has its old or its new deviation.
             changed = problem.before.changes_to(middle)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import PARAMETERS, Plant, SampledPlant
-from analogrig.run import CHANNELS, MEASURED, Channel, missing_to_device
+from analogrig.run import CHANNELS, MEASURED, Channel, missing_samples
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Signals:
             (channels[name].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2) ** 0.5 * abs(channels[name].lsb)
             for name in MEASURED
         )
-        valid = ~missing_to_device(clipped)
+        valid = ~missing_samples(clipped)
         return cls(columns["force"], columns["displacement"], valid, period_s, noise_n, noise_m)
 
     def part(self, first: int, end: int) -> Signals:
@@ -149,7 +149,7 @@ def _discretise(plant: Plant, part: float, signals: Signals) -> tuple[Array, Arr
     if part <= 0.0:
         return np.eye(2), np.zeros(2)
     period_s = signals.period_s
-    sampled = SampledPlant.of(plant, part * period_s)
+    sampled = SampledPlant.from_plant(plant, part * period_s)
     (xx, xv, vx, vv), (xf, vf) = sampled.transition, sampled.response
     transition = np.array([[xx, xv / period_s], [vx * period_s, vv]])
     return transition, np.array([xf, vf * period_s]) / signals.noise_m

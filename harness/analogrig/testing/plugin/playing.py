@@ -103,7 +103,7 @@ class Player:
             chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
             drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
             run = self.bench.play(chosen, drawn)
-        run = run.made_by(provenance.identity(self.item.config, self.bench.dut.files()))
+        run = run.with_identity(provenance.identity(self.item.config, self.bench.dut.files()))
         if run.conditions.faults:  # nothing of it may reach the next play of this test
             with contextlib.suppress(AnalogrigError):
                 self.bench.dut.handshake()
@@ -263,7 +263,7 @@ def _properties(played: Played) -> Mapping[str, Any]:
 
 def _latency(tweak: TweakVerdict) -> str:
     """``4``, or ``1..9`` where the instant of the change is not known better; ``None`` without an alarm."""
-    if tweak.latencies_n is None or not tweak.others:
+    if tweak.latencies_n is None or not tweak.alternatives:
         return str(tweak.latency_n)
     return "{}..{}".format(*tweak.latencies_n)
 

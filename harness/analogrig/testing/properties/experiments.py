@@ -92,9 +92,9 @@ def false_alarms_at_most(
         watched = trials.watched(scenario, seed + len(alarms))
         alarms.append(watched.alarms)
         armed += watched.exposure.armed
-        if watched.exposure.no_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+        if watched.exposure.lack_of_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
             why = (
-                watched.exposure.no_evidence
+                watched.exposure.lack_of_evidence
                 or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
             )
             return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
@@ -117,7 +117,7 @@ def false_alarms_of_plants_rarer(
     scenario = dataclasses.replace(scenario, samples=samples_each)
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
     played = [trials.watched(each, seed) for each in drawn]
-    if nothing := next((each.exposure.no_evidence for each in played if each.exposure.no_evidence), ""):
+    if nothing := next((each.exposure.lack_of_evidence for each in played if each.exposure.lack_of_evidence), ""):
         return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
     alarms = [each.alarms for each in played]
     count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)

@@ -1,0 +1,213 @@
+"""CAN logs as files: written during a run, and read from any tool."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import io
+import logging
+import sys
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
+
+from analogrig.errors import RecordingError
+from analogrig.wording import number_of
+
+if TYPE_CHECKING:
+    import can
+
+WRITTEN = ("log", "blf", "asc", "mf4")
+"""Formats that can be written, as file suffixes."""
+
+
+class _FrameWriter(Protocol):
+    def __call__(self, frame: can.Message) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+class CanLog:
+    """Listener to a link that writes each frame to a file, created with the first frame after ``begin``.
+
+    A write error, such as a full disk, does not end the run. ``close`` raises it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Log to ``path``, whose suffix is one of WRITTEN."""
+        self.path = path
+        self._held: list[can.Message] | None = []
+        """Frames before ``begin``; None afterwards."""
+        self._writer: _FrameWriter | None = None
+        self._failure: Exception | None = None
+
+    @property
+    def has_frames(self) -> bool:
+        """True if frames passed before ``begin``, as they do in the handshake on a CAN bus."""
+        return bool(self._held)
+
+    def begin(self) -> None:
+        """Write the frames so far, replacing the file; to be called once the device has answered."""
+        held, self._held = self._held or [], None
+        for frame in held:
+            self(frame)
+
+    def __call__(self, frame: can.Message) -> None:
+        if self._held is not None:
+            self._held.append(frame)
+            return
+        if self._failure is not None:
+            return
+        try:
+            if self._writer is None:
+                self._writer = _open_writer(self.path)
+            self._writer(frame)
+        except Exception as error:  # noqa: BLE001 - the writers' exceptions are undocumented; the run must continue
+            self._failure = error
+
+    def close(self) -> None:
+        """Finish the file. May be called twice.
+
+        :raises RecordingError: some frames could not be written.
+        """
+        writer, self._writer = self._writer, None
+        try:
+            if writer is not None:
+                writer.stop()
+        except Exception as error:  # noqa: BLE001 - as above
+            self._failure = self._failure or error
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            cause = getattr(failure, "strerror", None) or " ".join(str(failure).split())
+            raise RecordingError(f"{self.path}: cannot be written: {cause}") from failure
+
+
+def _open_writer(path: Path) -> _FrameWriter:
+    from analogrig.links.python_can import can
+
+    writers: Mapping[str, Any] = {
+        "log": can.CanutilsLogWriter,
+        "blf": can.BLFWriter,
+        "asc": can.ASCWriter,
+        "mf4": can.MF4Writer,
+    }
+    writer: _FrameWriter = writers[path.suffix[1:]](path)
+    return writer
+
+
+READ = (*WRITTEN, "trc")
+"""Formats that can be read, as file suffixes."""
+
+
+class _CountedLines(io.TextIOBase):
+    """Text file that counts the lines read."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        self.number = 0
+
+    def readline(self, _size: int | None = -1, /) -> str:  # type: ignore[override]
+        line = self._file.readline()
+        self.number += line != ""
+        return line
+
+
+@dataclass
+class CapturedFrames:
+    """Frames of a file, read by python-can; can be iterated once."""
+
+    path: Path
+    damaged: list[int] = field(default_factory=list)
+    """Numbers of the lines that are not frames and were skipped."""
+    end: str = ""
+    """Reason that reading stopped before the end of the file; empty otherwise."""
+
+    def __post_init__(self) -> None:
+        """Check that the file can be opened.
+
+        :raises RecordingError: the file is absent or unreadable, or its format is unknown.
+        """
+        if self.path.suffix[1:].lower() not in READ:
+            raise RecordingError(f"{self.path}: not a CAN log: the suffix must be one of .{', .'.join(READ)}")
+        try:
+            with self.path.open("rb"):
+                pass
+        except OSError as error:
+            raise RecordingError(f"{self.path}: {error.strerror or error}") from error
+
+    def __iter__(self) -> Iterator[can.Message]:
+        return self._read_candump() if self.path.suffix.lower() == ".log" else self._read_binary()
+
+    def _read_candump(self) -> Iterator[can.Message]:
+        """Read a candump log, in which reading continues after a damaged line."""
+        from analogrig.links.python_can import can
+
+        with self.path.open(encoding="ascii", errors="replace") as file:
+            lines = _CountedLines(file)
+            while True:
+                before = lines.number
+                try:
+                    yield from can.CanutilsLogReader(typing.cast(TextIO, lines))
+                except Exception:  # noqa: BLE001 - python-can's exceptions for damaged lines are undocumented
+                    self.damaged.append(lines.number)
+                    if lines.number > before:
+                        continue
+                return
+
+    def _read_binary(self) -> Iterator[can.Message]:
+        """Read any other format, in which reading ends at the first fault."""
+        from analogrig.links.python_can import can
+
+        readers: Mapping[str, Any] = {
+            "blf": can.BLFReader,
+            "asc": can.ASCReader,
+            "mf4": can.MF4Reader,
+            "trc": can.TRCReader,
+        }
+        suffix = self.path.suffix[1:].lower()
+        n = 0
+        # The file is opened here because readers that fail leave it open.
+        with self.path.open("rb") as raw:
+            file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
+            with silence_logger("asammdf"), silence_logger("can"), _silence_asammdf():
+                try:
+                    for frame in readers[suffix](file):
+                        yield frame
+                        n += 1
+                except Exception as error:  # noqa: BLE001 - the readers' exceptions are undocumented
+                    cause = " ".join(str(error).split()) or type(error).__name__
+                    self.end = f"{self.path} is damaged after {number_of(n, 'frame')}: {cause}"
+                if self.end:
+                    gc.collect()
+
+
+@contextlib.contextmanager
+def silence_logger(library: str) -> Iterator[None]:
+    """Suppress the log of a library, whose exception is already reported in one line."""
+    logger = logging.getLogger(library)
+    before = logger.level, logger.disabled
+    logger.setLevel(logging.CRITICAL + 1)  # also silences child loggers
+    logger.disabled = True  # the library may set the level when it is loaded later
+    try:
+        yield
+    finally:
+        logger.disabled = before[1]
+        logger.setLevel(before[0])
+
+
+@contextlib.contextmanager
+def _silence_asammdf() -> Iterator[None]:
+    """Suppress the traceback of asammdf's destructor for a file that it could not open."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if not str(getattr(unraisable.object, "__module__", "")).startswith("asammdf"):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
