@@ -36,6 +36,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
     held = set(zipfile.ZipFile(wheel).namelist())
     assert held >= {
         "analogrig_emulator/_engine.so",
+        *(f"analogrig_emulator/{folder}/__init__.py" for folder in ("card", "circuit", "engine", "machine")),
         "analogrig_emulator/py.typed",
         "analogrig/_catalogue.py",
         "analogrig/_commit.txt",

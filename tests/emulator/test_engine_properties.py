@@ -60,6 +60,7 @@ tweaks = st.lists(
         PotChange,
         st.integers(0, 299),
         st.dictionaries(st.sampled_from(("M_dial", "B_dial", "K_dial")), st.floats(0.1, 0.9), min_size=1),
+        ramp_n=st.just(0),
     ),
     max_size=4,
 )

@@ -340,6 +340,8 @@ def _check_names(elements: tuple[Element, ...]) -> None:
 
 
 def _check_element(element: Element) -> None:
+    if not isinstance(element, Element):
+        raise unknown_kind_error(element)
     for a, b in element.spans:
         if a == b:
             raise element_error(element, f"both ends are on node {a}")

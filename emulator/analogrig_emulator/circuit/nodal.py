@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,12 @@ from analogrig_emulator.circuit.circuit import (
     Circuit,
     CurrentSource,
     DiodeLimiter,
-    Element,
     OpAmp,
     Pot,
     Resistor,
     Switch,
     VoltageSource,
     element_error,
-    unknown_kind_error,
 )
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
 from analogrig_emulator.circuit.pot import check_dial, legs_ohm
@@ -59,16 +57,18 @@ class Nodal:
     """
 
     def __init__(self, circuit: Circuit) -> None:
-        kinds = _Kinds.of(circuit.elements)
-        self._elements = circuit.elements
-        self._pots = kinds.pots
-        self._switches = kinds.switches
-        self._limiters = kinds.limiters
-        self._capacitors = kinds.capacitors
+        self._circuit = circuit
+        self._pots = circuit.of(Pot)
+        self._switches = circuit.of(Switch)
+        self._limiters = circuit.of(DiodeLimiter)
+        self._capacitors = circuit.of(Capacitor)
         self._inputs = circuit.inputs
-        self._poles = tuple(amp for amp in kinds.amps if amp.model.has_state)
-        branches = [element.name for element in self._capacitors] + [source.name for source in kinds.voltage_sources]
-        branches += [amp.name for amp in kinds.amps if not (amp.model.has_state and amp.model.rout_ohm > 0)]
+        amps = circuit.of(OpAmp)
+        self._poles = tuple(amp for amp in amps if amp.model.has_state)
+        branches = [element.name for element in self._capacitors] + [
+            source.name for source in circuit.of(VoltageSource)
+        ]
+        branches += [amp.name for amp in amps if not (amp.model.has_state and amp.model.rout_ohm > 0)]
 
         self._nodes = circuit.nodes
         self._unknowns = [("node", node) for node in self._nodes] + [("current of", name) for name in branches]
@@ -90,7 +90,7 @@ class Nodal:
         ends = [(switch.a, switch.b) for switch in self._switches]
         self._leg_places = self._places(ends + [bond for pot in self._pots for bond in pot.bonds])
         self._laws = _Laws.of(self._row, self._branch, self._capacitors, self._poles, self._limiters)
-        self._enter(kinds)
+        self._enter(circuit)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
         """State space with pots at `dials` and switches at `closed`; the others are as in the netlist.
@@ -118,7 +118,7 @@ class Nodal:
 
         Raises like at(), and CircuitError for an op-amp without a pole.
         """
-        if len(self._poles) != sum(isinstance(element, OpAmp) for element in self._elements):
+        if len(self._poles) != len(self._circuit.of(OpAmp)):
             raise CircuitError("the offset of an op-amp without a pole enters every node: it cannot be trimmed")
         laws, solution = self._laws, self._solution(dials, {})
         apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
@@ -156,22 +156,22 @@ class Nodal:
             if count > limit:
                 raise CircuitError(f"the circuit has {count} {what}; the engine takes at most {limit}")
 
-    def _enter(self, kinds: _Kinds) -> None:
-        places = self._places([(resistor.a, resistor.b) for resistor in kinds.resistors])
-        siemens = [1.0 / resistor.ohm for resistor in kinds.resistors]
+    def _enter(self, circuit: Circuit) -> None:
+        places = self._places([(resistor.a, resistor.b) for resistor in circuit.of(Resistor)])
+        siemens = [1.0 / resistor.ohm for resistor in circuit.of(Resistor)]
         np.add.at(self._left.reshape(-1), places, np.outer(siemens, _STAMP).ravel())
         for capacitor in self._capacitors:
             row = self._voltage_branch(capacitor.name, capacitor.a, capacitor.b)
             self._right[row, self._state[capacitor.name]] = 1.0
-        for source in kinds.voltage_sources:
+        for source in circuit.of(VoltageSource):
             row = self._voltage_branch(source.name, source.plus, source.minus)
             column, volts = self._drive(source)
             self._right[row, column] = volts
-        for drive in kinds.current_sources:
+        for drive in circuit.of(CurrentSource):
             column, amperes = self._drive(drive)
             self._right[self._row[drive.plus], column] -= amperes
             self._right[self._row[drive.minus], column] += amperes
-        for amp in kinds.amps:
+        for amp in circuit.of(OpAmp):
             self._enter_opamp(amp)
         for i, limiter in enumerate(self._limiters):
             self._conductance(self._left, limiter.a, limiter.b, 1.0 / limiter.off_ohm)
@@ -260,7 +260,9 @@ class Nodal:
     def _singular(self, unknown: int) -> CircuitError:
         """CircuitError that names the undetermined node, with the first element at it, or the current."""
         what, name = self._unknowns[unknown]
-        element = next(part for part in self._elements if name in (part.nodes if what == "node" else (part.name,)))
+        element = next(
+            part for part in self._circuit.elements if name in (part.nodes if what == "node" else (part.name,))
+        )
         return element_error(element, f"the circuit is singular: nothing determines the {what} {name}")
 
     def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
@@ -295,46 +297,6 @@ class Trim:
     apart_v: Matrix
     gain_rate: Matrix
     rows: tuple[tuple[int, int | None], ...]
-
-
-@dataclass(frozen=True)
-class _Kinds:
-    """The elements of a circuit by kind, in netlist order."""
-
-    resistors: list[Resistor] = field(default_factory=list)
-    capacitors: list[Capacitor] = field(default_factory=list)
-    pots: list[Pot] = field(default_factory=list)
-    switches: list[Switch] = field(default_factory=list)
-    amps: list[OpAmp] = field(default_factory=list)
-    voltage_sources: list[VoltageSource] = field(default_factory=list)
-    current_sources: list[CurrentSource] = field(default_factory=list)
-    limiters: list[DiodeLimiter] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, elements: Sequence[Element]) -> _Kinds:
-        """Elements sorted by kind. Raises CircuitError for an element of another kind."""
-        kinds = cls()
-        for element in elements:
-            match element:
-                case Resistor():
-                    kinds.resistors.append(element)
-                case Capacitor():
-                    kinds.capacitors.append(element)
-                case Pot():
-                    kinds.pots.append(element)
-                case Switch():
-                    kinds.switches.append(element)
-                case OpAmp():
-                    kinds.amps.append(element)
-                case VoltageSource():
-                    kinds.voltage_sources.append(element)
-                case CurrentSource():
-                    kinds.current_sources.append(element)
-                case DiodeLimiter():
-                    kinds.limiters.append(element)
-                case _:
-                    raise unknown_kind_error(element)
-        return kinds
 
 
 _STAMP = np.array((1.0, 1.0, -1.0, -1.0))
