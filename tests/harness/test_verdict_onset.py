@@ -202,8 +202,8 @@ def test_exact_instants_are_shown_without_an_interval() -> None:
 
 def test_detection_limit_is_checked_for_every_instant() -> None:
     (tweak,) = judge(learned(between(395, 400, 402), alarms=[404])).tweaks
-    assert [each.bound_n for each in tweak.possible] == [1, 1, 1]
-    assert [each.latency_n for each in tweak.possible] == [9, 4, 2]  # of them 1 more than so many bounds is allowed
+    assert [each.bound_n for each in tweak.hypotheses] == [1, 1, 1]
+    assert [each.latency_n for each in tweak.hypotheses] == [9, 4, 2]  # of them 1 more than so many bounds is allowed
     played = Played(learned(between(395, 400, 402), alarms=[404]))
     assert played.detects(within=8.0)
     assert not played.detects(within=7.0)
