@@ -32,7 +32,6 @@ from analogrig.cli import (
     thesis,
 )
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
-from analogrig.identity import now
 from analogrig.signals import ending
 
 _COMMANDS = (
@@ -75,12 +74,19 @@ def main(argv: Sequence[str] | None = None) -> int:
                 completion.complete(parser)
             arguments = parser.parse_args(argv)
             arguments.command_line = shlex.join(["analogrig", *(sys.argv[1:] if argv is None else argv)])
-            arguments.started = now()
+            arguments.started = _now()
             return int(arguments.command(arguments))
         except KeyboardInterrupt:
             return complain("interrupted", INTERRUPTED)
         except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
             return _explain(error)
+
+
+def _now() -> str:
+    """Return the start time; imported here, for ``--help`` needs none."""
+    from analogrig.identity import now
+
+    return now()
 
 
 def _explain(error: Exception) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +46,8 @@ def play(
     log: CanLog | None = None,
 ) -> int:
     """:raises ConfigurationError: a log was asked for of a device that is on no CAN bus."""
+    from dataclasses import replace
+
     from analogrig.bench import Bench
     from analogrig.errors import ConfigurationError
     from analogrig.signals import held
@@ -63,7 +64,9 @@ def play(
 
 
 def _with_log(run: Run, log: CanLog | None, output: OutputFolder) -> Run:
-    """The run, which is not valid if its CAN log could not be written."""
+    """Return the run, invalid if its CAN log could not be written."""
+    from dataclasses import replace
+
     from analogrig.errors import RecordingError
 
     try:
