@@ -1,6 +1,6 @@
-"""The analogue computer, its generator and its card.
+"""Emulated analogue computer with signal generator and data-acquisition card.
 
-README.md explains the circuit; SuspensionComputer and Sampler are the way in.
+Start with SuspensionComputer, Excitation and Sampler.
 """
 
 from analogrig_emulator.card.acquisition import acquired, probes_per_sample

@@ -1,9 +1,8 @@
-"""What matters at 12 bits: each non-ideality by itself, and how far it moves the displacement from the ideal machine's.
+"""Effect of each non-ideality alone on the displacement, in LSB of 12 bits.
 
-The figure of a row is max |x - x_ideal| over SAMPLES samples of a 200 Hz square wave of 0..10 V, as the converter sees
-it, in LSB of 10 V / 4096; for what is drawn, the median over DRAWS seeds. Everything else is ideal. The front
-suspension plays the four changes of the thesis meanwhile, the shock absorber the same in proportion but for the last,
-M / 4, which is beyond its mass pot.
+The figure of a row is max |x - x_ideal| over SAMPLES samples of a 200 Hz square wave of 0..10 V at the converter's
+input, in LSB of 10 V / 4096; for random effects, the median over DRAWS seeds. The front suspension plays the four
+changes of the thesis. The shock absorber plays the same in proportion, without M / 4, which is beyond its mass pot.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer
 SAMPLES = 800
 DRAWS = 25
 _FEW_DRAWS = 5
-"""Where a draw takes long."""
+"""Number of draws for slow rows."""
 
 _CARD = Card(ranges_v=((-1.0, 9.0),) * len(CHANNELS))
 _DISPLACEMENT = CHANNELS.index("displacement")
@@ -46,7 +45,7 @@ _DISPLACEMENT = CHANNELS.index("displacement")
 
 @dataclass(frozen=True)
 class Effect:
-    """A row of the table: the median and the largest of `draws` figures, in LSB."""
+    """Row of the table: median and largest of `draws` figures, in LSB."""
 
     name: str
     median_lsb: float
@@ -72,51 +71,51 @@ _CHANGES: Mapping[str, Sequence[PotChange]] = {
 }
 
 _SLOW_CHANGE_N = 100
-"""Of the stiffness, to four fifths, for what a pot does while it turns."""
+"""Samples of the ramp of K to four fifths, for effects of a turning pot."""
 
 _Operator = Callable[[SuspensionComputer, Mapping[str, float], np.random.Generator], Mapping[str, float]]
-"""What somebody does who is told to set M_kg, B_n_s_per_m or K_n_per_m: other settings, perhaps."""
+"""Operator: maps wanted values of M_kg, B_n_s_per_m, K_n_per_m to the settings made."""
 
 
-def _careful(
+def _set_exactly(
     _machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
 ) -> Mapping[str, float]:
     return wanted
 
 
-def _without_load(
+def _set_without_load(
     machine: SuspensionComputer, wanted: Mapping[str, float], _rng: np.random.Generator
 ) -> dict[str, float]:
-    """Turns the dial to the coefficient that the pot should give under load."""
+    """Set each dial to the coefficient wanted under load."""
     program = machine.program
     return {f"{program.parameters[key].pot}_dial": program.coefficient(key, value) for key, value in wanted.items()}
 
 
-def _to_a_thousandth(
+def _set_to_a_thousandth(
     machine: SuspensionComputer, wanted: Mapping[str, float], rng: np.random.Generator
 ) -> dict[str, float]:
-    """Misses the dial by up to 0.1 % of full scale."""
+    """Miss each dial by up to 0.1 % of full scale."""
     dials = machine.dials_for(**wanted)
     return {f"{pot}_dial": min(dial + rng.uniform(-1e-3, 1e-3), 1.0) for pot, dial in dials.items()}
 
 
 @dataclass(frozen=True)
 class _Setup:
-    """A machine, ideal but for what is said here.
+    """Machine and card, ideal by default.
 
-    quantised: compare codes and not what the converter sees. turning: play one slow change instead of the usual ones.
+    quantised: compare codes instead of converter inputs. turning: play one ramp instead of the usual changes.
     """
 
     op_amp: OpAmpModel = IDEAL
     components: Components = NOMINAL
     noise: OpAmpGrade | None = None
     card: Card = _CARD
-    operator: _Operator = _careful
+    operator: _Operator = _set_exactly
     quantised: bool = False
     turning: bool = False
 
     def figure_lsb(self, program: Program, seed: int, ideal_lsb: NDArray[np.float64]) -> float:
-        """How far the displacement is from the ideal machine's; that of noise, from the same machine's without."""
+        """Largest difference of the displacement from the ideal machine's, or from that without the effect."""
         reference_lsb = ideal_lsb
         if self.turning:
             reference_lsb = dataclasses.replace(self, components=NOMINAL).displacement_lsb(program, seed)
@@ -125,7 +124,7 @@ class _Setup:
         return float(np.abs(self.displacement_lsb(program, seed) - reference_lsb).max())
 
     def displacement_lsb(self, program: Program, seed: int) -> NDArray[np.float64]:
-        """What the converter sees, or says, of the displacement at every sample, (SAMPLES,)."""
+        """Converter input or code of the displacement at every sample: (SAMPLES,), LSB."""
         rate_hz = self.card.true_rate_hz * probes_per_sample(self.card)
         components = dataclasses.replace(self.components, seed=seed)
         machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
@@ -136,7 +135,7 @@ class _Setup:
         volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, changes, rng=rng)))
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
-        return (sampler.converted(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
+        return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
 
     def _changes(self, program: Program) -> Sequence[PotChange]:
         if self.turning:
@@ -145,11 +144,11 @@ class _Setup:
 
 
 _Make = Callable[[int], _Setup]
-"""By the number of the draw."""
+"""Makes the setup of a draw."""
 
 
-def measured_effects(program: str) -> Iterator[Effect]:
-    """The table for a program ("shock" or "front"), row by row as they are measured (about 3 s in all)."""
+def measure_effects(program: str) -> Iterator[Effect]:
+    """Yield the rows for a program ("shock" or "front"), about 3 s in all."""
     chosen = PROGRAMS[program]
     ideal_lsb = _Setup().displacement_lsb(chosen, 0)
     for name, draws, make in _rows():
@@ -165,18 +164,18 @@ def _rows() -> Iterator[tuple[str, int, _Make]]:
     yield from _card_rows()
 
 
-def _fixed(setup: _Setup) -> _Make:
+def _constant(setup: _Setup) -> _Make:
     return lambda _seed: setup
 
 
-def _built_of(components: Components) -> _Make:
-    return _fixed(_Setup(components=components))
+def _with_components(components: Components) -> _Make:
+    return _constant(_Setup(components=components))
 
 
 def _value_rows() -> Iterator[tuple[str, int, _Make]]:
     for percent in (5, 1):
         parts = Components(resistors=Grade(0.01), capacitors=Grade(percent / 100))
-        yield f"R 1 %, C {percent} %, not calibrated", DRAWS, _built_of(parts)
+        yield f"R 1 %, C {percent} %, not calibrated", DRAWS, _with_components(parts)
     film = Grade(temperature_spread_per_k=50e-6)
     for name, per_k, spread_per_k in (("polyester", 400e-6, 100e-6), ("polypropylene", -200e-6, 50e-6)):
         warm = Components(
@@ -184,20 +183,20 @@ def _value_rows() -> Iterator[tuple[str, int, _Make]]:
             capacitors=Grade(temperature_per_k=per_k, temperature_spread_per_k=spread_per_k),
             temperature_c=35.0,
         )
-        yield f"+10 C, {name}", DRAWS, _built_of(warm)
+        yield f"+10 C, {name}", DRAWS, _with_components(warm)
 
 
 def _pot_rows() -> Iterator[tuple[str, int, _Make]]:
-    yield "pot loading ignored", 1, _fixed(_Setup(operator=_without_load))
-    yield "pots set to 0.1 % of full scale", DRAWS, _fixed(_Setup(operator=_to_a_thousandth))
-    yield "pots of 5000 windings", 1, _built_of(Components(pots=PotGrade(windings=5000)))
+    yield "pot loading ignored", 1, _constant(_Setup(operator=_set_without_load))
+    yield "pots set to 0.1 % of full scale", DRAWS, _constant(_Setup(operator=_set_to_a_thousandth))
+    yield "pots of 5000 windings", 1, _with_components(Components(pots=PotGrade(windings=5000)))
     noisy = Components(pots=PotGrade(wiper_noise_ohm=100.0))
-    yield "wiper noise 100 ohm, K turned", _FEW_DRAWS, _fixed(_Setup(components=noisy, turning=True))
+    yield "wiper noise 100 ohm, K turned", _FEW_DRAWS, _constant(_Setup(components=noisy, turning=True))
 
 
 def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
     tl07x, offset = PRESETS["tl07x"], OpAmpGrade(offset_v=3e-3)
-    yield "offsets of +-3 mV", DRAWS, _built_of(Components(op_amps=offset))
+    yield "offsets of +-3 mV", DRAWS, _with_components(Components(op_amps=offset))
     models = {
         "GBW 3 MHz": OpAmpModel(gbw_hz=tl07x.gbw_hz),
         "GBW 3 MHz, slew 13 V/us": OpAmpModel(gbw_hz=tl07x.gbw_hz, slew_v_per_s=tl07x.slew_v_per_s),
@@ -206,20 +205,24 @@ def _op_amp_rows() -> Iterator[tuple[str, int, _Make]]:
         "OPA627": PRESETS["opa627"],
     }
     for name, model in models.items():
-        yield name, 1, _fixed(_Setup(op_amp=model))
-    yield "noise of TL07x and resistors", DRAWS, _fixed(_Setup(op_amp=tl07x, noise=OP_AMP_GRADES["tl07x"]))
+        yield name, 1, _constant(_Setup(op_amp=model))
+    yield (
+        "noise of TL07x and resistors",
+        DRAWS,
+        _constant(_Setup(op_amp=tl07x, noise=OP_AMP_GRADES["tl07x"])),
+    )
     for name in ("tl07x", "741"):
         grade = OP_AMP_GRADES[name]
         bias = OpAmpGrade(bias_a=grade.bias_a, input_ohm=grade.input_ohm)
-        yield f"bias current, {name} ({1e9 * grade.bias_a:g} nA)", 1, _built_of(Components(op_amps=bias))
+        yield f"bias current, {name} ({1e9 * grade.bias_a:g} nA)", 1, _with_components(Components(op_amps=bias))
 
 
 def _dielectric_rows() -> Iterator[tuple[str, int, _Make]]:
     for name in ("polyester", "polypropylene"):
         absorption = Dielectric(absorption=DIELECTRICS[name].absorption)
-        yield f"dielectric absorption, {name}", 1, _built_of(Components(dielectric=absorption))
+        yield f"dielectric absorption, {name}", 1, _with_components(Components(dielectric=absorption))
     leakage = Dielectric(leakage_s=DIELECTRICS["polyester"].leakage_s)
-    yield "capacitor leakage, polyester", 1, _built_of(Components(dielectric=leakage))
+    yield "capacitor leakage, polyester", 1, _with_components(Components(dielectric=leakage))
 
 
 def _card_rows() -> Iterator[tuple[str, int, _Make]]:
@@ -232,13 +235,17 @@ def _card_rows() -> Iterator[tuple[str, int, _Make]]:
         "gain error 0.01 %": dataclasses.replace(_CARD, gain_error=tuple(1e-4 for _ in channels)),
     }
     for name, card in faults.items():
-        yield name, 1, _fixed(_Setup(card=card))
-    yield "jitter 1 ns", DRAWS, _fixed(_Setup(card=dataclasses.replace(_CARD, aperture_jitter_s=1e-9)))
-    yield "card noise 1 LSB rms", DRAWS, _fixed(_Setup(card=dataclasses.replace(_CARD, noise_lsb=(1.0,) * 4)))
-    yield "quantisation", 1, _fixed(_Setup(quantised=True))
-    yield "INL 1/2 LSB, and quantisation", DRAWS, lambda seed: _Setup(card=_bent(seed), quantised=True)
+        yield name, 1, _constant(_Setup(card=card))
+    yield "jitter 1 ns", DRAWS, _constant(_Setup(card=dataclasses.replace(_CARD, aperture_jitter_s=1e-9)))
+    yield (
+        "card noise 1 LSB rms",
+        DRAWS,
+        _constant(_Setup(card=dataclasses.replace(_CARD, noise_lsb=(1.0,) * 4))),
+    )
+    yield "quantisation", 1, _constant(_Setup(quantised=True))
+    yield "INL 1/2 LSB, and quantisation", DRAWS, lambda seed: _Setup(card=_bent_card(seed), quantised=True)
 
 
-def _bent(seed: int) -> Card:
+def _bent_card(seed: int) -> Card:
     levels_lsb = drawn_levels(_CARD.bits, np.random.default_rng(seed), inl_lsb=0.5)
     return dataclasses.replace(_CARD, levels_lsb=levels_lsb)

@@ -1,11 +1,11 @@
 """The exceptions of the emulator.
 
 * EmulatorError
-  x CircuitError      a netlist that cannot be: duplicate name, bad value, floating node, singular matrix
+  x CircuitError      invalid netlist: duplicate name, bad value, floating node, singular matrix
   x PotError          a setting beyond the track of a pot
-  x ExcitationError   a generator setting that cannot be
-  x ModeError         a machine asked for what its mode does not allow
-  x SamplerError      a card description or a voltage that cannot be
+  x ExcitationError   invalid generator setting
+  x ModeError         request that the mode of the machine does not allow
+  x SamplerError      invalid card description or voltage
   x EngineError       the engine is missing, or a run cannot go on
 """
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 
 class EmulatorError(Exception):
-    """Base of everything that the emulator raises on purpose; element: the name of the one at fault, if any."""
+    """Base of the emulator's errors; element: name of the element at fault, if any."""
 
     def __init__(self, message: str = "", *, element: str = "") -> None:
         super().__init__(message)
@@ -21,7 +21,7 @@ class EmulatorError(Exception):
 
 
 class CircuitError(EmulatorError):
-    """The netlist is wrong; the message names the element and the node."""
+    """Invalid netlist; the message names the element and the node."""
 
 
 class PotError(EmulatorError):
@@ -33,7 +33,7 @@ class ExcitationError(EmulatorError):
 
 
 class ModeError(EmulatorError):
-    """A change of mode that makes no sense, or a request in the wrong mode; the message names the mode."""
+    """Invalid change of mode, or request in the wrong mode; the message names the mode."""
 
 
 class SamplerError(EmulatorError):
@@ -41,4 +41,4 @@ class SamplerError(EmulatorError):
 
 
 class EngineError(EmulatorError):
-    """The compiled engine is absent, or it stopped; the message gives the sample."""
+    """Compiled engine missing, or run stopped; the message gives the sample."""

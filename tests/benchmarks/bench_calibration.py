@@ -1,4 +1,4 @@
-"""Twenty rigs that are drawn, each calibrated from its recordings: how far the twins are, and what their errors cover.
+"""Calibration of twenty random rigs: distance of the twins, and coverage of their standard errors.
 
 python -m tests.benchmarks.bench_calibration [FIRST LAST]    prints a line a rig besides
 """
@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from analogrig.hardware.calibration.fit import POTS, Calibration
 from analogrig.hardware.calibration.plan import check_scenario
-from tests.harness.calibration_rigs import DrawnRig, calibrated, drawn, rms_lsb, thesis_profile, truth
+from tests.harness.calibration_rigs import DrawnRig, calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 
 from .figure import Figure
 
@@ -27,8 +27,8 @@ def figures(numbers: Iterable[int] = range(RIGS_N), *, talkative: bool = False) 
     thesis, check, deviations = [], [], dict[str, list[float]]()
     right = 0
     for number in numbers:
-        rig = drawn(number)
-        found = calibrated(rig, number, ("polypropylene", "polyester"), POTS)
+        rig = draw_rig(number)
+        found = calibrate_rig(rig, number, ("polypropylene", "polyester"), POTS)
         thesis.append(rms_lsb(rig, found.twin, thesis_profile(rig.program)))
         check.append(rms_lsb(rig, found.twin, check_scenario(rig.program)))
         right += _kind_is_right(rig, found)

@@ -44,7 +44,7 @@ def jumps(trials: int = JUMPS_N) -> Iterator[Figure]:
     """Changes of 5 to 50 % of one or two parameters; at 99 % confidence the coverage is above its first bound."""
     for clock in CLOCKS:
         name = f"jump, clock {clock}"
-        pairs, each_ms = _searched(Trial.jump, Trial.found, Instant, clock, trials)
+        pairs, each_ms = _searched(Trial.jump, Trial.date_jump, Instant, clock, trials)
         yield _coverage(
             f"{name}: instants within the interval", [_holds(found, of.sample) for of, found in pairs], trials
         )
@@ -58,7 +58,7 @@ def ramps(trials: int = RAMPS_N) -> Iterator[Figure]:
     """Even turns of 10 to 50 % of one parameter in 20 to 600 samples."""
     for clock in CLOCKS:
         name = f"ramp, clock {clock}"
-        pairs, each_ms = _searched(Trial.ramp, Trial.turned, TurnInstants, clock, trials)
+        pairs, each_ms = _searched(Trial.ramp, Trial.date_turn, TurnInstants, clock, trials)
         begins = [_holds(found.begin, of.sample) for of, found in pairs]
         ends = [_holds(found.end, of.sample + of.ramp_n) for of, found in pairs]
         yield _coverage(f"{name}: begins within the interval", begins, trials)
@@ -94,7 +94,7 @@ def _width(name: str, intervals: Sequence[Instant], remark: str) -> Figure:
 def quiet(trials: int = STILL_N) -> Iterator[Figure]:
     """Pots that were to be turned, and were not."""
     for clock in CLOCKS:
-        said = [isinstance(still(seed, clock).found(), NoInstant) for seed in range(trials)]
+        said = [isinstance(still(seed, clock).date_jump(), NoInstant) for seed in range(trials)]
         yield _coverage(f"no turn, clock {clock}: said so", said, trials)
 
 

@@ -1,4 +1,4 @@
-"""What a netlist must be, and how it says what is wrong."""
+"""Checks of a netlist and their messages."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ NETLIST: tuple[Element, ...] = (
 
 
 def fitted(components: Components, netlist: Sequence[Element] = NETLIST) -> dict[str, Element]:
-    return {element.name: element for element in components.fitted(netlist)}
+    return {element.name: element for element in components.fit(netlist)}
 
 
 def value(elements: dict[str, Element], name: str) -> float:
@@ -76,8 +76,8 @@ def displacement_v(components: Components, samples: int = 800) -> np.ndarray:
 
 
 def test_perfect_components_change_no_bit() -> None:
-    assert Components().fitted(NETLIST) == NETLIST
-    assert Components(seed=7, temperature_c=80.0, age_h=1e5).fitted(NETLIST) == NETLIST
+    assert Components().fit(NETLIST) == NETLIST
+    assert Components(seed=7, temperature_c=80.0, age_h=1e5).fit(NETLIST) == NETLIST
 
 
 def test_tolerances_fill_their_range_evenly() -> None:
@@ -126,7 +126,7 @@ def test_given_bandwidth_and_slew_take_the_place_of_the_drawn_and_of_nothing_els
 
 
 def test_what_is_undrawn_is_the_same_for_every_seed_and_keeps_what_all_specimens_share() -> None:
-    stock = replace(COMPONENTS["polyester"].undrawn(), temperature_c=35.0, age_h=1e4)
+    stock = replace(COMPONENTS["polyester"].without_draws(), temperature_c=35.0, age_h=1e4)
     machines = [fitted(replace(stock, seed=seed)) for seed in (1, 2)]
     assert machines[0] == machines[1]
     assert value(machines[0], "R1") == 10e3
@@ -157,7 +157,7 @@ def test_offset_drifts_and_bias_of_a_fet_doubles_with_warming() -> None:
 
 def test_bias_current_ramps_an_integrator_as_i_over_c() -> None:
     """With the input at ground, 1 nA into the summing junction of 1 nF: dv/dt = +1 V/s."""
-    parts = Components(op_amps=OpAmpGrade(bias_a=1e-9, input_ohm=1e12)).fitted(NETLIST)
+    parts = Components(op_amps=OpAmpGrade(bias_a=1e-9, input_ohm=1e12)).fit(NETLIST)
     engine = Engine(piecewise_linear(Circuit(parts)), ("out",))
     out_v = engine.run(2001)[:, 0]
     assert out_v[-1] - out_v[0] == pytest.approx(1.0 * 2000 * 50e-6, rel=1e-6)
@@ -167,7 +167,7 @@ def test_dielectric_absorption_gives_back_part_of_the_charge() -> None:
     """Step response of 10 k into a lossy capacitor against scipy's integration of the same branches."""
     dielectric = Dielectric(leakage_s=1e-2, absorption=((0.02, 1e-3), (0.01, 1e-4)))
     netlist = (VoltageSource("F", "in"), Resistor("R", "in", "c", 10e3), Capacitor("C", "c", "0", 1e-8))
-    circuit = Circuit(Components(dielectric=dielectric).fitted(netlist))
+    circuit = Circuit(Components(dielectric=dielectric).fit(netlist))
     edges = Edges(np.array([0, 20 << 22]), np.array([10.0, 0.0]))
     volts = Engine(piecewise_linear(circuit), ("c",)).run(60, {"F": edges})[:, 0]
 
@@ -188,7 +188,7 @@ def test_dielectric_absorption_gives_back_part_of_the_charge() -> None:
 def test_a_real_pot_passes_what_its_network_passes(load_ohm: float) -> None:
     grade = PotGrade(wiper_ohm=50.0, end_ohm=20.0)
     netlist = (VoltageSource("F", "in"), Pot("P", "in", "w", "0", 10e3, 0.3), Resistor("RL", "w", "0", load_ohm))
-    system = piecewise_linear(Circuit(Components(pots=grade).fitted(netlist)))
+    system = piecewise_linear(Circuit(Components(pots=grade).fit(netlist)))
     assert grade.model(10e3).coefficient(0.3, load_ohm) == pytest.approx(
         float(system.readings(("w",))[0, 0]), rel=1e-12
     )
@@ -219,7 +219,7 @@ def test_the_wiper_rests_on_a_winding() -> None:
 
 
 def test_a_coefficient_is_set_with_the_real_load_and_track() -> None:
-    """What the pots pass is what the program asks for, whatever track, wiper and load are: they are set, not read."""
+    """Pots pass the program's coefficients, whatever track, wiper and load are: they are set, not read."""
     components = replace(COMPONENTS["polypropylene"], seed=5, pots=PotGrade(Grade(0.05), wiper_ohm=30.0, end_ohm=5.0))
     coefficients = SuspensionComputer("front", components=components).coefficients
     assert coefficients == pytest.approx(SuspensionComputer("front").coefficients, rel=1e-12)
@@ -255,10 +255,10 @@ def test_a_real_machine_agrees_with_ngspice(ngspice: NgSpice, op_amp: str) -> No
         (lambda: OpAmpGrade(bias_a=1e-9, input_ohm=math.inf), "OpAmpGrade: input_ohm"),
         (lambda: PotGrade(wiper_ohm=-1.0), "pot: wiper_ohm"),
         (lambda: Components(temperature_c=400.0), "Components: temperature_c"),
-        (lambda: Components(given={"R9": 0.1}).fitted(NETLIST), "no element is called 'R9'"),
-        (lambda: Components(given_slew={"R1": 0.1}).fitted(NETLIST), "given_slew: no op-amp is called 'R1'"),
-        (lambda: Components(given_bandwidth={"U9": 0.1}).fitted(NETLIST), "given_bandwidth: no op-amp is called 'U9'"),
-        (lambda: Components(given={"R1": -1.0}).fitted(NETLIST), "R1 would have 0 times its nominal value"),
+        (lambda: Components(given={"R9": 0.1}).fit(NETLIST), "no element is called 'R9'"),
+        (lambda: Components(given_slew={"R1": 0.1}).fit(NETLIST), "given_slew: no op-amp is called 'R1'"),
+        (lambda: Components(given_bandwidth={"U9": 0.1}).fit(NETLIST), "given_bandwidth: no op-amp is called 'U9'"),
+        (lambda: Components(given={"R1": -1.0}).fit(NETLIST), "R1 would have 0 times its nominal value"),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(make: object, message: str) -> None:

@@ -21,7 +21,7 @@ from analogrig_emulator import (
     PotGrade,
     SuspensionComputer,
 )
-from analogrig_emulator.effects import Effect, measured_effects
+from analogrig_emulator.effects import Effect, measure_effects
 
 REFERENCE_LSB = {
     "R 1 %, C 5 %, not calibrated": (47.0, 60.0),
@@ -41,7 +41,7 @@ two" and does not say which changes the shock absorber played. Its pot loading o
 suspension in proportion, without M."""
 
 EXACT_FRONT_LSB = {"pot loading ignored": 194.0, "10 us channel skew": 46.0, "GBW 3 MHz": 1.20, "741": 41.0}
-"""Of the same study: the rows in which nothing is drawn and no parameter is left to choose."""
+"""Rows of the same study in which nothing is drawn and no parameter is left to choose."""
 
 EXACT_SHOCK_LSB = {
     "pot loading ignored": 167.0,
@@ -68,7 +68,7 @@ REAL = Components(
 
 @functools.cache
 def table(program: str) -> dict[str, Effect]:
-    return {effect.name: effect for effect in measured_effects(program)}
+    return {effect.name: effect for effect in measure_effects(program)}
 
 
 @pytest.mark.parametrize("name", REFERENCE_LSB)

@@ -1,4 +1,4 @@
-"""What must hold for every machine of the family, and the overload of a summer against ngspice."""
+"""Properties of every machine of the family, and the overload of a summer against ngspice."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def test_a_tweak_to_the_same_value_changes_nothing(
 
 
 def test_cost_grows_linearly_with_samples() -> None:
-    """Of the work that the engine counts: sixteen times the samples, sixteen times the steps, to within a period."""
+    """Engine work is linear: sixteen times the samples, sixteen times the steps, to within a period."""
 
     def steps(samples: int) -> int:
         excitation = Excitation(clock="free", phase=0.137, drift_ppm=20.0)

@@ -569,7 +569,7 @@ def acceleration_scaled(opamp: str = "tl07x") -> AnalogComputer:
 
 
 def set_mass(computer: AnalogComputer, m_kg: float) -> None:
-    """As an operator would: in POT SET, on a machine of the same circuit."""
+    """Coefficients read in POT SET on a machine of the same circuit."""
     bench = AnalogComputer(computer.circuit, ["u1"], initial_v={"U2": 0.0, "U3": 0.0})
     bench.switch(POT_SET)
     for pot, coefficient in (("PF", 1.0), ("PB", 3021.0 * 2.0 / 2940.0), ("PK", 24500.0 * 0.1996 / 2940.0)):
@@ -651,7 +651,7 @@ def test_a_coefficient_is_read_beyond_the_wiper_whatever_its_load_is_called(load
         Resistor("R2", "s", "out", 1e5),
         OpAmp("U1", "0", "s", "out", IDEAL),
     ]
-    machine = AnalogComputer(Circuit(parts.fitted(elements)), ["out"], components=parts)
+    machine = AnalogComputer(Circuit(parts.fit(elements)), ["out"], components=parts)
     machine.switch(Mode.POT_SET)
     assert machine.coefficient("M") == pytest.approx(0.5 / 1.025 * 0.95, rel=1e-5)
 

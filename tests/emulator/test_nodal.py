@@ -186,4 +186,4 @@ def test_an_element_of_no_known_kind_is_refused_by_its_name() -> None:
     with pytest.raises(CircuitError, match=r"Inductor L1 \(in 0\): no such kind of element"):
         Nodal(Circuit([SOURCE, strange]))
     with pytest.raises(CircuitError, match=r"Inductor L1 \(in 0\): no such kind of element"):
-        Components(given={"V1": 0.0}).fitted([SOURCE, strange])
+        Components(given={"V1": 0.0}).fit([SOURCE, strange])

@@ -1,4 +1,4 @@
-"""What overloads when: the table of emulator/README.md."""
+"""Overloads: the table of the background page on the circuit."""
 
 from __future__ import annotations
 

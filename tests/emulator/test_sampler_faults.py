@@ -53,7 +53,7 @@ class Wave:
 
 
 def times_us(card: Card, samples: int, block_samples: int = 7, seed: int = 1) -> Volts:
-    """When each channel was taken, less the nominal instant: (samples, channels), us."""
+    """Delay of each channel after the nominal instant: (samples, channels), us."""
     wave = Wave(card.true_rate_hz * probes_per_sample(card), card.channels)
     rng = np.random.default_rng(seed)
     blocks = list(acquired(wave, card, Excitation(), samples, rng=rng, block_samples=block_samples))
@@ -227,7 +227,7 @@ CARD = st.builds(
 @given(CARD, st.integers(0, 2**32))
 @settings(max_examples=100, deadline=None)
 def test_every_clipped_sample_is_flagged_and_no_other(card: Card, seed: int) -> None:
-    """What the converter sees is computed here in volts: clipped is what lies outside half an LSB about the codes."""
+    """The converter input is computed here in volts: clipped is what lies outside half an LSB about the codes."""
     volts = np.random.default_rng(seed).uniform(-15.0, 15.0, (50, 4))
     _, clipped = Sampler(card, np.random.default_rng(seed)).sample(volts)
     low_v, high_v = np.array(card.ranges_v).T

@@ -1,4 +1,4 @@
-"""Rigs that are drawn, what of them can be told from force and displacement, and how far a twin is from them.
+"""Random rigs, the values of theirs that force and displacement identify, and the distance of a twin from them.
 
 The truth follows from the circuit alone (emulator/README.md, "The circuit"), with r4 = R4FB / R4, r5 = R5FB / R5 and
 amplifiers that hold their junctions at their offsets V1..V5:
@@ -7,7 +7,7 @@ amplifiers that hold their junctions at their offsets V1..V5:
     d_M u1 = V2 at rest                                             u4 = -r4 u2 + (1 + r4) V4
     u2 = V3 at rest                                                 x = -r5 u3 + (1 + r5) V5
 
-rho is what a pot's wiper has as source resistance, d_M the dial of pot M.
+rho is the source resistance of a pot's wiper, d_M the dial of pot M.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resi
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
 
 GBW_HZ, SLEW_V_PER_S = 3e6, 13e6
-"""Of the TL07x model."""
+"""Gain-bandwidth product and slew rate of the TL07x model."""
 
 
 @dataclass(frozen=True)
 class DrawnRig:
-    """One of the rigs, and the program that is wired on it."""
+    """Random rig and the program wired on it."""
 
     description: EmulatorDescription
     program: Program
@@ -43,9 +43,12 @@ class DrawnRig:
         return self.description.computer.components
 
 
-def drawn(number: int) -> DrawnRig:
-    """Components within their tolerances; every second one on the card of a served instrument, every third one with
-    pots that are set by their dials, every fifth one wired as the shock absorber."""
+def draw_rig(number: int) -> DrawnRig:
+    """Rig with random components within their tolerances.
+
+    Every second one has the card of a served instrument, every third one pots set by dials, every fifth one is wired as
+    the shock absorber.
+    """
     rng = np.random.default_rng([20, number])
     span_v, bits = (20.0, 14) if number % 2 else (10.0, 12)
     card = CardDescription(
@@ -64,17 +67,17 @@ def drawn(number: int) -> DrawnRig:
     return DrawnRig(EmulatorDescription(card=card, computer=computer), "shock" if number % 5 == 4 else "front")
 
 
-def calibrated(
+def calibrate_rig(
     rig: DrawnRig, number: int, stocks: tuple[Stock, ...], pots: tuple[Pots, ...] = ("coefficient",)
 ) -> Calibration:
-    """From recordings whose noise differs from one to the next."""
+    """Calibration of a rig from recordings with independent noise."""
     with EmulatorRig(rig.description) as there:
         recordings = [record(there, each, 1000 * number + i) for i, each in enumerate(scenarios(rig.program))]
     return calibrate(recordings, stocks=stocks, pots=pots)
 
 
 def truth(rig: DrawnRig) -> dict[str, float]:
-    """What the estimates should be, by name; those of the tracks are made where the pots are set by their dials."""
+    """True values of the estimates by name; those of the tracks apply to pots set by dials."""
     there, nominal = _values(rig.description, rig.program), _nominal(rig.program)
     channel = DISPLACEMENT
     card = rig.description.card
@@ -110,13 +113,13 @@ def truth(rig: DrawnRig) -> dict[str, float]:
 
 
 def rms_lsb(rig: DrawnRig, twin: EmulatorDescription, scenario: Scenario) -> float:
-    """Of the difference between the displacements of rig and twin over the whole scenario, without noise."""
+    """Rms difference between the displacements of rig and twin over the whole scenario, without noise."""
     difference = noise_free_lsb(rig.description, scenario, 0) - noise_free_lsb(twin, scenario, 0)
     return float(np.sqrt(np.mean(difference[:, DISPLACEMENT] ** 2)))
 
 
 def thesis_profile(program: Program) -> Scenario:
-    """That of the thesis; for the shock absorber the same changes in proportion, but for that of M, beyond its pot."""
+    """Scenario of the thesis; for the shock absorber the same relative changes, but for M, which exceeds its pot."""
     thesis = Scenario.load("thesis")
     if program == "front":
         return thesis
@@ -137,7 +140,7 @@ def thesis_profile(program: Program) -> Scenario:
 
 
 def _values(description: EmulatorDescription, program: Program) -> dict[str, float]:
-    """ohm, F, V, Hz, V/s by name, and the dials, of the rig's machine."""
+    """Values of the rig's machine by name, in ohm, F, V, Hz, V/s, and its dials."""
     scenario = Scenario(samples=1, excitation=Scenario.load("thesis").excitation, plant=PlantChoice(program))
     return _read(EmulatorRig(description).set_up(scenario, 0).computer)
 

@@ -1,4 +1,4 @@
-"""Turns of the pots at instants that nobody told, on emulated machines of real components."""
+"""Trials of dating: pot changes at unknown instants, on emulated machines of real components."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FIELDS = dict(zip(PARAMETERS, (field.name for field in dataclasses.fields(Plant)
 Clock = Literal["card", "free"]
 
 LARGEST_UP = {"M": 0.5, "B": 0.3, "K": 0.15}
-"""Relative changes beyond which a pot comes to its end; down there is always room for half."""
+"""Largest relative increases within the range of each pot; a decrease by half is always within it."""
 
 QUIET_N = 900
 """Samples before the first instant of a change."""
@@ -39,15 +39,15 @@ QUIET_N = 900
 
 @functools.cache
 def machines() -> EmulatorRig:
-    """Of polyester capacitors and resistors of 1 %, drawn from the seed, amplifiers of the grade, noise of 1 LSB."""
+    """Rig whose seed draws polyester capacitors, 1 % resistors and amplifiers of the grade; noise of 1 LSB."""
     table = config.read_toml(config.locate("rigs", "emulator"))
     described = config.build(EmulatorDescription, {"name": "polyester", **table}, "emulator")
     computer = dataclasses.replace(described.computer, components="polyester")
     return EmulatorRig(dataclasses.replace(described, computer=computer))
 
 
-def played(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
-    """What the card takes of it; on one of the machines, or another rig."""
+def play(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
+    """Samples of a scenario on one of the machines, or on another rig."""
     performance = (rig or machines()).perform(scenario, seed)
     blocks = list(performance.blocks)
     codes, clipped = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("codes", "clipped"))
@@ -57,7 +57,7 @@ def played(scenario: Scenario, seed: int, rig: Rig | None = None) -> Signals:
 def scenario_of(
     samples: int, clock: Clock, frequency_hz: float, plant: Plant = FRONT, sample: int = 0, ramp_n: int = 0
 ) -> Scenario:
-    """The front suspension, which becomes ``plant`` at a sample."""
+    """Scenario of the front suspension, which becomes ``plant`` at a sample."""
     tweaks = (tweak_of(sample, FRONT, plant, ramp_n),) if plant != FRONT else ()
     return Scenario(samples, square(clock, frequency_hz, 9.9), random_phase=True, tweaks=tweaks, name="onset")
 
@@ -71,8 +71,8 @@ def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> Tweak
     return Tweak(sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()})
 
 
-def changed(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
-    """The front suspension with so many of M, B, K changed, by factors from 1 +- least to 1 +- most."""
+def change_front(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:
+    """Front suspension with ``together`` of M, B, K changed, by factors from 1 +- least to 1 +- most."""
     plant = FRONT
     for name in rng.choice(PARAMETERS, size=together, replace=False).tolist():
         size = math.exp(rng.uniform(math.log(least), math.log(most)))
@@ -83,7 +83,7 @@ def changed(rng: np.random.Generator, least: float, most: float, together: int) 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A change of the front suspension at an instant that only the trial knows."""
+    """Change of the front suspension at an instant that the search is not given."""
 
     signals: Signals
     after: Plant
@@ -91,39 +91,42 @@ class Trial:
     ramp_n: int
     search: range
     known: bool
-    """The harness is told what the plant is to become."""
+    """True if the search is given the plant after the change."""
 
     @classmethod
     def jump(cls, seed: int, clock: Clock) -> Trial:
-        """5 to 50 % of one or two parameters, edges every 50 or 100 samples, in a range of 600; what it becomes is told
-        in five of six trials."""
+        """Change of one or two parameters by 5 to 50 %, in a range of 600 samples.
+
+        Edges come every 50 or 100 samples; the plant after the change is given in five of six trials.
+        """
         rng = np.random.default_rng([9, seed])
-        after = changed(rng, 0.05, 0.5, together=int(rng.integers(1, 3)))
+        after = change_front(rng, 0.05, 0.5, together=int(rng.integers(1, 3)))
         sample = QUIET_N + int(rng.integers(200))
         first = sample - int(rng.integers(50, 550))
         scenario = scenario_of(2200, clock, float(rng.choice([100.0, 200.0])), after, sample)
-        return cls(played(scenario, seed), after, sample, 0, range(first, first + 600), bool(rng.uniform() < 5.0 / 6.0))
+        return cls(play(scenario, seed), after, sample, 0, range(first, first + 600), bool(rng.uniform() < 5.0 / 6.0))
 
     @classmethod
     def ramp(cls, seed: int, clock: Clock) -> Trial:
-        """10 to 50 % of one parameter within 20 to 600 samples, 50 to 300 samples on both sides of the range."""
+        """Change of one parameter by 10 to 50 % within 20 to 600 samples, 50 to 300 samples inside the range."""
         rng = np.random.default_rng([10, seed])
-        after = changed(rng, 0.1, 0.5, together=1)
+        after = change_front(rng, 0.1, 0.5, together=1)
         sample, ramp_n = QUIET_N + int(rng.integers(200)), int(math.exp(rng.uniform(math.log(20.0), math.log(600.0))))
         search = range(sample - int(rng.integers(50, 300)), sample + ramp_n + int(rng.integers(50, 300)))
         scenario = scenario_of(3000, clock, 200.0, after, sample, ramp_n)
-        return cls(played(scenario, seed), after, sample, ramp_n, search, known=True)
+        return cls(play(scenario, seed), after, sample, ramp_n, search, known=True)
 
-    def found(self) -> Instant | NoInstant:
+    def date_jump(self) -> Instant | NoInstant:
         return date_jump(self.signals, FRONT, self.after if self.known else None, self.search)
 
-    def turned(self) -> TurnInstants | NoInstant:
+    def date_turn(self) -> TurnInstants | NoInstant:
         return date_turn(self.signals, FRONT, self.after if self.known else None, self.search)
 
     def width_bound(self) -> int:
-        """How many instants nobody can tell from the true one with 95 % confidence, were both plants known: the
-        information between the courses that the displacement then takes is below ln 20, as in
-        analogrig.judging.information."""
+        """Number of instants that no method separates from the true one with 95 % confidence.
+
+        The information between the courses of the displacement is below ln 20, as in analogrig.judging.information.
+        """
         first = max(0, self.sample - 400)
         samples = np.arange(max(self.search.start, self.sample - 120), min(self.search.stop, self.sample + 120))
         courses_m = self._courses(first, samples)
@@ -132,7 +135,7 @@ class Trial:
         return int((gathered < information.LN_CERTAIN).sum())
 
     def _courses(self, first: int, samples: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(m, 800) metres from a sample on, the plant changing at each of these samples (m,)."""
+        """(m, 800) displacement in metres from sample ``first`` on, for a change at each of ``samples`` (m,)."""
         before, after = (SampledPlant.of(plant, self.signals.period_s) for plant in (FRONT, self.after))
         x, v = np.zeros(len(samples)), np.zeros(len(samples))
         out = []
@@ -146,17 +149,19 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Several:
-    """Turns of one record, told to the sample."""
+    """Several changes of one record at known samples."""
 
     signals: Signals
     tweaks: tuple[Told, ...]
 
     @classmethod
     def of(cls, seed: int, clock: Clock, rig: Rig | None = None) -> Several:
-        """Eight, 150 to 600 samples apart: one of M, B, K by 5 to 74 %, and back. The force is such that no amplifier
-        comes to its end where K is least."""
+        """Eight changes, 150 to 600 samples apart: one of M, B, K by 5 to 74 %, and back.
+
+        The force overloads no amplifier where K is least.
+        """
         rng = np.random.default_rng([12, seed])
-        away = [changed(rng, 0.05, 0.74, together=1) for _ in range(4)]
+        away = [change_front(rng, 0.05, 0.74, together=1) for _ in range(4)]
         plants = [FRONT, *(plant for each in away for plant in (each, FRONT))]
         instants = 600 + np.append(0, np.cumsum(rng.integers(150, 600, size=8)))
         pairs = list(zip(instants.tolist(), plants, plants[1:], strict=False))
@@ -168,10 +173,10 @@ class Several:
             tweaks=tuple(tweak_of(*pair) for pair in pairs),
             name="several",
         )
-        return cls(played(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
+        return cls(play(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
 
     def stretches(self) -> Iterator[tuple[Told, range]]:
-        """Each turn with the samples that no other one changes."""
+        """Each change with the samples between its neighbours."""
         starts = [tweak.sample for tweak in self.tweaks]
         for tweak, before, after in zip(self.tweaks, [0, *starts], [*starts[1:], len(self.signals)], strict=False):
             yield tweak, range(before + 1, after)
@@ -180,14 +185,16 @@ class Several:
 def _next(
     plant: SampledPlant, x: NDArray[np.float64], v: NDArray[np.float64], force_n: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """SampledPlant.next for many states."""
+    """Return SampledPlant.next for many states."""
     xx, xv, vx, vv = plant.transition
     xf, vf = plant.response
     return xx * x + xv * v + xf * force_n, vx * x + vv * v + vf * force_n
 
 
 def still(seed: int, clock: Clock) -> Trial:
-    """A pot that was to be turned and was not: nothing has changed."""
+    """Trial without a change, although a pot was to turn."""
     rng = np.random.default_rng([11, seed])
-    signals = played(scenario_of(2200, clock, 200.0), seed)
-    return Trial(signals, changed(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0))
+    signals = play(scenario_of(2200, clock, 200.0), seed)
+    return Trial(
+        signals, change_front(rng, 0.05, 0.5, together=1), 0, 0, range(800, 1400), bool(rng.uniform() < 5.0 / 6.0)
+    )

@@ -13,7 +13,7 @@ from analogrig.hardware.dating.two_filter import Signals
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
 from analogrig.scenario import Tweak as PlayedTweak
-from tests.harness.dating_trials import FRONT, Clock, Several, played, scenario_of
+from tests.harness.dating_trials import FRONT, Clock, Several, play, scenario_of
 
 RATE_HZ = 20e3
 
@@ -47,7 +47,7 @@ def turned(tweaks: Sequence[Tweak], takes_s: float, *, slow: bool = False) -> By
 
 def taken(samples: int, *changes: PlayedTweak) -> Signals:
     """By the card of a machine of real components."""
-    return played(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
+    return play(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
 
 
 def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) -> Tweak:

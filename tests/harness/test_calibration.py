@@ -1,4 +1,4 @@
-"""Calibration: the twin of a rig that was drawn, what is known of it, and what is nobody's twin."""
+"""Calibration: twins of random rigs, their standard errors, and recordings that have no twin."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from analogrig.rigs.rig import Block, Hindsight, Performance
 from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.scenario import PlantChoice
 from analogrig_emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
-from tests.harness.calibration_rigs import calibrated, drawn, rms_lsb, thesis_profile, truth
+from tests.harness.calibration_rigs import calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 
 LSB_V = 20.0 / 4096
 
@@ -46,13 +46,13 @@ LSB_V = 20.0 / 4096
     [(0, ("polypropylene", "polyester")), (3, ("polypropylene",)), (4, ("polyester",))],
     ids=["front, polyester", "front, polypropylene", "shock, polyester"],
 )
-def test_the_twin_of_a_drawn_rig_follows_it_and_its_errors_cover_what_was_drawn(
-    number: int, stocks: tuple[Stock, ...]
-) -> None:
-    """Follows: 1 LSB is asked for, half of it is what twenty rigs stay below (README). Cover: with 17 values that have
-    Gaussian errors, one beyond 4.5 standard errors has a probability of 1e-4, a chi-square above 3 x 17 one of 3e-5."""
-    rig = drawn(number)
-    found = calibrated(rig, number, stocks)
+def test_twin_of_a_random_rig_follows_it_and_its_errors_cover_the_truth(number: int, stocks: tuple[Stock, ...]) -> None:
+    """The limit is 1 LSB; twenty rigs stay below half of it (README).
+
+    One of 17 Gaussian errors exceeds 4.5 standard errors with a probability of 1e-4; chi-square 3 x 17 with 3e-5.
+    """
+    rig = draw_rig(number)
+    found = calibrate_rig(rig, number, stocks)
     assert found.twin.computer.components == rig.stock
     assert found.twin.card.bits == rig.description.card.bits
     for scenario in (thesis_profile(rig.program), check_scenario(rig.program)):
@@ -64,10 +64,10 @@ def test_the_twin_of_a_drawn_rig_follows_it_and_its_errors_cover_what_was_drawn(
     assert sum(deviation**2 for deviation in deviations) < 3 * len(deviations)
 
 
-def test_pots_that_are_set_by_their_dials_are_found_out_with_the_tracks_they_have() -> None:
-    rig = drawn(2)
+def test_pots_set_by_dials_are_identified_with_their_tracks() -> None:
+    rig = draw_rig(2)
     assert rig.description.computer.pots == "dial"
-    found = calibrated(rig, 2, (rig.stock,), ("coefficient", "dial"))
+    found = calibrate_rig(rig, 2, (rig.stock,), ("coefficient", "dial"))
     assert found.twin.computer.pots == "dial"
     assert rms_lsb(rig, found.twin, thesis_profile("front")) < 0.5
     track = found.estimate("B track")
@@ -77,7 +77,7 @@ def test_pots_that_are_set_by_their_dials_are_found_out_with_the_tracks_they_hav
 # ---- noise and rounding
 
 
-def made(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: int = 0) -> SquareWaveRecording:
+def recording_of(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: int = 0) -> SquareWaveRecording:
     """A recording of a scenario of the plan (half a period: 50 samples), of these codes on both channels."""
     channels = {name: Channel(-10.0, LSB_V, "V", 1.0, 0.0) for name in MEASURED}
     both = np.stack([codes, codes], axis=1)
@@ -86,19 +86,19 @@ def made(codes: np.ndarray, *, clipped: np.ndarray | None = None, scenario_n: in
 
 
 @pytest.mark.parametrize("noise_lsb", [0.0, 0.2, 0.35, 0.6, 1.0, 3.0])
-def test_noise_is_told_from_rounded_samples(noise_lsb: float) -> None:
-    """Levels anywhere between codes; within four standard errors, for six cases a probability of 4e-4."""
+def test_noise_is_estimated_from_rounded_samples(noise_lsb: float) -> None:
+    """Levels at any place between codes. Six cases exceed four standard errors with a probability of 4e-4."""
     rng = np.random.default_rng(5)
     levels = np.tile(rng.uniform(1000.0, 2000.0, 100), 100)
     codes = np.floor(levels + noise_lsb * rng.standard_normal(len(levels)) + 0.5)
-    found, error = estimate_noise([made(codes)], DISPLACEMENT)
+    found, error = estimate_noise([recording_of(codes)], DISPLACEMENT)
     assert abs(found - noise_lsb) <= 4.0 * error
     assert error < 0.05 or noise_lsb == 0.0
 
 
 @pytest.mark.parametrize("noise_lsb", [0.0, 0.2, 0.4])
-def test_rounding_leaves_that_variance_in_a_mean(noise_lsb: float) -> None:
-    """Against the mean code by the normal distribution's integral, at 1000 levels between two codes."""
+def test_rounding_variance_is_that_of_a_mean_of_rounded_samples(noise_lsb: float) -> None:
+    """Compare with the mean code by the normal distribution function, at 1000 levels between two codes."""
     levels = (np.arange(1000) + 0.5) / 1000
     steps = np.arange(-8, 9) + 0.5
     beyond = (levels[:, None] - steps[None]) / (math.sqrt(2.0) * max(noise_lsb, 1e-9))
@@ -110,12 +110,12 @@ def test_phases_with_a_clipped_sample_are_left_out() -> None:
     codes = np.full(1400, 1500.0)
     clipped = np.zeros(1400, np.bool_)
     clipped[[703, 1207]] = True
-    average = average_phases(made(codes, clipped=clipped), FORCE, 0.5)
+    average = average_phases(recording_of(codes, clipped=clipped), FORCE, 0.5)
     assert set(range(100)) - set(average.phases.tolist()) == {3, 7}
 
 
-def test_the_displacement_late_displacement_is_that_of_a_card_with_that_skew() -> None:
-    """By moving the force, and by a machine of four times the rate; they begin apart by less than a sample."""
+def test_late_displacement_is_that_of_a_card_with_skew() -> None:
+    """Compare with a machine of four times the sample rate; both begin apart by less than a sample."""
     card = Card(skew_s=(0.0, 12.5e-6, 0.0, 0.0))
     fast = SuspensionComputer("front", sample_rate_hz=card.rate_hz * probes_per_sample(card))
     wave = Excitation(frequency_hz=400.0)
@@ -133,9 +133,9 @@ def test_the_displacement_late_displacement_is_that_of_a_card_with_that_skew() -
     ],
     ids="MBK",
 )
-def test_a_pot_that_misses_its_setting_is_a_pot_set_elsewhere(pot: int, elsewhere: PlantChoice) -> None:
-    """By a thousandth of its coefficient, which is 1 / M, B and K; seen, and told to a hundredth of that."""
-    there = made(np.zeros(1400))
+def test_pot_that_misses_its_setting_equals_a_pot_set_elsewhere(pot: int, elsewhere: PlantChoice) -> None:
+    """Error of a thousandth of the coefficient (1 / M, B, K), visible and reproduced to a hundredth of its effect."""
+    there = recording_of(np.zeros(1400))
     other = dataclasses.replace(there, scenario=dataclasses.replace(there.scenario, plant=elsewhere))
     model = EmulatorModel([there, other], ComputerDescription(), 1.0)
     at_rest = np.zeros(len(model.known_to))
@@ -147,17 +147,17 @@ def test_a_pot_that_misses_its_setting_is_a_pot_set_elsewhere(pot: int, elsewher
     np.testing.assert_allclose(model.codes(missed, there), expected, rtol=0, atol=0.01 * np.abs(moved).max())
 
 
-# ---- what is nobody's twin
+# ---- recordings without a twin
 
 
 @pytest.fixture(scope="module")
 def recordings() -> list[SquareWaveRecording]:
-    """Of the nominal computer and a card without fault but noise."""
+    """Recordings of the nominal computer on a card with noise and no other fault."""
     with open_rig("emulator") as rig:
         return [record(rig, each, 1) for each in scenarios("front")]
 
 
-def otherwise(recordings: list[SquareWaveRecording], **changes: Any) -> list[SquareWaveRecording]:
+def alter(recordings: list[SquareWaveRecording], **changes: Any) -> list[SquareWaveRecording]:
     return [
         dataclasses.replace(each, **{name: change(each) for name, change in changes.items()}) for each in recordings
     ]
@@ -172,25 +172,25 @@ def otherwise(recordings: list[SquareWaveRecording], **changes: Any) -> list[Squ
     ],
     ids=["swapped leads", "silence", "edges a sample late"],
 )
-def test_recordings_that_no_computer_makes_end_in_one_line(
+def test_recordings_of_no_computer_raise_one_line(
     recordings: list[SquareWaveRecording], codes: Any, message: str
 ) -> None:
     with pytest.raises(RigError, match=message):
-        calibrate(otherwise(recordings, codes=codes), stocks=("nominal",), pots=("coefficient",))
+        calibrate(alter(recordings, codes=codes), stocks=("nominal",), pots=("coefficient",))
 
 
-def test_too_few_recordings_are_told_apart_from_enough(recordings: list[SquareWaveRecording]) -> None:
+def test_too_few_recordings_are_rejected(recordings: list[SquareWaveRecording]) -> None:
     with pytest.raises(RigError, match="do not determine the values to fit|does not converge"):
         calibrate(recordings[:1], stocks=("nominal",), pots=("coefficient",))
 
 
-def test_a_card_whose_samples_do_not_fit_the_periods_is_refused(recordings: list[SquareWaveRecording]) -> None:
+def test_card_whose_samples_do_not_fit_the_periods_is_rejected(recordings: list[SquareWaveRecording]) -> None:
     with pytest.raises(ConfigurationError, match=r"scenario calibration-1: half a period .* at 12345 Hz; .* 20000 Hz"):
-        calibrate(otherwise(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
+        calibrate(alter(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
 
 
-class Troubled:
-    """A rig with a lit lamp, that is not well, or whose samples are of two records."""
+class FaultyRig:
+    """Rig with a lit lamp, a caveat, or samples of two records."""
 
     capabilities = frozenset({"excite"})
 
@@ -219,15 +219,15 @@ class Troubled:
 @pytest.mark.parametrize(
     ("rig", "message"),
     [
-        (Troubled({"U1": 7}), "scenario calibration-1: overload lamps of U1 are lit"),
+        (FaultyRig({"U1": 7}), "scenario calibration-1: overload lamps of U1 are lit"),
         (
-            Troubled({}, ("the rig's self-test: skew",)),
+            FaultyRig({}, ("the rig's self-test: skew",)),
             "scenario calibration-1: the rig's self-test: skew: nothing",
         ),
-        (Troubled({}, records=(0, 1)), "scenario calibration-1: the samples have a gap"),
+        (FaultyRig({}, records=(0, 1)), "scenario calibration-1: the samples have a gap"),
     ],
 )
-def test_overloaded_and_broken_recordings_are_not_fitted(rig: Troubled, message: str) -> None:
+def test_recordings_with_overload_or_gap_are_rejected(rig: FaultyRig, message: str) -> None:
     with pytest.raises(RigError, match=message):
         record(rig, scenarios("front")[0], 1)
 
@@ -235,7 +235,7 @@ def test_overloaded_and_broken_recordings_are_not_fitted(rig: Troubled, message:
 # ---- the command
 
 
-def described(folder: Path, **card: object) -> str:
+def rig_file(folder: Path, **card: object) -> str:
     path = folder / "mine.toml"
     faults = {"gain_error": [0.001, 0.0, 0.0, 0.0], **card}
     table = config.read_toml(config.locate("rigs", "emulator"))
@@ -243,25 +243,25 @@ def described(folder: Path, **card: object) -> str:
     return str(path)
 
 
-def ran(rig: str, out: Path, *more: str) -> int:
+def run_calibrate(rig: str, out: Path, *more: str) -> int:
     given = ["--components", "nominal", "--pots", "coefficient", "--seed", "3"]
     return main(["calibrate", "--rig", rig, "--out", str(out), *given, *more])
 
 
-def test_the_command_keeps_a_twin_that_opens_as_a_rig(
+def test_command_writes_a_twin_that_opens_as_a_rig(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setattr("analogrig.cli.terminal._PROGRESS_S", 0.0)
     out = tmp_path / "twin.toml"
-    assert ran(described(tmp_path), out, "--json") == 0
-    said = capsys.readouterr()
-    assert "\r4 of 13 recordings (31%)" in said.err
-    assert said.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
-    told = json.loads(said.out)
-    assert told["check_lsb"] < 0.5
-    assert told["caveats"] == []
-    gain = next(each for each in told["estimates"] if each["name"] == "force gain")
+    assert run_calibrate(rig_file(tmp_path), out, "--json") == 0
+    output = capsys.readouterr()
+    assert "\r4 of 13 recordings (31%)" in output.err
+    assert output.err.endswith("\r13 of 13 recordings (100%)\n\r1 of 1 fits (100%)\n")
+    result = json.loads(output.out)
+    assert result["check_lsb"] < 0.5
+    assert result["caveats"] == []
+    gain = next(each for each in result["estimates"] if each["name"] == "force gain")
     assert abs(gain["value"] - 1e-3) < 4.5 * gain["standard_error"]
     with open_rig(str(out)) as twin:
         assert isinstance(twin, EmulatorRig)
@@ -272,27 +272,23 @@ def test_the_command_keeps_a_twin_that_opens_as_a_rig(
 @pytest.mark.parametrize(
     ("dial", "why"), [(400.0, "the least chi-square but for dials"), (600.0, "of those tried the least chi-square")]
 )
-def test_the_kind_that_is_kept_is_kept_with_its_reason(dial: float, why: str) -> None:
+def test_report_gives_the_reason_for_the_kind_chosen(dial: float, why: str) -> None:
     chi_squares: dict[tuple[Stock, Pots], float] = {("nominal", "coefficient"): 420.0, ("nominal", "dial"): dial}
     card = CardDescription(range_v=dict.fromkeys(CHANNELS, (-10.0, 10.0)))
     found = Calibration(EmulatorDescription(card=card), (), np.eye(0), 0.1, chi_squares, 514)
     assert _said(found, 0.1)[0].startswith(f"kept: nominal capacitors, pots set by coefficient: {why}")
 
 
-def test_a_rig_that_is_not_like_its_twin_fails_and_nothing_is_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A stuck bit of 4 codes, which is an error of 0 to 4 LSB from level to level."""
+def test_rig_unlike_its_twin_fails_and_writes_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Stuck bit of 4 codes: an error of 0 to 4 LSB that depends on the level."""
     out = tmp_path / "twin.toml"
-    assert ran(described(tmp_path, stuck_low=4), out) == 1
-    said = capsys.readouterr().out
-    assert "no twin: more than 1 LSB" in said
-    assert re.search(r"^caveat: chi-square \d+ where noise leaves \d+ \+- \d+: ", said, re.MULTILINE)
+    assert run_calibrate(rig_file(tmp_path, stuck_low=4), out) == 1
+    output = capsys.readouterr().out
+    assert "no twin: more than 1 LSB" in output
+    assert re.search(r"^caveat: chi-square \d+ where noise leaves \d+ \+- \d+: ", output, re.MULTILINE)
     assert not out.exists()
 
 
-def test_the_command_wants_a_toml_file_and_a_rig_that_can_play(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_requires_a_toml_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", "--rig", "emulator", "--out", str(tmp_path / "twin.npz")]) == 2
     assert "twin.npz: must be a .toml file" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Two rigs against each other: known differences come out with the bounds that were promised, and noise is none."""
+"""Comparison of two rigs: known differences are found, bounds have their coverage, and noise is no difference."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def rig(noise_lsb: float = 1.0, **faults: object) -> EmulatorRig:
     return EmulatorRig(EmulatorDescription(CardDescription(WIDE, noise_lsb=noise_lsb, faults=faults), name="drawn"))
 
 
-def compared(a: EmulatorRig, b: EmulatorRig, plays: int = 4) -> RigComparison:
+def compare(a: EmulatorRig, b: EmulatorRig, plays: int = 4) -> RigComparison:
     with open_dut("inproc") as dut:
         found = compare_rigs(Bench(a, dut), Bench(b, dut), Scenario.load("thesis"), range(plays))
     assert isinstance(found, RigComparison)
@@ -43,8 +43,8 @@ PLAYS, SAMPLES, SETS = 6, 1000, 100
 CONFIDENCE = 0.9
 
 
-def recorded(displacement: np.ndarray, rng: np.random.Generator) -> Run:
-    """In codes, with 1 LSB of noise; the force jumps every 100 samples."""
+def run_of(displacement: np.ndarray, rng: np.random.Generator) -> Run:
+    """Run of a displacement in codes, with 1 LSB of noise; the force jumps every 100 samples."""
     force_n = np.where(np.arange(len(displacement)) // 100 % 2, 2500.0, 300.0)
     run = made_run(force_n, [(0, FRONT)])
     codes = run.codes.copy()
@@ -52,16 +52,18 @@ def recorded(displacement: np.ndarray, rng: np.random.Generator) -> Run:
     return dataclasses.replace(run, codes=codes)
 
 
-def test_difference_is_within_its_bound_as_often_as_promised() -> None:
-    """A wave of 0.5 LSB rms under 1.4 LSB of noise. Of 100 bounds of 90 % fewer than 80 hold with a probability of 1e-3
-    (binomial); the mean estimate is right to 4 of its own standard errors."""
+def test_bound_of_the_difference_has_its_coverage() -> None:
+    """Wave of 0.5 LSB rms under 1.4 LSB of noise. Fewer than 80 of 100 bounds of 90 % hold with a probability of 1e-3.
+
+    The mean estimate is within 4 of its standard errors.
+    """
     rng = np.random.default_rng(3)
     k = np.arange(SAMPLES)
     signal = 2000.0 + 800.0 * np.sin(k / 30.0)
     wave = 0.5 * np.sqrt(2.0) * np.sin(k / 17.0)
     found = [
         signal_difference(
-            [(recorded(signal, rng), recorded(signal + wave, rng)) for _ in range(PLAYS)], "displacement", CONFIDENCE
+            [(run_of(signal, rng), run_of(signal + wave, rng)) for _ in range(PLAYS)], "displacement", CONFIDENCE
         )
         for _ in range(SETS)
     ]
@@ -72,8 +74,8 @@ def test_difference_is_within_its_bound_as_often_as_promised() -> None:
     assert np.mean([each.noise_lsb for each in found]) == pytest.approx(np.sqrt(2.0 + 2.0 / 12.0), rel=0.02)
 
 
-def test_offset_is_a_difference_and_noise_is_none() -> None:
-    found = compared(rig(noise_lsb=0.5), rig(noise_lsb=2.0, offset_lsb=[0.0, 3.0, 0.0, 0.0]))
+def test_offset_is_a_difference_and_noise_is_not() -> None:
+    found = compare(rig(noise_lsb=0.5), rig(noise_lsb=2.0, offset_lsb=[0.0, 3.0, 0.0, 0.0]))
     force, displacement = found.signals
     assert displacement.rms_lsb == pytest.approx(3.0, abs=0.15)
     assert displacement.rms_most_lsb >= displacement.rms_lsb
@@ -83,8 +85,8 @@ def test_offset_is_a_difference_and_noise_is_none() -> None:
 
 
 def test_skew_shows_where_the_displacement_moves() -> None:
-    """10 us cost up to 46 LSB of a front suspension (facts of the project, by ngspice)."""
-    found = compared(rig(), rig(skew_s=[0.0, 10e-6, 0.0, 0.0]))
+    """A skew of 10 us causes up to 46 LSB on a front suspension (by ngspice)."""
+    found = compare(rig(), rig(skew_s=[0.0, 10e-6, 0.0, 0.0]))
     force, displacement = found.signals
     assert force.rms_lsb == 0.0
     assert 5.0 < displacement.rms_lsb < 25.0
@@ -94,7 +96,7 @@ def test_skew_shows_where_the_displacement_moves() -> None:
 
 def test_edges_that_lie_apart_are_counted_and_left_out() -> None:
     rng = np.random.default_rng(4)
-    run = recorded(np.full(SAMPLES, 2000.0), rng)
+    run = run_of(np.full(SAMPLES, 2000.0), rng)
     later = dataclasses.replace(run, codes=np.concatenate((run.codes[:1], run.codes[:-1])))
     force = signal_difference([(run, later), (run, later)], "force", 0.95)
     assert force.rms_lsb == 0.0
@@ -113,19 +115,19 @@ def test_mean_interval_is_that_of_student() -> None:
 # -------------------------------------------------------------------------------------------------------- the verdicts
 
 
-def test_rig_is_the_same_as_itself() -> None:
-    found = compared(rig(), rig())
+def test_rig_equals_itself() -> None:
+    found = compare(rig(), rig())
     assert [each.rms_most_lsb for each in found.signals] == [0.0, 0.0]
     assert found.latency is not None
     assert (found.latency.mean_n, found.latency.unequal) == (0.0, 0)
-    # Of the 13 or so changes none differs: by Clopper and Pearson up to 21 % of them might, by a sample each.
+    # None of about 13 latencies differs; by Clopper and Pearson up to 21 % may, by a sample each.
     assert found.latency.within_n == pytest.approx(1.0 - 0.05 ** (1.0 / found.latency.changes))
     assert found.verdicts.identical == (4, 4)
     assert "no difference is shown" in found.sentence
 
 
-def test_noise_that_the_device_is_not_set_for_shows_in_the_verdicts() -> None:
-    found = compared(rig(noise_lsb=0.3), rig(noise_lsb=8.0), plays=8)
+def test_noise_beyond_the_setting_of_the_device_changes_the_verdicts() -> None:
+    found = compare(rig(noise_lsb=0.3), rig(noise_lsb=8.0), plays=8)
     assert found.latency is not None
     assert found.latency.least_n > 0.0
     assert found.latency.quantiles_n[1][1] > found.latency.quantiles_n[0][1]
@@ -134,7 +136,7 @@ def test_noise_that_the_device_is_not_set_for_shows_in_the_verdicts() -> None:
     assert "false alarms is worse" in found.sentence
 
 
-def test_command_says_the_sentence_and_fails_beyond_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_the_sentence_and_fails_beyond_the_limits(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["compare-rigs", "emulator", "emulator-skewed", "--dut", "inproc", "--plays", "3"]
     assert main(command) == 0
     first = capsys.readouterr().out.splitlines()[0]
@@ -145,8 +147,8 @@ def test_command_says_the_sentence_and_fails_beyond_what_is_allowed(capsys: pyte
     assert main([*command, "--most-lsb", "20", "--most-samples", "0.001"]) == 1
 
 
-def test_plays_that_are_not_valid_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """More clipped samples than the scenario allows make every run of one rig inconclusive."""
+def test_invalid_plays_are_not_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Clipped samples beyond the scenario's limit make every run of one rig inconclusive."""
     table = "[card]\n[card.range_v]\nforce = [-1.0, 5.0]\ndisplacement = [-1.0, 9.0]\nvelocity = [-10.0, 10.0]\n"
     clipping = tmp_path / "clipping.toml"
     clipping.write_text(f"{table}net_force = [-12.5, 12.5]\n")
@@ -156,8 +158,6 @@ def test_plays_that_are_not_valid_are_not_compared(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.parametrize(("option", "value"), [("--plays", "1"), ("--confidence", "0.4"), ("--confidence", "1")])
-def test_what_cannot_be_compared_is_a_matter_of_usage(
-    option: str, value: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_options_are_usage_errors(option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare-rigs", "emulator", "emulator", option, value]) == 2
     assert option in capsys.readouterr().err

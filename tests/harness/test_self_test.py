@@ -1,4 +1,4 @@
-"""The self-test: what is wrong with a rig is found by its name, and nothing else; what is well is left alone."""
+"""Self-test: each fault of a rig is identified, without false positives."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ IDEAL = ComputerDescription(op_amp="ideal")
 Codes = NDArray[np.uint16]
 
 
-def emulated(
+def emulate(
     computer: ComputerDescription = IDEAL,
     ranges: Mapping[str, tuple[float, float]] = WIDE,
     noise_lsb: float = 1.0,
@@ -47,7 +47,7 @@ def emulated(
 
 
 class Altered:
-    """A rig with something between its card and us."""
+    """Rig whose codes or scenario are altered."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Altered:
         codes: Callable[[Codes], Codes] = lambda codes: codes,
         play: Callable[[Scenario], Scenario] = lambda played: played,
     ) -> None:
-        """``codes`` is given all codes (n, 4)."""
+        """Set the functions applied to all codes (n, 4) and to the scenario."""
         self.capabilities = rig.capabilities
         self._rig, self._codes, self._play = rig, codes, play
 
@@ -81,7 +81,7 @@ class Altered:
         pass
 
 
-def wrong(rig: Rig, program: str = "front", seed: int = 1) -> list[str]:
+def wrong_titles(rig: Rig, program: str = "front", seed: int = 1) -> list[str]:
     return [check.title for check in self_test(rig, seed, program).in_state("wrong")]
 
 
@@ -93,8 +93,8 @@ def value(findings: Findings, title: str) -> Check:
 
 
 @pytest.mark.parametrize("program", ["front", "shock"])
-def test_an_ideal_rig_is_well(program: str) -> None:
-    assert self_test(emulated(noise_lsb=0.0), 1, program).well
+def test_ideal_rig_is_well(program: str) -> None:
+    assert self_test(emulate(noise_lsb=0.0), 1, program).well
 
 
 @pytest.mark.parametrize("name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
@@ -104,8 +104,8 @@ def test_shipped_rigs_are_well(name: str) -> None:
 
 
 def test_twenty_machines_within_tolerance_are_well() -> None:
-    """1 % resistors, 5 % polyester, 3 mV of offset. `make bench ARGS=self-test` tries hundreds."""
-    rig = emulated(ComputerDescription(components="polyester"))
+    """Resistors of 1 %, polyester of 5 %, offsets of 3 mV. `make bench ARGS=self-test` tries hundreds."""
+    rig = emulate(ComputerDescription(components="polyester"))
     found = {
         (seed, program): self_test(rig, seed, program).reasons
         for seed in range(20)
@@ -117,12 +117,12 @@ def test_twenty_machines_within_tolerance_are_well() -> None:
 # ------------------------------------------------------------------------------------- each fault, at twice its limit
 
 
-def swapped(codes: Codes) -> Codes:
+def swap(codes: Codes) -> Codes:
     return codes[:, [1, 0, 2, 3]]
 
 
-def inverted(channel: str) -> Callable[[Codes], Codes]:
-    """On a range from -12.5 to 12.5 V."""
+def invert_channel(channel: str) -> Callable[[Codes], Codes]:
+    """Inversion of a channel on a range from -12.5 to 12.5 V."""
     column = CHANNELS.index(channel)
 
     def invert(codes: Codes) -> Codes:
@@ -148,8 +148,8 @@ def stuck_bit(codes: Codes) -> Codes:
     return codes
 
 
-def soaked(codes: Codes) -> Codes:
-    """A part of 1 % follows with a lag of 60 samples: 0.06 % of the swing that no second-order response has."""
+def soak(codes: Codes) -> Codes:
+    """Add a part of 1 % with a lag of 60 samples: 0.06 % of the swing that is no second-order response."""
     column = CHANNELS.index("displacement")
     values = codes[:, column].astype(np.float64)
     slow = lfilter([1.0 / 60.0], [1.0, 1.0 / 60.0 - 1.0], values)
@@ -167,63 +167,64 @@ def ranges(**changed: tuple[float, float]) -> dict[str, tuple[float, float]]:
 
 FORCE_LSB_V, LSB_V = 12.0 / 4096, 10.0 / 4096
 SWING_LSB = 9.0 / FORCE_LSB_V, 5.43 / LSB_V
-# Twice and half of the limits that harness/README.md promises, section Self-test: gain of 1 % of the force and 5 %,
-# offset of 60 mV, noise of 0.2 % of the swing, skew of 0.1 sample (5 us), 50 ppm, mass of 30 %, damping of 15 %
+# Faults are twice and half of the limits of harness/README.md, section Self-test: gain of 1 % of the force and 5 % of
+# the displacement, offset of 60 mV, noise of 0.2 % of the swing, skew of 0.1 sample (5 us), 50 ppm, mass of 30 %,
+# damping of 15 %.
 
 FAULTS: dict[str, tuple[Callable[[], Rig], list[str]]] = {
-    "leads swapped": (lambda: Altered(emulated(), swapped), ["identity"]),
-    "force inverted": (lambda: Altered(emulated(ranges=BIPOLAR), inverted("force")), ["polarity of force"]),
+    "leads swapped": (lambda: Altered(emulate(), swap), ["identity"]),
+    "force inverted": (lambda: Altered(emulate(ranges=BIPOLAR), invert_channel("force")), ["polarity of force"]),
     "displacement inverted": (
-        lambda: Altered(emulated(ranges=BIPOLAR), inverted("displacement")),
+        lambda: Altered(emulate(ranges=BIPOLAR), invert_channel("displacement")),
         ["polarity of displacement"],
     ),
-    "force clips": (lambda: emulated(ranges=ranges(force=(-1.0, 9.0))), ["clipping of force"]),
+    "force clips": (lambda: emulate(ranges=ranges(force=(-1.0, 9.0))), ["clipping of force"]),
     "displacement clips": (
-        lambda: emulated(ranges=ranges(displacement=(-1.0, 5.6))),
+        lambda: emulate(ranges=ranges(displacement=(-1.0, 5.6))),
         ["clipping of displacement"],
     ),
     "force takes an eighth of the range": (
-        lambda: emulated(ranges=ranges(force=(-37.0, 37.0)), noise_lsb=0.2),
+        lambda: emulate(ranges=ranges(force=(-37.0, 37.0)), noise_lsb=0.2),
         ["range use of force"],
     ),
     "displacement takes an eighth of the range": (
-        lambda: emulated(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
+        lambda: emulate(ranges=ranges(displacement=(-22.0, 22.0)), noise_lsb=0.2),
         ["range use of displacement"],
     ),
-    "gain of force": (lambda: emulated(gain_error=[-0.02, 0, 0, 0]), ["gain of force"]),
-    "gain of displacement": (lambda: emulated(gain_error=[0, 0.10, 0, 0]), ["gain of displacement"]),
-    "offset of force": (lambda: emulated(offset_lsb=[0.120 / FORCE_LSB_V, 0, 0, 0]), ["offset of force"]),
-    "offset of displacement": (lambda: emulated(offset_lsb=[0, -0.120 / LSB_V, 0, 0]), ["offset of displacement"]),
-    "displacement late": (lambda: emulated(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
-    "force late": (lambda: emulated(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
+    "gain of force": (lambda: emulate(gain_error=[-0.02, 0, 0, 0]), ["gain of force"]),
+    "gain of displacement": (lambda: emulate(gain_error=[0, 0.10, 0, 0]), ["gain of displacement"]),
+    "offset of force": (lambda: emulate(offset_lsb=[0.120 / FORCE_LSB_V, 0, 0, 0]), ["offset of force"]),
+    "offset of displacement": (lambda: emulate(offset_lsb=[0, -0.120 / LSB_V, 0, 0]), ["offset of displacement"]),
+    "displacement late": (lambda: emulate(skew_s=[0, 10e-6, 0, 0]), ["skew"]),
+    "force late": (lambda: emulate(skew_s=[10e-6, 0, 0, 0]), ["skew"]),
     "force noisy": (
-        lambda: Altered(emulated(), noisier("force", 0.004 * SWING_LSB[0])),
+        lambda: Altered(emulate(), noisier("force", 0.004 * SWING_LSB[0])),
         ["noise of force"],
     ),
     "displacement noisy": (
-        lambda: Altered(emulated(), noisier("displacement", 0.004 * SWING_LSB[1])),
+        lambda: Altered(emulate(), noisier("displacement", 0.004 * SWING_LSB[1])),
         ["noise of displacement"],
     ),
-    "card fast": (lambda: emulated(clock_drift_ppm=100.0), ["clock ratio"]),
-    "card slow": (lambda: emulated(clock_drift_ppm=-100.0), ["clock ratio"]),
-    "pot of M": (lambda: Altered(emulated(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
+    "card fast": (lambda: emulate(clock_drift_ppm=100.0), ["clock ratio"]),
+    "card slow": (lambda: emulate(clock_drift_ppm=-100.0), ["clock ratio"]),
+    "pot of M": (lambda: Altered(emulate(), play=pots(mass_kg=115.0 * 1.6)), ["mass"]),
     "pot of B": (
-        lambda: Altered(emulated(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
+        lambda: Altered(emulate(), play=pots(damping_n_s_per_m=3021.0 * 0.7)),
         ["damping"],
     ),
-    "a dielectric that soaks": (lambda: Altered(emulated(), soaked), ["shape of displacement"]),
-    "a bit of displacement stuck": (lambda: Altered(emulated(), stuck_bit), ["shape of displacement"]),
+    "a dielectric that soaks": (lambda: Altered(emulate(), soak), ["shape of displacement"]),
+    "a bit of displacement stuck": (lambda: Altered(emulate(), stuck_bit), ["shape of displacement"]),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_one_fault_is_found_by_its_name_and_no_other(fault: str) -> None:
+def test_each_fault_is_identified_without_another(fault: str) -> None:
     rig, names = FAULTS[fault]
-    assert wrong(rig()) == names
+    assert wrong_titles(rig()) == names
 
 
 def test_half_of_each_limit_is_well() -> None:
-    rig = emulated(
+    rig = emulate(
         gain_error=[-0.005, 0.025, 0, 0],
         offset_lsb=[0.030 / FORCE_LSB_V, -0.030 / LSB_V, 0, 0],
         skew_s=[0.0, 2.5e-6, 0, 0],
@@ -234,38 +235,38 @@ def test_half_of_each_limit_is_well() -> None:
     assert self_test(turned, 1).reasons == ()
 
 
-def test_an_inverted_signal_on_a_range_of_one_sign_is_off_scale() -> None:
-    rig = emulated(ranges=ranges(displacement=(-10.0, 0.0)))
-    assert wrong(rig) == ["clipping of displacement"]
+def test_inverted_signal_on_a_unipolar_range_is_clipping() -> None:
+    rig = emulate(ranges=ranges(displacement=(-10.0, 0.0)))
+    assert wrong_titles(rig) == ["clipping of displacement"]
 
 
-def test_swapped_leads_are_told_from_one_signal_on_both() -> None:
+def test_swapped_leads_are_separated_from_one_signal_on_both() -> None:
     def both(codes: Codes) -> Codes:
         return codes[:, [0, 0, 2, 3]]
 
     found = {}
-    for alter in (swapped, both):
-        (check,) = self_test(Altered(emulated(), alter), 1, "shock").in_state("wrong")
+    for alter in (swap, both):
+        (check,) = self_test(Altered(emulate(), alter), 1, "shock").in_state("wrong")
         assert check.title == "identity"
         found[alter] = check.advice
-    assert "swapped" in found[swapped]
+    assert "swapped" in found[swap]
     assert "wrong jack" in found[both]
 
 
-def test_several_faults_are_all_found() -> None:
-    rig = emulated(skew_s=[0, 15e-6, 0, 0], clock_drift_ppm=-150.0, gain_error=[0.05, 0, 0, 0])
-    assert wrong(rig) == ["gain of force", "skew", "clock ratio"]
+def test_several_faults_are_all_identified() -> None:
+    rig = emulate(skew_s=[0, 15e-6, 0, 0], clock_drift_ppm=-150.0, gain_error=[0.05, 0, 0, 0])
+    assert wrong_titles(rig) == ["gain of force", "skew", "clock ratio"]
 
 
-def test_an_error_of_the_generator_is_told_from_one_of_the_input() -> None:
-    """The generator's amplifier gives 3 % more: the displacement follows. If only the input reads so, it does not."""
+def test_error_of_the_generator_is_separated_from_one_of_the_input() -> None:
+    """A generator with 3 % more drives the displacement; an input that reads 3 % more does not."""
 
     def louder(played: Scenario) -> Scenario:
         wave = dataclasses.replace(played.excitation, low_v=0.515, high_v=9.785)
         return dataclasses.replace(played, excitation=wave)
 
-    generator = self_test(Altered(emulated(), play=louder), 1).in_state("wrong")
-    card = self_test(emulated(gain_error=[0.03, 0, 0, 0]), 1).in_state("wrong")
+    generator = self_test(Altered(emulate(), play=louder), 1).in_state("wrong")
+    card = self_test(emulate(gain_error=[0.03, 0, 0, 0]), 1).in_state("wrong")
     assert [check.title for check in (*generator, *card)] == ["gain of force"] * 2
     assert "generator" in generator[0].advice
     assert "generator" not in card[0].advice
@@ -278,14 +279,16 @@ TAIL = 1e-3
 
 
 def test_standard_errors_are_those_of_the_estimates() -> None:
-    """Truth drawn anew for each seed: the squares of deviations by standard errors are chi-squared, beyond either bound
-    with a probability of 1e-3. The skew's error holds what amplifiers may do as well."""
+    """Random truth for each seed: the sum of squared standard scores exceeds either chi-square bound with 1e-3.
+
+    The standard error of the skew includes the delay of the amplifiers.
+    """
     rng = np.random.default_rng(9)
     scores: dict[str, list[float]] = {}
     for seed in range(DRAWN):
         gains, offsets = rng.uniform(-0.005, 0.005, 2), rng.uniform(-10, 10, 2)
         late_n, ppm = int(rng.integers(0, 10)) / 10, float(rng.uniform(-200, 200))
-        rig = emulated(
+        rig = emulate(
             noise_lsb=1.5,
             gain_error=[*gains, 0, 0],
             offset_lsb=[*offsets, 0, 0],
@@ -293,12 +296,12 @@ def test_standard_errors_are_those_of_the_estimates() -> None:
             clock_drift_ppm=ppm,
         )
         lsb_v = np.array([12.0, 10.0]) / 4096
-        # A card takes its range's low end for zero volts of its amplifier: v = low + lsb code.
+        # The gain of a card acts about the low end of its range: v = low + lsb code.
         truth = {
             "gain of force": gains[0],
             "offset of force": offsets[0] * lsb_v[0],
             "clock ratio": 1e6 * (1.0 / (1.0 + 1e-6 * ppm) - 1.0),
-            # By the samples, which are closer when the card is fast.
+            # In samples, which are closer when the card is fast.
             "mass": (1.0 + 1e-6 * ppm) ** 2 - 1.0,
             "damping": 1e-6 * ppm,
         }
@@ -316,8 +319,8 @@ def test_standard_errors_are_those_of_the_estimates() -> None:
     assert {title: total for title, total in sums.items() if not low < total < high} == {}
 
 
-def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
-    """The truth is always among the instants that are left: half a width is sqrt(3) standard errors."""
+def test_delay_interval_of_edges_between_samples_holds_the_truth() -> None:
+    """The truth always lies in the intersection; its half width is sqrt(3) standard errors."""
     rng = np.random.default_rng(5)
     for _ in range(100):
         line = EdgeTimes(*(rng.uniform(190.0, 210.0) + np.array([0.0, *rng.uniform(0, 1, 1), 100.0])))
@@ -325,11 +328,11 @@ def test_an_edge_between_two_samples_leaves_no_more_room_than_it_must() -> None:
         codes = square_wave(line, late_n, averaged=0.0)
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
-        found_n, error_n = delay(codes, levels, edges, numbered(line, edges), 0.0)
+        found_n, error_n = delay(codes, levels, edges, align(line, edges), 0.0)
         assert abs(found_n - late_n) <= math.sqrt(3.0) * error_n + 1e-9
 
 
-def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
+def test_averaging_instrument_is_identified_by_samples_between_levels() -> None:
     rng = np.random.default_rng(6)
     for averaged in (0.3, 1.0):
         line, late_n = EdgeTimes(207.318, 8000.3, 8104.7), float(rng.uniform(-0.5, 0.5))
@@ -337,12 +340,12 @@ def test_instrument_that_averages_is_told_by_edges_on_the_way() -> None:
         levels = Levels.of(codes)
         edges = SeenEdges.of(levels.state, 0.5 * line.period_n)
         assert edges.averaging_n() == pytest.approx(averaged, abs=0.03)
-        found_n, _ = delay(codes, levels, edges, numbered(line, edges), 0.0)
+        found_n, _ = delay(codes, levels, edges, align(line, edges), 0.0)
         assert found_n == pytest.approx(late_n, abs=5e-3)
 
 
 def square_wave(line: EdgeTimes, late_n: float, averaged: float) -> Codes:
-    """16,384 codes of a wave that is high from rising to falling edges, each that much later than the line."""
+    """16,384 codes of a square wave with its edges ``late_n`` after ``line``."""
     parts = []
     for window in (0.5, -0.5) if averaged else (0.0,):
         # High time until t is a ramp in every period: its difference over the window is the average.
@@ -355,8 +358,8 @@ def square_wave(line: EdgeTimes, late_n: float, averaged: float) -> Codes:
     return np.asarray(np.rint(500 + 3000 * upper), dtype=np.uint16)
 
 
-def numbered(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
-    """The same line, its instants those next to the middle edge as the edges have them."""
+def align(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
+    """Same timing, with the instants next to the middle edge."""
     turns = np.rint((edges.times().rising_n - line.rising_n) / line.period_n)
     rising = line.rising_n + turns * line.period_n
     turns = np.rint((edges.times().falling_n - line.falling_n) / line.period_n)
@@ -365,7 +368,7 @@ def numbered(line: EdgeTimes, edges: SeenEdges) -> EdgeTimes:
 
 @pytest.mark.parametrize(("mass", "damping"), [(46.0, 12.3), (0.0163, 0.0735), (4.0, 4.0)])
 def test_step_response_is_that_of_scipy(mass: float, damping: float) -> None:
-    """The front suspension, the shock absorber by the sample, and two equal poles."""
+    """Front suspension, shock absorber in samples, and two equal poles."""
     t = np.linspace(0.0, 12.0 * damping, 500)
     _, expected = step(([1.0], [mass, damping, 1.0]), T=t)
     plant = SecondOrder(mass, damping)
@@ -375,8 +378,8 @@ def test_step_response_is_that_of_scipy(mass: float, damping: float) -> None:
     assert plant.step(t, width) == pytest.approx(plant.step(t + fine).mean(axis=0), abs=1e-3)
 
 
-def test_rig_that_averages_over_its_sample_period_has_no_skew_by_that() -> None:
-    """Eight looks a sample, as the emulated Red Pitaya takes them; 0.25 of a sample between the channels is found."""
+def test_averaging_over_the_sample_period_causes_no_skew() -> None:
+    """Eight conversions per sample, as in the emulated Red Pitaya; a skew of 0.25 samples is found."""
 
     def averages(codes: Codes) -> Codes:
         return np.asarray(np.rint(codes.reshape(-1, 8, 4).mean(axis=1)), dtype=np.uint16)
@@ -386,20 +389,20 @@ def test_rig_that_averages_over_its_sample_period_has_no_skew_by_that() -> None:
             performance = super().perform(dataclasses.replace(scenario, samples=8 * scenario.samples), seed)
             return dataclasses.replace(performance, sample_period_s=8.0 * performance.sample_period_s)
 
-    assert self_test(Averaging(emulated(rate_hz=160e3), averages), 1).reasons == ()
-    late = self_test(Averaging(emulated(rate_hz=160e3, skew_s=[0.0, 2e-6, 0, 0]), averages), 1)
+    assert self_test(Averaging(emulate(rate_hz=160e3), averages), 1).reasons == ()
+    late = self_test(Averaging(emulate(rate_hz=160e3, skew_s=[0.0, 2e-6, 0, 0]), averages), 1)
     assert value(late, "skew").value == pytest.approx(0.04, abs=0.03)
-    later = emulated(rate_hz=160e3)
+    later = emulate(rate_hz=160e3)
     shifted = Averaging(
         later, lambda codes: averages(np.stack([codes[:, 0], np.roll(codes[:, 1], -2), *codes.T[2:]], 1))
     )
     assert [check.title for check in self_test(shifted, 1).in_state("wrong")] == ["skew"]
 
 
-# ------------------------------------------------------------------------------------ what it says, and when it cannot
+# ------------------------------------------------------------------------------------------- states, errors, command
 
 
-def checked(number: float, error: float) -> Check:
+def skew_check(number: float, error: float) -> Check:
     return Check("skew", "", number, error, -0.1, 0.1, "samples", "advice")
 
 
@@ -407,7 +410,7 @@ def checked(number: float, error: float) -> Check:
     ("number", "error", "state"),
     [
         (0.0, 0.01, "well"),
-        (0.12, 0.01, "well"),  # not surely beyond
+        (0.12, 0.01, "well"),  # not significantly beyond
         (0.14, 0.01, "wrong"),
         (-0.14, 0.01, "wrong"),
         (0.0, 0.02, "not measured"),
@@ -415,8 +418,8 @@ def checked(number: float, error: float) -> Check:
         (math.nan, math.nan, "not measured"),
     ],
 )
-def test_wrong_is_what_is_beyond_its_limit_by_three_standard_errors(number: float, error: float, state: str) -> None:
-    assert checked(number, error).state == state
+def test_quantity_is_wrong_three_standard_errors_beyond_its_limit(number: float, error: float, state: str) -> None:
+    assert skew_check(number, error).state == state
 
 
 def zero_from(first: int, column: int | None = None) -> Callable[[Codes], Codes]:
@@ -433,7 +436,7 @@ def glitch(codes: Codes) -> Codes:
 
 
 @pytest.mark.parametrize(
-    ("alter", "says"),
+    ("alter", "message"),
     [
         (zero_from(0), "no signal on force"),
         (zero_from(0, CHANNELS.index("displacement")), "no signal on displacement"),
@@ -443,17 +446,17 @@ def glitch(codes: Codes) -> Codes:
         (lambda codes: codes[:-1], "16383 of 16384 samples"),
     ],
 )
-def test_record_with_no_signal_or_a_drop_out_is_no_self_test(alter: Callable[[Codes], Codes], says: str) -> None:
-    with pytest.raises(SelfTestError, match=says):
-        self_test(Altered(emulated(noise_lsb=0.0), alter), 1)
+def test_record_without_signal_or_with_a_drop_out_raises(alter: Callable[[Codes], Codes], message: str) -> None:
+    with pytest.raises(SelfTestError, match=message):
+        self_test(Altered(emulate(noise_lsb=0.0), alter), 1)
 
 
-def test_rig_that_fails_is_no_self_test() -> None:
+def test_failure_of_the_rig_is_raised() -> None:
     def fails(_: Codes) -> Codes:
         raise RigError("the instrument is gone")
 
     with pytest.raises(RigError, match="the instrument is gone"):
-        self_test(Altered(emulated(), fails), 1)
+        self_test(Altered(emulate(), fails), 1)
 
 
 def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
@@ -463,7 +466,7 @@ def test_recording_cannot_be_tested(recorded_thesis: Path) -> None:
 
 def test_other_programs_cannot_be_tested() -> None:
     with pytest.raises(SelfTestError, match="two-mass"):
-        self_test(emulated(), 1, "two-mass")
+        self_test(emulate(), 1, "two-mass")
 
 
 RIG_FILE = """
@@ -478,23 +481,21 @@ net_force = [-12.5, 12.5]
 """
 
 
-def described(tmp_path: Path, faults: str) -> str:
+def rig_file(tmp_path: Path, faults: str) -> str:
     path = tmp_path / "bench.toml"
     path.write_text(RIG_FILE.format(faults=faults))
     return str(path)
 
 
-def test_doctor_of_a_rig_that_is_well(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_passes_a_healthy_rig(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--rig", "emulator", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["rig"], said["well"], said["reasons"]) == ("emulator", True, [])
-    assert {check["state"] for check in said["checks"]} == {"well"}
+    output = json.loads(capsys.readouterr().out)
+    assert (output["rig"], output["well"], output["reasons"]) == ("emulator", True, [])
+    assert {check["state"] for check in output["checks"]} == {"well"}
 
 
-def test_doctor_says_of_what_is_wrong_how_much_the_limit_and_what_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rig = described(tmp_path, "clock_drift_ppm = 120.0, skew_s = [0.0, 10e-6, 0.0, 0.0]")
+def test_doctor_reports_value_limit_and_remedy_of_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = rig_file(tmp_path, "clock_drift_ppm = 120.0, skew_s = [0.0, 10e-6, 0.0, 0.0]")
     assert main(["doctor", "--rig", rig]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "self-test of bench, program front: 2 WRONG"
@@ -507,43 +508,45 @@ def test_doctor_says_of_what_is_wrong_how_much_the_limit_and_what_to_do(
 
 
 def test_doctor_without_a_signal_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = described(tmp_path, "stuck_low = 4095")
+    rig = rig_file(tmp_path, "stuck_low = 4095")
     assert main(["doctor", "--rig", rig]) == 3
     assert capsys.readouterr().err.startswith("analogrig: INCONCLUSIVE: the self-test could not be made: no signal on")
 
 
-def test_doctor_that_cannot_tell_is_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With noise of 4 LSB of 12 bits, which is within its limit, the shape is known to a ninth of its own."""
+def test_doctor_is_inconclusive_if_a_quantity_is_not_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Noise of 4 LSB of 12 bits is within its limit; the standard error of the shape is a ninth of its limit."""
     path = tmp_path / "noisy.toml"
     path.write_text(RIG_FILE.format(faults="").replace("noise_lsb = 1.0", "noise_lsb = 4.0"))
     assert main(["doctor", "--rig", str(path)]) == 3
-    said = capsys.readouterr().out
-    assert said.startswith("self-test of noisy, program front: 1 NOT MEASURED")
-    assert "standard error would have to be at most 0.056" in said
+    output = capsys.readouterr().out
+    assert output.startswith("self-test of noisy, program front: 1 NOT MEASURED")
+    assert "standard error would have to be at most 0.056" in output
 
 
-def test_doctor_of_no_rig_is_a_matter_of_usage(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_of_an_unknown_rig_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--rig", "nowhere"]) == 2
     assert "no rig is called" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("late_us", [0.0, 4.0, -10.0, 10.0])
-def test_skew_of_a_fast_card_is_held_against_microseconds(late_us: float) -> None:
-    """At 60 kHz 5 us are 0.3 samples, of which the amplifiers' half a microsecond is known no better than 0.03."""
+def test_skew_of_a_fast_card_is_limited_in_microseconds(late_us: float) -> None:
+    """At 60 kHz, 5 us are 0.3 samples; the delay of the amplifiers has a standard error of 0.03."""
     skew_s = [max(0.0, -1e-6 * late_us), max(0.0, 1e-6 * late_us), 0.0, 0.0]
-    check = value(self_test(emulated(rate_hz=60e3, skew_s=skew_s), 1), "skew")
+    check = value(self_test(emulate(rate_hz=60e3, skew_s=skew_s), 1), "skew")
     assert check.value == pytest.approx(0.06 * (late_us + 0.625), abs=0.03)  # ideal amplifiers do not delay
     assert check.state == ("wrong" if abs(late_us) > 5.0 else "well")
 
 
-def test_card_that_is_too_fast_for_the_self_test_is_told_so() -> None:
+def test_card_too_fast_for_the_self_test_is_rejected() -> None:
     with pytest.raises(SelfTestError, match="the self-test goes up to 120750 samples/s, and the rig takes 300000"):
-        self_test(emulated(rate_hz=300e3), 1)
-    assert self_test(emulated(rate_hz=120e3), 1).well
+        self_test(emulate(rate_hz=300e3), 1)
+    assert self_test(emulate(rate_hz=120e3), 1).well
 
 
-def test_what_cannot_be_measured_is_said() -> None:
-    """Noise of 60 LSB: the skew is known to no more than some hundredths of a sample. But noise is what is wrong."""
-    findings = self_test(emulated(noise_lsb=60.0), 1)
+def test_unmeasured_quantities_are_reported() -> None:
+    """Noise of 60 LSB: noise is wrong, and the skew is known to some hundredths of a sample only."""
+    findings = self_test(emulate(noise_lsb=60.0), 1)
     assert {check.title for check in findings.in_state("wrong")} == {"noise of force", "noise of displacement"}
     assert "skew" in {check.title for check in findings.in_state("not measured")}

@@ -1,8 +1,8 @@
-"""When the card samples: the engine is asked at the instants at which each channel is really taken.
+"""Sampling instants of the card: skew, aperture delay, jitter and clock drift.
 
-The machine runs at a multiple of the card's rate, and each channel takes its own of these *probes*: skew costs no
-accuracy. Aperture delay and jitter, tens of nanoseconds, lie between two probes no more than PROBE_S apart; there the
-voltage is taken on the chord, which for the suspension is wrong by less than 0.003 LSB on the displacement.
+The machine runs at a multiple of the card's rate. Each channel takes one of these *probes*, so skew costs no accuracy.
+Aperture delay and jitter, tens of nanoseconds, lie between two probes at most PROBE_S apart. There the voltage is
+interpolated linearly: an error below 0.003 LSB on the displacement of the suspension.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from analogrig_emulator.engine.system import Edges
 from analogrig_emulator.errors import SamplerError
 
 PROBE_S = 1e-6
-"""Longest time between probes when there is an aperture delay or jitter."""
+"""Longest time between probes, in s, with an aperture delay or jitter."""
 
 _MAX_PROBES = 1000
 
 _EARLIEST_PROBES = 1
-"""So many probes before the nominal instant are at hand, for jitter that comes early."""
+"""Probes kept from before the nominal instant, for early jitter."""
 
 
 class Playable(Protocol):
-    """A machine that can be played, at the rate it was made for (SuspensionComputer)."""
+    """Machine with a fixed sample rate that plays excitations, such as SuspensionComputer."""
 
     @property
     def sample_rate_hz(self) -> float: ...
@@ -47,7 +47,7 @@ class Playable(Protocol):
 
 
 def probes_per_sample(card: Card) -> int:
-    """How many times the card's rate the machine must run.
+    """Number of probes per sample: the machine runs at so many times the card's rate.
 
     Raises SamplerError for a skew that is no multiple of a thousandth of the sample period.
     """
@@ -70,12 +70,12 @@ def acquired(
     rng: np.random.Generator,
     block_samples: int = 256,
 ) -> Iterator[NDArray[np.float64]]:
-    """Plays a machine that was made with sample_rate_hz = card.true_rate_hz probes_per_sample(card).
+    """Play a machine made with sample_rate_hz = card.true_rate_hz probes_per_sample(card).
 
-    Yields what the sample-and-holds see, in blocks, float64 (block_samples or, last, fewer; channels), V. rng: of the
-    jitter. The conventions of Excitation and of SuspensionComputer.play hold for the nominal instants: a channel that
-    is taken later can show a tweak after sample k in sample k already. Raises SamplerError for a machine that was made
-    for another rate, and what play raises.
+    Yields the voltages at the sample-and-holds in blocks: float64 (block_samples or, last, fewer; channels), V.
+    rng: generator of the jitter. Excitation and changes refer to the nominal instants, so a channel with skew can show
+    a change after sample k in sample k already. Raises SamplerError for a machine of another rate, and what play
+    raises.
     """
     count = probes_per_sample(card)
     _check_rate(machine, card, count)
@@ -85,7 +85,7 @@ def acquired(
     slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
     slow_changes = [PotChange(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
     probed = machine.play(slow, samples * count, slow_changes, block_samples * count)
-    return _picked(probed, card, count, rng)
+    return _take_samples(probed, card, count, rng)
 
 
 def _check_rate(machine: Playable, card: Card, count: int) -> None:
@@ -98,15 +98,15 @@ def _check_rate(machine: Playable, card: Card, count: int) -> None:
 
 
 def _offsets(card: Card, count: int) -> NDArray[np.float64]:
-    """By how many probes each channel is taken after the nominal instant, without jitter: (channels,)."""
+    """Delay of each channel after the nominal instant, without jitter, in probes: (channels,)."""
     per_s = card.rate_hz * count
     return np.asarray(np.rint(card.per_channel("skew_s") * per_s) + card.aperture_delay_s * per_s)
 
 
-def _picked(
+def _take_samples(
     probed: Iterator[NDArray[np.float64]], card: Card, count: int, rng: np.random.Generator
 ) -> Iterator[NDArray[np.float64]]:
-    """Of each block its samples' voltages; the last probes of a block are kept, for what the next takes early."""
+    """Yield the sample voltages of each block; keep its last probes for early jitter in the next."""
     before: NDArray[np.float64] | None = None
     for block in probed:
         before = np.repeat(block[:1], _EARLIEST_PROBES, axis=0) if before is None else before
@@ -114,11 +114,13 @@ def _picked(
         before = block[-_EARLIEST_PROBES:]
         nominal = np.arange(_EARLIEST_PROBES, len(block) + _EARLIEST_PROBES, count)[:, None]
         jitter = rng.standard_normal((len(nominal), card.channels)) * (card.aperture_jitter_s * card.rate_hz * count)
-        yield _on_chord(probes, nominal, np.clip(_offsets(card, count) + jitter, -_EARLIEST_PROBES, count - 1.0))
+        yield _interpolate(probes, nominal, np.clip(_offsets(card, count) + jitter, -_EARLIEST_PROBES, count - 1.0))
 
 
-def _on_chord(probes: NDArray[np.float64], nominal: NDArray[np.intp], late: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Voltages so many probes after the nominal rows: at a probe its own, else between two."""
+def _interpolate(
+    probes: NDArray[np.float64], nominal: NDArray[np.intp], late: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Voltages `late` probes after the nominal rows, interpolated between two probes."""
     left = np.floor(late)
     part = late - left
     rows, columns = nominal + left.astype(np.intp), np.arange(probes.shape[1])
@@ -128,15 +130,15 @@ def _on_chord(probes: NDArray[np.float64], nominal: NDArray[np.intp], late: NDAr
 
 @dataclass(frozen=True)
 class _OnCardClock(Excitation):
-    """An excitation whose edges fall where they would if the machine ran at the card's rate, `probes` times slower.
+    """Excitation with the edges of a machine at the card's rate, `probes` times slower.
 
-    clock_hz: the card's rate by the clock that the generator goes by.
+    clock_hz: card's rate by the clock of the generator.
     """
 
     probes: int = 1
     clock_hz: float = 20e3
 
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
-        del sample_rate_hz  # the machine's, of which the generator knows nothing
+        del sample_rate_hz  # the machine's rate; the generator follows clock_hz
         slow = super().edges(-(-start_tick // self.probes), -(-stop_tick // self.probes), self.clock_hz)
         return Edges(slow.ticks * self.probes, slow.levels_v)

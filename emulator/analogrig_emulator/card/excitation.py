@@ -1,7 +1,4 @@
-"""The signal generator: a two-level waveform, and the exact instants of its edges.
-
-Time is counted in ticks of a sample period / 2^22 (12 ps at 20 kHz) from sample 0, the same clock as the engine's.
-"""
+"""Signal generator: a two-level waveform with exact edge instants, in ticks of the engine from sample 0."""
 
 from __future__ import annotations
 
@@ -47,12 +44,12 @@ _TAPS = {
 
 @dataclass(frozen=True)
 class Excitation:
-    """A generator that switches between low_v and high_v; it is switched on, at whatever level it then has, at tick 0.
+    """Generator that switches between low_v and high_v, and is switched on at tick 0.
 
     shape: "square" and "pulse" are high for the first `duty` of each period (a square has duty 0.5); "prbs" takes a
     level for each period from a maximal-length sequence of register_length bits that starts at seed.
     frequency_hz: periods (bits, for prbs) per second of machine time.
-    phase: how far into a period the generator is at tick 0, in periods, 0 <= phase < 1.
+    phase: position within the period at tick 0, in periods, 0 <= phase < 1.
     clock: "card": the generator runs on the card's clock, and an edge comes at the first sample instant at or after its
     ideal instant; "free": it has a clock of its own, edges come at any instant, and it runs drift_ppm fast (slow when
     negative).
@@ -93,9 +90,9 @@ class Excitation:
         self._require("seed", 0 <= self.seed < 2**63, "must be 0 to 2^63 - 1")
 
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
-        """The edges at ticks start_tick <= t < stop_tick, t >= 0; the one at tick 0 is the switching on.
+        """Edges at ticks start_tick <= t < stop_tick, t >= 0. The edge at tick 0 switches the generator on.
 
-        Any way of cutting a range into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
+        A range cut into parts gives the same edges. Instants are exact to the tick up to tick 2^53 (29
         hours at 20 kHz).
         Raises ExcitationError for a frequency above half the sample rate, or so low that a period has more ticks.
         """
@@ -115,7 +112,7 @@ class Excitation:
         if start_tick <= 0:
             first = -2
         ticks, levels_v = self._prbs(first, last, period) if self.shape == "prbs" else self._cycle(first, last, period)
-        return _between(max(start_tick, 0), stop_tick, ticks, levels_v)
+        return _level_changes(max(start_tick, 0), stop_tick, ticks, levels_v)
 
     def _cycle(self, first: int, last: int, period: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         starts: NDArray[np.float64] = np.arange(first, last + 1, dtype=np.float64) - self.phase
@@ -139,11 +136,8 @@ class Excitation:
             raise ExcitationError(f"excitation: {field} {getattr(self, field)!r} {what}")
 
 
-def _between(start_tick: int, stop_tick: int, ticks: NDArray[np.int64], levels_v: NDArray[np.float64]) -> Edges:
-    """Those edges that change the level, within the range.
-
-    All that happened before tick 0 becomes one edge at tick 0.
-    """
+def _level_changes(start_tick: int, stop_tick: int, ticks: NDArray[np.int64], levels_v: NDArray[np.float64]) -> Edges:
+    """Edges within the range that change the level. Those before tick 0 become one edge at tick 0."""
     ticks = np.maximum(ticks, 0)
     lasts = np.append(ticks[1:] != ticks[:-1], True)
     ticks, levels_v = ticks[lasts], levels_v[lasts]
@@ -154,7 +148,7 @@ def _between(start_tick: int, stop_tick: int, ticks: NDArray[np.int64], levels_v
 
 @functools.lru_cache(maxsize=4)
 def _sequence(length: int) -> NDArray[np.bool_]:
-    """One period, 2^length - 1 bits, of the maximal-length sequence that a register of ones gives."""
+    """One period of the maximal-length sequence from a register of ones: 2^length - 1 bits."""
     register = [1] * length
     taps = [tap - 1 for tap in _TAPS[length]]
     bits = np.empty((1 << length) - 1, np.bool_)

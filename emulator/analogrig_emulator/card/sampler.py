@@ -1,11 +1,11 @@
-"""The card: channels, sampled together or one after the other, to codes.
+"""Data-acquisition card: voltages of simultaneous or multiplexed channels to codes.
 
-A channel's way to its code, each step exact where its fault is left at its default:
+Steps from voltage to code; a fault left at its default changes nothing:
 
-    instant    k / rate + skew of the channel + aperture delay + jitter          (acquisition.py asks the engine there)
+    instant    k / rate + skew of the channel + aperture delay + jitter          (acquisition.py)
     hold       acquired to within exp(-acquisition) of the step from the sample before; droop while conversions wait
     amplifier  u = ((1 + gain error) held - low) / LSB + offset + noise, in LSB
-    converter  successive approximation on the levels of linearity.py; stuck bits
+    converter  successive approximation on levels_lsb; stuck bits
 """
 
 from __future__ import annotations
@@ -32,21 +32,20 @@ RANGES_V: Mapping[str, tuple[float, float]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Card:
-    """An analogue-to-digital card; the defaults are 12 bits at 20 kHz, +-10 V on each of four channels, without faults.
+    """Description of a card. Defaults: 12 bits at 20 kHz, +-10 V on each of four channels, no faults.
 
     A field of one number per channel may be left empty for zeros.
 
     ranges_v: (low, high) of each channel in V; code 0 is low, and high is one LSB above the last code.
     noise_lsb: rms of the white Gaussian noise of each channel, added before quantisation.
     throughput_hz: conversions per second of the converter that all channels share.
-    skew_s: by how much each channel is sampled after the nominal instant. clock_drift_ppm: by how much its clock is
-    fast.
-    aperture_delay_s, aperture_jitter_s: of every sample-and-hold, and its rms.
-    acquisition: time constants that the sample-and-hold has to acquire; droop_v_per_s: loss of a held voltage (towards
-    low) while the conversions of the channels before are waited for, 1 / throughput_hz each.
-    gain_error: of each channel, a fraction; offset_lsb: of each channel.
-    levels_lsb: where the converter steps from code c - 1 to code c, for c = 1 .. 2^bits - 1 (ideal: c - 1/2), in LSB;
-    empty: ideal. missing_codes: never given. stuck_high, stuck_low: masks of bits that always read 1 or 0.
+    skew_s: delay of each channel after the nominal instant. clock_drift_ppm: excess of its clock rate.
+    aperture_delay_s, aperture_jitter_s: delay of every sample-and-hold, and rms of its jitter.
+    acquisition: acquisition time in time constants of the sample-and-hold; droop_v_per_s: rate at which a held voltage
+    falls while earlier channels are converted, 1 / throughput_hz each.
+    gain_error: fraction, by channel; offset_lsb: by channel.
+    levels_lsb: transition from code c - 1 to code c, for c = 1 .. 2^bits - 1 (ideal: c - 1/2), in LSB; empty: ideal.
+    missing_codes: codes that never occur. stuck_high, stuck_low: masks of bits that always read 1 or 0.
     Raises SamplerError naming the field.
     """
 
@@ -86,12 +85,12 @@ class Card:
 
     @property
     def channels(self) -> int:
-        """How many channels there are."""
+        """Number of channels."""
         return len(self.ranges_v)
 
     @functools.cached_property
     def lsb_v(self) -> NDArray[np.float64]:
-        """Volts per code of each channel, (channels,); not to be written to."""
+        """Volts per code of each channel: (channels,), read-only."""
         low, high = np.array(self.ranges_v).T
         lsb_v = np.asarray((high - low) / (1 << self.bits))
         lsb_v.setflags(write=False)
@@ -99,18 +98,18 @@ class Card:
 
     @functools.cached_property
     def low_v(self) -> NDArray[np.float64]:
-        """The volts of code 0 of each channel, (channels,); not to be written to."""
+        """Voltage of code 0 of each channel: (channels,), read-only."""
         low_v = np.array(self.ranges_v)[:, 0]
         low_v.setflags(write=False)
         return low_v
 
     @property
     def true_rate_hz(self) -> float:
-        """Samples per second of true time, which rate_hz is by the card's own clock."""
+        """Samples per second of true time; rate_hz is by the card's own clock."""
         return self.rate_hz * (1.0 + 1e-6 * self.clock_drift_ppm)
 
     def per_channel(self, field: str) -> NDArray[np.float64]:
-        """A field of one number per channel, (channels,)."""
+        """Values of a field by channel, zeros if it is empty: (channels,)."""
         return np.array(getattr(self, field) or (0.0,) * self.channels)
 
     def volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -118,7 +117,7 @@ class Card:
         return np.asarray(self.low_v + codes * self.lsb_v)
 
     def levels(self) -> NDArray[np.float64] | None:
-        """levels_lsb with level 0 before it and the missing codes left no width, (2^bits,); None for an ideal one."""
+        """Transition levels from level 0 on, missing codes of zero width: (2^bits,); None for an ideal converter."""
         if not self.levels_lsb and not self.missing_codes:
             return None
         levels: NDArray[np.float64] = np.arange(1 << self.bits, dtype=np.float64) - 0.5
@@ -172,10 +171,10 @@ class Card:
 
 
 class Sampler:
-    """A card at work.
+    """Converter of voltages to codes, with the state of one card.
 
-    rng gives the noise: one number per sample and channel whatever the settings, so that neither the size of the blocks
-    nor another channel's noise changes what a channel sees.
+    rng: generator of the noise. It gives one number per sample and channel whatever the settings, so neither block size
+    nor another channel's noise changes a channel.
     """
 
     def __init__(self, card: Card, rng: np.random.Generator) -> None:
@@ -187,24 +186,24 @@ class Sampler:
         self._gain = 1.0 + card.per_channel("gain_error")
         self._offset_lsb = card.per_channel("offset_lsb")
         self._droop_v = card.droop_v_per_s / card.throughput_hz * np.arange(card.channels)
-        self._left_over = math.exp(-card.acquisition)
+        self._residual = math.exp(-card.acquisition)
         self._held_v: NDArray[np.float64] | None = None
         self._levels = card.levels()
 
     def sample(
         self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-        """Volts (n, channels) to codes, uint16 (n, channels), and whether each was clipped, bool (n, channels).
+        """Codes, uint16 (n, channels), and clipping flags, bool (n, channels), of volts (n, channels).
 
-        Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. Clipped says that what the
-        converter saw, noise and errors included, was half an LSB or more beyond the ideal converter's end codes.
-        normals: the standard normal numbers of which the noise is made, (n, channels), instead of the rng's own.
+        Ideally code = floor((v - low) / LSB + noise + 1/2), limited to 0 .. 2^bits - 1. A sample is
+        clipped if the converter's input, noise and errors included, is half an LSB or more beyond the end codes.
+        normals: standard normal numbers (n, channels) for the noise, instead of those of rng.
         Raises SamplerError for a voltage that is not finite, or another shape.
         """
-        return self.converted(self.seen_lsb(volts, normals))
+        return self.convert(self.seen_lsb(volts, normals))
 
     def seen_lsb(self, volts: NDArray[np.float64], normals: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """What the converter sees of the next samples, (n, channels): in LSB above low, noise and errors included.
+        """Converter input of the next samples, noise and errors included: (n, channels), LSB above low.
 
         Raises SamplerError for a voltage that is not finite, or another shape.
         """
@@ -225,30 +224,30 @@ class Sampler:
         seen += noise
         return seen
 
-    def converted(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-        """Codes and clipping flags, as of sample, of what the converter sees."""
+    def convert(self, seen_lsb: NDArray[np.float64]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+        """Codes and clipping flags, as from sample(), of converter inputs (n, channels) in LSB."""
         unlimited = seen_lsb + 0.5
         np.floor(unlimited, out=unlimited)
         limited = np.clip(unlimited, 0, (1 << self.card.bits) - 1)
-        codes = limited.astype(np.uint16) if self._levels is None else _approximated(seen_lsb, self._levels)
+        codes = limited.astype(np.uint16) if self._levels is None else _approximate_successively(seen_lsb, self._levels)
         codes = (codes | np.uint16(self.card.stuck_high)) & ~np.uint16(self.card.stuck_low)
         return codes, limited != unlimited
 
     def _acquired(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the sample-and-holds hold: each step from one sample to the next lacks its last part."""
-        if self._left_over == 0.0 or not len(volts):
+        """Held voltages (n, channels): each step from sample to sample lacks exp(-acquisition)."""
+        if self._residual == 0.0 or not len(volts):
             return volts
         held_v = np.empty_like(volts)
         before = volts[0] if self._held_v is None else self._held_v
         for k, target in enumerate(volts):
-            before = target + self._left_over * (before - target)
+            before = target + self._residual * (before - target)
             held_v[k] = before
         self._held_v = before
         return held_v
 
 
-def _approximated(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Successive approximation: from the highest bit down, keep a bit when what is seen reaches the level with it."""
+def _approximate_successively(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Codes by successive approximation: from the highest bit down, keep a bit if the input reaches its level."""
     codes = np.zeros(seen_lsb.shape, np.uint16)
     for bit in reversed(range(levels.size.bit_length() - 1)):
         tried = codes | np.uint16(1 << bit)
@@ -257,10 +256,10 @@ def _approximated(seen_lsb: NDArray[np.float64], levels: NDArray[np.float64]) ->
 
 
 def drawn_levels(bits: int, rng: np.random.Generator, inl_lsb: float, *, monotonic: bool = True) -> tuple[float, ...]:
-    """Levels of a converter whose bits have drawn weights, for Card.levels_lsb; its largest INL is inl_lsb.
+    """Card.levels_lsb of a converter with random bit weights and largest INL inl_lsb.
 
-    The error of bit b is normal, in proportion to 2^(b/2) as that of 2^b equal elements; INL is counted from the
-    straight line through the ends. Where a major carry would step back, monotonic holds the level instead.
+    The error of bit b is normal and proportional to 2^(b/2), as for 2^b equal elements. INL is measured from the
+    straight line through the ends. With monotonic, a major carry that would step back holds the level.
     """
     weights_lsb = rng.standard_normal(bits) * 2.0 ** (0.5 * np.arange(bits))
     codes = np.arange(1 << bits)
@@ -291,5 +290,5 @@ CARDS: Mapping[str, Card] = MappingProxyType(
         "skewed": Card(throughput_hz=100e3, skew_s=(0.0, 10e-6, 20e-6, 30e-6)),
     }
 )
-"""ideal; dt2821: the class of the thesis's card, four simultaneous sample-and-holds on one 100 kHz converter; skewed:
-the same converter without them, so that each channel is taken one conversion after the one before."""
+"""Cards by name. dt2821: class of the thesis's card, four simultaneous sample-and-holds on one 100 kHz converter;
+skewed: the same converter without them, so each channel is one conversion later than the one before."""

@@ -15,7 +15,7 @@ from numbers import Real
 from typing import ClassVar, Never, TypeAlias, TypeVar
 
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.circuit.pot import checked_dial
+from analogrig_emulator.circuit.pot import check_dial
 from analogrig_emulator.errors import CircuitError
 
 GROUND = "0"
@@ -25,11 +25,11 @@ _NAME = re.compile(r"[A-Za-z0-9_]+")
 
 @dataclass(frozen=True)
 class _Part:
-    """What every element has: a name, and which of its fields must be what for it to be possible."""
+    """Common part of all elements: name, and the constraints on the fields."""
 
     positive: ClassVar[tuple[str, ...]] = ()
     finite: ClassVar[tuple[str, ...]] = ()
-    """Fields that must be numbers, where they are given at all."""
+    """Fields that must be finite numbers if given."""
 
     name: str
 
@@ -39,7 +39,7 @@ class _Part:
 
     @property
     def bonds(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of nodes of which it holds either at a voltage once the other is held."""
+        """Pairs of nodes between which the element determines the voltage."""
         raise NotImplementedError
 
     @property
@@ -49,7 +49,7 @@ class _Part:
 
     @property
     def rigid_bonds(self) -> tuple[tuple[str, str], ...]:
-        """The bonds between which it lets whatever current flow without the voltage giving way."""
+        """Bonds whose voltage does not depend on the current."""
         return ()
 
 
@@ -146,7 +146,7 @@ class _Source(_Part):
 
     @property
     def constant(self) -> float | None:
-        """Its level when that is a constant [V or A]; None for an input of the circuit."""
+        """Constant level in V or A; None for an input of the circuit."""
         raise NotImplementedError
 
 
@@ -174,7 +174,7 @@ class VoltageSource(_Source):
 @dataclass(frozen=True)
 class CurrentSource(_Source):
     """A current from node plus through the source to node minus: an input of the circuit [A], or, when dc_a is given, a
-    constant. It holds no node at a voltage."""
+    constant. It determines no voltage."""
 
     finite = ("dc_a",)
 
@@ -213,7 +213,7 @@ class DiodeLimiter(_TwoEnded):
 
     @property
     def excess_siemens(self) -> float:
-        """By how much its conductance grows at the threshold."""
+        """Increase of the conductance at the threshold, in S."""
         return 1.0 / self.on_ohm - 1.0 / self.off_ohm
 
 
@@ -228,7 +228,7 @@ class Switch(_TwoEnded):
     closed: bool
 
     def ohm(self, *, closed: bool) -> float:
-        """Its resistance in that position."""
+        """Resistance in the given position."""
         return self.on_ohm if closed else self.off_ohm
 
 
@@ -236,15 +236,15 @@ Element: TypeAlias = Resistor | Capacitor | Pot | OpAmp | VoltageSource | Curren
 _E = TypeVar("_E", Resistor, Capacitor, Pot, OpAmp, VoltageSource, CurrentSource, DiodeLimiter, Switch)
 
 _LEAST = 1e-100
-"""Of ohms and farads, so that no reciprocal of theirs, nor of an end stop's part of a track, overflows."""
+"""Least ohms and farads: no reciprocal of them, nor of an end stop's part of a track, overflows."""
 
 
 @dataclass(frozen=True)
 class Circuit:
     """A checked netlist.
 
-    Raises CircuitError for duplicate or malformed names, values that are not positive or no numbers, an element across
-    a single node, nodes that nothing holds at a voltage, loops without resistance, and op-amps without feedback;
+    Raises CircuitError for duplicate or malformed names, values that are not positive numbers, an element across
+    a single node, floating nodes, loops without resistance, and op-amps without feedback;
     PotError for a dial off its track. The message begins with the element and its nodes.
     """
 
@@ -267,7 +267,7 @@ class Circuit:
 
     @property
     def inputs(self) -> tuple[VoltageSource | CurrentSource, ...]:
-        """The sources that are no constants: volts or amperes from outside, in netlist order."""
+        """Sources without a constant level: inputs in V or A, in netlist order."""
         sources = (element for element in self.elements if isinstance(element, VoltageSource | CurrentSource))
         return tuple(source for source in sources if source.constant is None)
 
@@ -300,18 +300,18 @@ class Circuit:
 
 
 def label(element: Element) -> str:
-    """How errors name an element: kind, name and nodes."""
+    """Kind, name and nodes of an element, for error messages."""
     return f"{type(element).__name__} {element.name} ({' '.join(element.nodes)})"
 
 
-def refused(element: Element, why: str) -> CircuitError:
-    """The error that an element cannot be, or cannot be there."""
+def element_error(element: Element, why: str) -> CircuitError:
+    """CircuitError about an element; its message begins with the element's label."""
     return CircuitError(f"{label(element)}: {why}", element=element.name)
 
 
-def unknown(element: Never) -> CircuitError:
-    """The error for an element of no kind that is known; mypy sees that a match that ends in it leaves none out."""
-    return refused(element, "no such kind of element is known")
+def unknown_kind_error(element: Never) -> CircuitError:
+    """CircuitError for an element of unknown kind. Its type makes mypy check that a match covers every kind."""
+    return element_error(element, "no such kind of element is known")
 
 
 def _check_known(kind: str, names: Iterable[str], elements: Iterable[Element]) -> None:
@@ -326,29 +326,29 @@ def _check_names(elements: tuple[Element, ...]) -> None:
     nodes: dict[str, str] = {}
     for element in elements:
         if not _NAME.fullmatch(element.name):
-            raise refused(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
+            raise element_error(element, f"element name {element.name!r}: only letters, digits and _ are allowed")
         if element.name.lower() in names:
-            raise refused(element, f"two elements are called {element.name!r}")
+            raise element_error(element, f"two elements are called {element.name!r}")
         names.add(element.name.lower())
         for node in element.nodes:
             if nodes.get(node.lower()) == node:
                 continue
             if not _NAME.fullmatch(node):
-                raise refused(element, f"node name {node!r}: only letters, digits and _ are allowed")
+                raise element_error(element, f"node name {node!r}: only letters, digits and _ are allowed")
             if nodes.setdefault(node.lower(), node) != node:
-                raise refused(element, f"nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
+                raise element_error(element, f"nodes {nodes[node.lower()]!r} and {node!r} differ in case only")
 
 
 def _check_element(element: Element) -> None:
     for a, b in element.spans:
         if a == b:
-            raise refused(element, f"both ends are on node {a}")
+            raise element_error(element, f"both ends are on node {a}")
     for field in (*element.positive, *element.finite):
         _check_value(element, field)
     if isinstance(element, Pot):
-        checked_dial(element.dial, element.name)
+        check_dial(element.dial, element.name)
     if isinstance(element, DiodeLimiter | Switch) and element.on_ohm > element.off_ohm:
-        raise refused(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
+        raise element_error(element, f"on_ohm {element.on_ohm!r} exceeds off_ohm {element.off_ohm!r}")
 
 
 def _check_value(element: Element, field: str) -> None:
@@ -357,48 +357,50 @@ def _check_value(element: Element, field: str) -> None:
         return
     number = isinstance(value, Real) and math.isfinite(value)
     if field in element.finite and not number:
-        raise refused(element, f"{field} must be finite, got {value!r}")
+        raise element_error(element, f"{field} must be finite, got {value!r}")
     if field in element.positive and not (number and value > 0):
-        raise refused(element, f"{field} must be positive and finite, got {value!r}")
+        raise element_error(element, f"{field} must be positive and finite, got {value!r}")
     if field in element.positive and value < _LEAST:
-        raise refused(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
+        raise element_error(element, f"{field} must be at least {_LEAST:g}, got {value!r}")
 
 
 def _check_nodes(elements: tuple[Element, ...]) -> None:
-    """Every node must have a path to ground that can hold its voltage."""
-    grounded = _reached(GROUND, _ways(bond for element in elements for bond in element.bonds))
+    """Raise CircuitError for a node without a path to ground that determines its voltage."""
+    grounded = _reachable(GROUND, _neighbours(bond for element in elements for bond in element.bonds))
     for element in elements:
         for node in element.nodes:
             if node not in grounded:
-                raise refused(element, f"node {node} floats: no path to ground holds its voltage")
+                raise element_error(element, f"node {node} floats: no path to ground holds its voltage")
 
 
 def _check_loops(elements: tuple[Element, ...]) -> None:
-    """Sources, capacitors and op-amps that hold their voltages whatever the current must not form a loop.
+    """Raise CircuitError for a loop of rigid bonds: nothing determines the current around it.
 
-    Nothing would determine the current around it. (Nodes are merged as such elements join them: Kruskal's forest.)
+    Method: merge the nodes that rigid bonds join (Kruskal's forest).
     """
     joined: dict[str, str] = {}
     for count, element in enumerate(elements):
         for a, b in element.rigid_bonds:
             one, other = _root(a, joined), _root(b, joined)
             if one == other:
-                others = ", ".join(_names_between(a, b, elements[:count]))
-                raise refused(element, f"closes a loop without resistance from node {a} to node {b} with {others}")
+                others = ", ".join(_path_names(a, b, elements[:count]))
+                raise element_error(
+                    element, f"closes a loop without resistance from node {a} to node {b} with {others}"
+                )
             joined[one] = other
 
 
 def _root(node: str, joined: dict[str, str]) -> str:
     while node in joined:
-        joined[node] = joined.get(joined[node], joined[node])  # halves the way for the next search
+        joined[node] = joined.get(joined[node], joined[node])  # path halving, for the next search
         node = joined[node]
     return node
 
 
-def _names_between(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
-    """The rigid elements by which node a is joined to node b, in order; there is one such way at most."""
+def _path_names(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
+    """Names of the rigid elements on the path from node a to node b, in order."""
     rigid = [(element.name, bond) for element in elements for bond in element.rigid_bonds]
-    ways = _ways(bond for _, bond in rigid)
+    ways = _neighbours(bond for _, bond in rigid)
     names = {frozenset(bond): name for name, bond in rigid}
     before, front = {a: a}, [a]
     while b not in before:
@@ -413,8 +415,8 @@ def _names_between(a: str, b: str, elements: tuple[Element, ...]) -> list[str]:
 
 
 def _check_feedback(elements: tuple[Element, ...]) -> None:
-    """Every op-amp's output must act on one of its own inputs, through whatever elements."""
-    acts = _ways(
+    """Raise CircuitError for an op-amp whose output acts on neither of its inputs."""
+    acts = _neighbours(
         bond for element in elements if not isinstance(element, OpAmp) for bond in element.bonds if GROUND not in bond
     )
     for amp in elements:
@@ -422,15 +424,15 @@ def _check_feedback(elements: tuple[Element, ...]) -> None:
             for node in {amp.plus, amp.minus} - {GROUND}:
                 acts.setdefault(node, []).append(amp.out)
     for amp in elements:
-        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reached(amp.out, acts):
-            raise refused(
+        if isinstance(amp, OpAmp) and not {amp.plus, amp.minus} & _reachable(amp.out, acts):
+            raise element_error(
                 amp,
                 f"no feedback: its output, node {amp.out}, acts on neither of its inputs, nodes"
                 f" {amp.plus} and {amp.minus}",
             )
 
 
-def _ways(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def _neighbours(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """The neighbours of each node."""
     ways: dict[str, list[str]] = {}
     for a, b in bonds:
@@ -439,7 +441,7 @@ def _ways(bonds: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     return ways
 
 
-def _reached(start: str, ways: Mapping[str, Sequence[str]]) -> set[str]:
+def _reachable(start: str, ways: Mapping[str, Sequence[str]]) -> set[str]:
     reached, front = {start}, [start]
     while front:
         fresh = [node for node in ways.get(front.pop(), ()) if node not in reached]

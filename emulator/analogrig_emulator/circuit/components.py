@@ -1,15 +1,15 @@
-"""Real components: what is soldered in where the circuit diagram says 100k.
+"""Real components: tolerances, drift, ageing and parasitics of one specimen of a circuit.
 
-`Components.fitted` turns a nominal netlist into one specimen of it, by rewriting elements and adding some:
+`Components.fit` rewrites the elements of a nominal netlist and adds parasitic ones:
 
     R, C, track     value (1 + tolerance) (1 + temperature coefficient (T - 25 C)) (1 + ageing sqrt(age / 1000 h))
     C               leakage resistance across it; dielectric absorption as series R-C branches across it
     op-amp          offset voltage and its drift, bandwidth and slew of the specimen; bias current through its input
                     resistance (as a voltage source behind it), input capacitance
-    pot             wiper resistance, and what of the track lies beyond the end stops
+    pot             wiper resistance, and resistance beyond the end stops
 
-so that the engine and a SPICE deck need know nothing of it. Every draw comes from the seed and the element's name:
-adding an element, or a non-ideality, changes no other draw. What is left at its default is switched off, alone.
+Engine and SPICE deck see ordinary elements only. Every draw comes from the seed and the element's name: adding an
+element or a non-ideality changes no other draw. Each default switches its non-ideality off.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from analogrig_emulator.circuit.circuit import (
     Resistor,
     Switch,
     VoltageSource,
-    unknown,
+    unknown_kind_error,
 )
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.circuit.pot import PotModel
 from analogrig_emulator.errors import CircuitError
 
 REFERENCE_C = 25.0
-"""Temperature in Celsius at which components have the values that they were made to."""
+"""Temperature in Celsius at which components have their marked values."""
 
 _DRAWS = 8
-"""Uniform numbers within +-1 that each element has for its own; what uses which is said by _Draw."""
+"""Uniform numbers within +-1 drawn for each element, numbered by _Draw."""
 
 
 class _Draw:
-    """Which of an element's numbers decides what."""
+    """Index of each quantity among the numbers drawn for an element."""
 
     TOLERANCE, TEMPERATURE, AGEING, OFFSET, OFFSET_DRIFT, BANDWIDTH, SLEW, BIAS = range(_DRAWS)
 
@@ -60,7 +60,7 @@ def _require(owner: object, field_name: str, holds: object, what: str) -> None:
 
 @dataclass(frozen=True)
 class Grade:
-    """How true a kind of component is to its value; all numbers are fractions of it.
+    """Accuracy of a kind of component; all numbers are fractions of its value.
 
     tolerance: uniform within +- when new, at 25 C. temperature_per_k: coefficient of the kind;
     temperature_spread_per_k: uniform within +- about it. ageing: change after 1000 h, uniform within +-; it grows with
@@ -78,14 +78,14 @@ class Grade:
             _require(self, name, 0.0 <= getattr(self, name) < 1.0, "must be at least 0 and less than 1")
         _require(self, "temperature_per_k", abs(self.temperature_per_k) < 0.01, "must be within +-0.01 per kelvin")
 
-    def undrawn(self) -> Grade:
-        """What all of the kind have in common."""
+    def without_draws(self) -> Grade:
+        """The grade without its random part."""
         return Grade(temperature_per_k=self.temperature_per_k)
 
 
 @dataclass(frozen=True)
 class Dielectric:
-    """What a capacitor does beside storing charge.
+    """Leakage and dielectric absorption of a capacitor.
 
     leakage_s: its insulation resistance times its capacitance. absorption: branches in parallel, each as (fraction of
     the capacitance, time constant in s of its series R-C).
@@ -102,9 +102,9 @@ class Dielectric:
 
 
 def _constant_loss(tan_delta: float, taus_s: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
-    """Branches, one a decade, of a dielectric whose loss does not depend on frequency.
+    """Branches, one a decade, of a dielectric with frequency-independent loss.
 
-    By Kramers and Kronig its capacitance then grows by (2 / pi) ln 10 tan delta per decade of time.
+    By Kramers and Kronig its capacitance grows by (2 / pi) ln 10 tan delta per decade of time.
     """
     return tuple((2.0 / math.pi * math.log(10.0) * tan_delta, tau_s) for tau_s in taus_s)
 
@@ -120,13 +120,13 @@ DIELECTRICS: Mapping[str, Dielectric] = MappingProxyType(
 )
 """Film capacitors with the typical insulation resistance and the loss at 100 Hz of their datasheets.
 
-What relaxes faster than a millisecond is part of the capacitance, which is measured at 1 kHz.
+Relaxation faster than a millisecond is part of the capacitance, which is measured at 1 kHz.
 """
 
 
 @dataclass(frozen=True)
 class OpAmpGrade:
-    """How specimens of an op-amp differ from the model in the netlist, and what their inputs draw.
+    """Spread of op-amp specimens about the netlist's model, and their input currents, capacitances and noise.
 
     offset_v, offset_v_per_k: uniform within +-, added to the model's. bandwidth, slew: fractions, uniform within +-.
     bias_a: current into each input at 25 C, of which bias_spread, a fraction, is uniform within +-; it doubles every
@@ -198,15 +198,15 @@ OP_AMP_GRADES: Mapping[str, OpAmpGrade] = MappingProxyType(
         ),
     }
 )
-"""To be used with the model of the same name in opamp.py; typical values of the datasheets."""
+"""Grades for the models of the same name in opamp.py; typical values of the datasheets."""
 
 
 @dataclass(frozen=True)
 class PotGrade:
-    """Coefficient pots: the track's grade, the resistance of the wiper, of the ends beyond each stop, and the windings.
+    """Coefficient pots: grade of the track, resistances of wiper and ends, and windings.
 
-    windings: turns of wire on the track, on one of which the wiper rests; 0 for a continuous track. wiper_noise_ohm: by
-    how much the wiper's resistance rises at most while it moves, differently from place to place (drawn).
+    windings: turns of wire on the track, on one of which the wiper rests; 0 for a continuous track. wiper_noise_ohm:
+    largest rise of the wiper's resistance while it moves; drawn for each place.
     Raises CircuitError naming the field.
     """
 
@@ -220,17 +220,17 @@ class PotGrade:
         self.model(1.0)
 
     def model(self, track_ohm: float) -> PotModel:
-        """The pot of this grade whose track between the stops has track_ohm."""
+        """Pot of this grade with track_ohm between the stops."""
         return PotModel(track_ohm, self.wiper_ohm, self.end_ohm, self.windings, self.wiper_noise_ohm)
 
 
 @dataclass(frozen=True)
 class Components:
-    """What a machine is built of. The defaults are perfect and change nothing.
+    """Component grades, temperature, age and seed of a machine. The defaults are perfect and change nothing.
 
     given: by element name, the deviation of a resistor, capacitor or track from its value (a fraction), or the offset
     of an op-amp in V, instead of the drawn one. given_bandwidth, given_slew: by op-amp, the deviation from the model's.
-    temperature_c: of all components; age_h: hours since they were new; seed: of all draws.
+    temperature_c: temperature of all components; age_h: hours in service; seed: seed of all draws.
     Raises CircuitError naming the field.
     """
 
@@ -256,11 +256,11 @@ class Components:
         rng = np.random.default_rng([self.seed, *contact_of(pot.name).lower().encode()])
         return self.pots.model(pot.track_ohm).contact(rng)
 
-    def fitted(self, elements: Iterable[Element]) -> tuple[Element, ...]:
-        """One specimen of a netlist: each element with its real value, followed by what comes with it.
+    def fit(self, elements: Iterable[Element]) -> tuple[Element, ...]:
+        """One specimen of a netlist: each element with its real value, followed by its parasitic elements.
 
-        What is added to element E is called E_..., its nodes too. Raises CircuitError for a given name that is not
-        there, or a deviation that leaves no value.
+        Elements and nodes added to element E are named E_... Raises CircuitError for an unknown given name, or a
+        deviation that leaves no positive value.
         """
         elements = tuple(elements)
         if self._perfect:
@@ -268,18 +268,17 @@ class Components:
         self._check_given(elements)
         return tuple(part for element in elements for part in self._parts(element))
 
-    def undrawn(self) -> Components:
-        """The same with nothing drawn: what is not given is as the diagram and the models say.
+    def without_draws(self) -> Components:
+        """The same components without random parts: values not given are those of the diagram and the models.
 
-        The tracks are continuous then: on which winding a wiper rests hangs on track and load more finely than they are
-        known.
+        The tracks become continuous: track and load are not known well enough to tell the winding of a wiper.
         """
         return replace(
             self,
-            resistors=self.resistors.undrawn(),
-            capacitors=self.capacitors.undrawn(),
+            resistors=self.resistors.without_draws(),
+            capacitors=self.capacitors.without_draws(),
             op_amps=replace(self.op_amps, offset_v=0.0, offset_v_per_k=0.0, bandwidth=0.0, slew=0.0, bias_spread=0.0),
-            pots=replace(self.pots, track=self.pots.track.undrawn(), windings=0),
+            pots=replace(self.pots, track=self.pots.track.without_draws(), windings=0),
         )
 
     def _check_given(self, elements: Sequence[Element]) -> None:
@@ -295,7 +294,7 @@ class Components:
 
     @property
     def _perfect(self) -> bool:
-        """Whether nothing would change: most machines are nominal, and drawing takes longer than solving them."""
+        """True if fit() changes nothing. Most machines are nominal, and drawing takes longer than solving them."""
         given = self.given or self.given_bandwidth or self.given_slew
         return not given and self._kinds == NOMINAL._kinds
 
@@ -311,17 +310,17 @@ class Components:
             case Capacitor():
                 real = replace(element, farad=element.farad * self._factor(element.name, self.capacitors, draws))
                 yield real
-                yield from _losses(real, self.dielectric)
+                yield from _loss_parts(real, self.dielectric)
             case Pot():
                 factor = self._factor(element.name, self.pots.track, draws)
-                yield from _mounted(replace(element, track_ohm=element.track_ohm * factor), self.pots)
+                yield from _pot_parts(replace(element, track_ohm=element.track_ohm * factor), self.pots)
             case OpAmp():
                 yield replace(element, model=self._specimen(element, draws))
                 yield from self._inputs(element, draws)
             case VoltageSource() | CurrentSource() | DiodeLimiter() | Switch():
                 yield element
             case _:
-                raise unknown(element)
+                raise unknown_kind_error(element)
 
     def _draws(self, name: str) -> NDArray[np.float64]:
         return np.random.default_rng([self.seed, *name.lower().encode()]).uniform(-1.0, 1.0, _DRAWS)
@@ -331,7 +330,7 @@ class Components:
         return self.temperature_c - REFERENCE_C
 
     def _factor(self, name: str, grade: Grade, draws: NDArray[np.float64]) -> float:
-        """Real value over nominal value. A factor of exactly 1 is what the perfect grade gives."""
+        """Real value over nominal value; exactly 1 for the perfect grade."""
         deviation = self.given.get(name, grade.tolerance * float(draws[_Draw.TOLERANCE]))
         per_k = grade.temperature_per_k + grade.temperature_spread_per_k * float(draws[_Draw.TEMPERATURE])
         aged = grade.ageing * float(draws[_Draw.AGEING]) * math.sqrt(self.age_h / 1000.0)
@@ -368,7 +367,7 @@ class Components:
                 yield Capacitor(f"{amp.name}_{side}_farad", node, GROUND, grade.input_farad)
 
 
-def _losses(capacitor: Capacitor, dielectric: Dielectric) -> Iterator[Element]:
+def _loss_parts(capacitor: Capacitor, dielectric: Dielectric) -> Iterator[Element]:
     name, a, b = capacitor.name, capacitor.a, capacitor.b
     if math.isfinite(dielectric.leakage_s):
         yield Resistor(f"{name}_leak", a, b, dielectric.leakage_s / capacitor.farad)
@@ -378,16 +377,16 @@ def _losses(capacitor: Capacitor, dielectric: Dielectric) -> Iterator[Element]:
         yield Capacitor(f"{name}_soak{i}", inner, b, farad)
 
 
-_NOWHERE_OHM = 1e12
-"""What leads to it leads nowhere."""
+_OPEN_OHM = 1e12
+"""Resistance of an open end."""
 
 
 def contact_of(pot: str) -> str:
-    """Name of the rheostat that is the noisy contact of a pot's wiper: all of it at dial 0, nothing at dial 1."""
+    """Name of the rheostat that models a wiper's noisy contact: full resistance at dial 0, none at dial 1."""
     return f"{pot}_contact"
 
 
-def _mounted(pot: Pot, grade: PotGrade) -> Iterator[Element]:
+def _pot_parts(pot: Pot, grade: PotGrade) -> Iterator[Element]:
     wiper, top, bottom = pot.wiper, pot.top, pot.bottom
     if grade.wiper_ohm > 0:
         wiper = f"{pot.name}_wiper"
@@ -399,21 +398,21 @@ def _mounted(pot: Pot, grade: PotGrade) -> Iterator[Element]:
     if grade.wiper_noise_ohm > 0:
         contact, rest, wiper = contact_of(pot.name), wiper, f"{pot.name}_track"
         yield Pot(contact, wiper, rest, f"{contact}_end", grade.wiper_noise_ohm, 1.0)
-        yield Resistor(f"{contact}_ohm", f"{contact}_end", GROUND, _NOWHERE_OHM)
+        yield Resistor(f"{contact}_ohm", f"{contact}_end", GROUND, _OPEN_OHM)
     yield replace(pot, top=top, wiper=wiper, bottom=bottom)
 
 
 _ADDED = re.compile(r"leak|soak\d+(_ohm)?|(plus|minus)_(bias|ohm|farad)|(wiper|top|bottom)_ohm|contact(_ohm)?")
-"""What fitted() adds to the name of an element for those that make it real."""
+"""Suffixes of the elements that fit() adds."""
 
 
 def is_part_of(element: Element, owner: str) -> bool:
-    """Whether an element is one of those that fitted() adds to make another real: by its name, C1_leak for C1."""
+    """True if fit() added the element to its owner; its name shows it, C1_leak for C1."""
     return element.name.startswith(f"{owner}_") and _ADDED.fullmatch(element.name, len(owner) + 1) is not None
 
 
 NOMINAL = Components()
-"""Perfect components: fitted() gives back what it was given."""
+"""Perfect components: fit() returns its argument."""
 
 _METAL_FILM = Grade(tolerance=0.01, temperature_spread_per_k=50e-6, ageing=2e-3)
 _TEN_TURN = PotGrade(Grade(tolerance=0.03, temperature_spread_per_k=50e-6), wiper_ohm=2.0, end_ohm=5.0, windings=5000)
@@ -437,4 +436,4 @@ COMPONENTS: Mapping[str, Components] = MappingProxyType(
         ),
     }
 )
-"""Machines as one could build them: 1 % metal film, ten-turn wire-wound pots, TL07x, and 5 % or 1 % film capacitors."""
+"""Components by name: 1 % metal film, ten-turn wire-wound pots, TL07x, and 5 % or 1 % film capacitors."""

@@ -1,16 +1,14 @@
-"""From a circuit to its piecewise-linear state space, by modified nodal analysis.
-
-    dx/dt = A x + B u + c + G phi(w),   w = C x + D u + e + P phi(w),   v = L x + M u + n + R phi(w)
+"""Piecewise-linear state space of a circuit (engine/system.py), by modified nodal analysis.
 
 x: the voltage of every capacitor, then the voltage behind the output resistance of every op-amp that has a pole
 (netlist order each).
 u: the voltage sources that are inputs. v: every node voltage. phi: one Kink per element of w: for each op-amp its slew
-limit, then its clamp; then, for each diode limiter, by how many volts it is beyond its threshold.
+limit, then its clamp; then, for each diode limiter, the voltage beyond its threshold.
 
-How: with x and u held, the circuit is resistive. Capacitors become voltage sources x, op-amp poles voltage sources x
+With x and u held, the circuit is resistive. Capacitors become voltage sources x, op-amp poles voltage sources x
 behind their output resistance. Kirchhoff's current law at every node, and one equation per branch whose current is
 unknown, give one linear system with right-hand side columns [x | u | 1 | phi of the limiters]; its solution is
-[L M n R] and the branch currents, and the rest is read off it: a capacitor's dx/dt is its current over its
+[L M n R] and the branch currents, and A, B, c, G follow from it: a capacitor's dx/dt is its current over its
 capacitance, an op-amp's is its law (opamp.py). Only elementwise arithmetic and engine_solve are used, no BLAS,
 so a circuit has the same bits on every machine.
 """
@@ -36,18 +34,18 @@ from analogrig_emulator.circuit.circuit import (
     Resistor,
     Switch,
     VoltageSource,
-    refused,
-    unknown,
+    element_error,
+    unknown_kind_error,
 )
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
-from analogrig_emulator.circuit.pot import checked_dial, legs_ohm
+from analogrig_emulator.circuit.pot import check_dial, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import Kink, Matrix, PiecewiseLinear, solve_in_place
 from analogrig_emulator.errors import CircuitError
 
 
 def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
-    """The state space of a circuit, its pots as they are set.
+    """State space of a circuit with its pots at their dials.
 
     Raises CircuitError naming the node where the circuit is singular.
     """
@@ -55,9 +53,9 @@ def piecewise_linear(circuit: Circuit) -> PiecewiseLinear:
 
 
 class Nodal:
-    """The equations of one circuit, with everything but pots and switches already entered: turning a pot costs little.
+    """Equations of one circuit with all but pots and switches entered, so that turning a pot is cheap.
 
-    Raises CircuitError when the circuit exceeds what the engine takes.
+    Raises CircuitError for a circuit that exceeds the limits of the engine.
     """
 
     def __init__(self, circuit: Circuit) -> None:
@@ -95,13 +93,11 @@ class Nodal:
         self._enter(kinds)
 
     def at(self, dials: Mapping[str, float], closed: Mapping[str, bool] | None = None) -> PiecewiseLinear:
-        """The state space with the pots named in dials and the switches named in closed set so.
-
-        The others are as in the netlist.
+        """State space with pots at `dials` and switches at `closed`; the others are as in the netlist.
 
         Raises PotError for a dial off its track, CircuitError for a singular circuit.
         """
-        solution = self._solved(dials, closed or {})
+        solution = self._solution(dials, closed or {})
         abc, g, cde, w_phi = self._flow(solution)
         voltages = solution[: len(self._nodes)]
         return PiecewiseLinear(
@@ -117,14 +113,14 @@ class Nodal:
             v_phi=self._spread(voltages),
         )
 
-    def trimmed(self, dials: Mapping[str, float]) -> tuple[PiecewiseLinear, Trim]:
-        """As at(), and how the offsets of the op-amps enter it.
+    def with_trim(self, dials: Mapping[str, float]) -> tuple[PiecewiseLinear, Trim]:
+        """State space of at(), and the trim by which op-amp offsets enter it.
 
-        Raises as at(), and CircuitError for an op-amp without a pole.
+        Raises like at(), and CircuitError for an op-amp without a pole.
         """
         if len(self._poles) != sum(isinstance(element, OpAmp) for element in self._elements):
             raise CircuitError("the offset of an op-amp without a pole enters every node: it cannot be trimmed")
-        laws, solution = self._laws, self._solved(dials, {})
+        laws, solution = self._laws, self._solution(dials, {})
         apart_v = (solution[laws.plus] - solution[laws.minus])[laws.poles, self._columns - 1]
         slew_kinks = dict(zip(laws.drive_of_kink[laws.slews].tolist(), laws.slews.tolist(), strict=True))
         return self.at(dials), Trim(
@@ -135,9 +131,9 @@ class Nodal:
         )
 
     def disturbances(self, dials: Mapping[str, float]) -> dict[str, Matrix]:
-        """What small sources add to dx/dt while nothing limits, each (n,), with the pots named in dials set so.
+        """Contribution of unit sources to dx/dt while no limit acts, each (n,), with pots at `dials`.
 
-        By node: a current of 1 A into it; by op-amp: 1 V in series with its + input; for ground, 0. Raises as at().
+        Key node: 1 A into it; key op-amp: 1 V in series with its + input; ground: zeros. Raises like at().
         """
         size = len(self._unknowns)
         slopes = self._laws.slopes(self._solve(self._set(dials, {}), np.eye(size + 1)))[: len(self._state)]
@@ -183,7 +179,7 @@ class Nodal:
             self._right[self._row[limiter.b], self._columns + i] += limiter.excess_siemens
 
     def _drive(self, source: VoltageSource | CurrentSource) -> tuple[int, float]:
-        """The column of what drives a source, and by how much: the constant's, or that of an input."""
+        """Column of the right-hand side that drives a source, and its factor."""
         level = source.constant
         if level is None:
             return len(self._state) + self._inputs.index(source), 1.0
@@ -206,11 +202,11 @@ class Nodal:
         """Conductances of the switches, then of both legs of every pot."""
         ohms = [switch.ohm(closed=closed.get(switch.name, switch.closed)) for switch in self._switches]
         for pot in self._pots:
-            ohms += legs_ohm(checked_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
+            ohms += legs_ohm(check_dial(dials.get(pot.name, pot.dial), pot.name), pot.track_ohm)
         return [1.0 / ohm for ohm in ohms]
 
     def _places(self, ends: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
-        """Where conductances between these nodes enter the flattened matrix, four places each."""
+        """Indices at which conductances between these nodes enter the flattened matrix, four each."""
         size = len(self._unknowns) + 1
         rows = [(self._row[a], self._row[b]) for a, b in ends]
         return np.array([(i * size + i, j * size + j, i * size + j, j * size + i) for i, j in rows], np.intp).ravel()
@@ -248,11 +244,11 @@ class Nodal:
 
     # ---- reading the solution
 
-    def _solved(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
+    def _solution(self, dials: Mapping[str, float], closed: Mapping[str, bool]) -> Matrix:
         return self._solve(self._set(dials, closed), self._right)
 
     def _solve(self, left: Matrix, right: Matrix) -> Matrix:
-        """Every unknown as a function of what the columns of right stand for, and a last row for ground, of zeros."""
+        """Solution for the columns of `right`: a row per unknown, and a last row of zeros for ground."""
         size = len(self._unknowns)
         solution = np.zeros((size + 1, right.shape[1]))
         solution[:size] = right[:size]
@@ -262,10 +258,10 @@ class Nodal:
         return solution
 
     def _singular(self, unknown: int) -> CircuitError:
-        """The error for what nothing determines: a node, named with the first element at it, or a current."""
+        """CircuitError that names the undetermined node, with the first element at it, or the current."""
         what, name = self._unknowns[unknown]
         element = next(part for part in self._elements if name in (part.nodes if what == "node" else (part.name,)))
-        return refused(element, f"the circuit is singular: nothing determines the {what} {name}")
+        return element_error(element, f"the circuit is singular: nothing determines the {what} {name}")
 
     def _flow(self, solution: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         """[A B c], G, [C D e] and P."""
@@ -289,10 +285,10 @@ class Nodal:
 
 @dataclass(frozen=True)
 class Trim:
-    """How the offsets of op-amps enter a state space: (apart_v + offset) gain_rate is the constant of each one's drive.
+    """Entry of op-amp offsets into a state space: the constant of each drive is (apart_v + offset) gain_rate.
 
-    apart_v: (amps,) V between their inputs at x = 0, u = 0; gain_rate: (amps,) 1/s. rows: of each the row of abc, and
-    that of cde in which the drive stands instead if the amplifier slews.
+    apart_v: (amps,) V between the inputs at x = 0, u = 0; gain_rate: (amps,) 1/s. rows: for each op-amp the row of abc,
+    and that of cde which holds the drive instead if the amplifier has a slew limit.
     """
 
     amps: tuple[str, ...]
@@ -316,7 +312,7 @@ class _Kinds:
 
     @classmethod
     def of(cls, elements: Sequence[Element]) -> _Kinds:
-        """Sorted; CircuitError for an element of none of these kinds."""
+        """Elements sorted by kind. Raises CircuitError for an element of another kind."""
         kinds = cls()
         for element in elements:
             match element:
@@ -337,20 +333,20 @@ class _Kinds:
                 case DiodeLimiter():
                     kinds.limiters.append(element)
                 case _:
-                    raise unknown(element)
+                    raise unknown_kind_error(element)
         return kinds
 
 
 _STAMP = np.array((1.0, 1.0, -1.0, -1.0))
-"""How a conductance enters: at both ends' own places, then across."""
+"""Signs of a conductance at its four places: both diagonal ones, then both off-diagonal ones."""
 
 
 @dataclass(frozen=True)
 class _Laws:
-    """What makes states and kinks move, as arrays: capacitors by their currents, then op-amps and limiters by voltages.
+    """Laws of capacitors (by current), op-amps and limiters (by voltages), as arrays.
 
-    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less what leaks. Of the kinks, in the order
-    of _kinks(), drive_of_kink says whose they are; slews and clamps say which are which. g: G without the limiters.
+    A drive is (solution[plus] - solution[minus] + offset) gain / capacity, less the leak. drive_of_kink: drive of each
+    kink, in the order of _kinks(); slews, clamps: indices of the kinks of each kind. g: G without the limiters.
     """
 
     plus: NDArray[np.intp]
@@ -374,7 +370,7 @@ class _Laws:
         poles: Sequence[OpAmp],
         limiters: Sequence[DiodeLimiter],
     ) -> _Laws:
-        """The laws of the circuit whose nodes and branches have been numbered."""
+        """Laws of a circuit with numbered nodes (row) and branches."""
         ends = [(branch[capacitor.name], row[GROUND]) for capacitor in capacitors]
         ends += [(row[amp.plus], row[amp.minus]) for amp in poles]
         ends += [(row[limiter.a], row[limiter.b]) for limiter in limiters]
@@ -412,7 +408,7 @@ class _Laws:
         return drives
 
     def slopes(self, solution: Matrix) -> Matrix:
-        """The same rows without offsets and leaks: what the voltages and currents do by themselves."""
+        """Rows of drives() without offsets and leaks."""
         return np.asarray((solution[self.plus] - solution[self.minus]) * self.gain / self.capacity)
 
 

@@ -6,8 +6,8 @@ The law of every op-amp here, with v the voltage behind the output resistance (S
     tau = Avol / (2 pi GBW)
 
 The clamp is a spring and not a wall: overdriven at full slew rate, v settles SR / CLAMP_RATE beyond the swing (13 mV
-for a TL07x). That keeps the field continuous, so the mode of an amplifier follows from the state alone and there is
-nothing to slide on. Inputs draw no current; the supply is not modelled beyond the swing.
+for a TL07x). The field is therefore continuous, and the mode of an amplifier follows from the state alone.
+Inputs draw no current; the supply is not modelled beyond the swing.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ LEAST_GBW_HZ = 1.0
 
 @dataclass(frozen=True)
 class OpAmpModel:
-    """One type of op-amp. The defaults are the ideal one (v+ = v-, no state); every non-ideality is off on its own.
+    """One type of op-amp. The defaults are ideal: v+ = v-, no state. Each field switches one non-ideality on.
 
     avol: open-loop gain at DC (V/V); gbw_hz: gain-bandwidth product; slew_v_per_s: slew rate; swing_v: (lowest,
     highest) output in V; rout_ohm: open-loop output resistance; vos_v: input offset voltage, added to v+ - v-.
 
-    Raises CircuitError naming the field. Slew and swing need a finite gbw_hz, for they act on the state that it brings.
+    Raises CircuitError naming the field. Slew and swing need a finite gbw_hz: they act on its state.
     """
 
     avol: float = math.inf
@@ -62,17 +62,17 @@ class OpAmpModel:
 
     @property
     def has_state(self) -> bool:
-        """Whether the amplifier has a pole, and so a state."""
+        """True if the amplifier has a pole, and so a state."""
         return math.isfinite(self.gbw_hz)
 
     @property
     def slews(self) -> bool:
-        """Whether the slew rate is finite."""
+        """True if the slew rate is finite."""
         return math.isfinite(self.slew_v_per_s)
 
     @property
     def clamps(self) -> bool:
-        """Whether the output swing is finite on either side."""
+        """True if the output swing is finite on either side."""
         return any(math.isfinite(limit) for limit in self.swing_v)
 
     @property
@@ -100,7 +100,7 @@ PRESETS: Mapping[str, OpAmpModel] = MappingProxyType(
 
 
 def preset(name: str) -> OpAmpModel:
-    """The preset of that name (any case); raises CircuitError listing what there is."""
+    """Preset of a name (any case). Raises CircuitError that lists the presets."""
     try:
         return PRESETS[name.lower()]
     except KeyError:

@@ -1,11 +1,10 @@
-"""Coefficient potentiometers, and what their load does to them.
+"""Coefficient potentiometers under load.
 
 A pot of track Rp set to dial k (0..1) and loaded by RL to ground (or to a virtual ground) passes the coefficient
 
     k_eff = k / (1 + k (1 - k) Rp / RL)
 
-which is less than its dial shows. An operator either sets the dial, or sets the coefficient with the load connected
-(pot-set mode).
+less than its dial. An operator sets either the dial, or the coefficient with the load connected (pot-set mode).
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from analogrig_emulator.engine.system import is_integer
 from analogrig_emulator.errors import CircuitError, PotError
 
 _PLACES = 5000
-"""Into which a continuous track is divided for its noise."""
+"""Number of places with a noise of their own on a continuous track."""
 
 END_FRACTION = 1e-6
-"""Part of the track that stays between wiper and terminal at an end stop, so that no leg is ever a short circuit."""
+"""Part of the track between wiper and terminal at an end stop, so that no leg is a short circuit."""
 
 
 class PotChange(NamedTuple):
@@ -40,15 +39,15 @@ class PotChange(NamedTuple):
     ramp_n: int = 0
 
 
-def checked_dial(dial: float, name: str = "pot") -> float:
-    """The dial itself when it is within 0..1, else PotError."""
+def check_dial(dial: float, name: str = "pot") -> float:
+    """Return the dial. Raises PotError unless it is within 0..1."""
     if not 0.0 <= dial <= 1.0:
         raise PotError(f"pot {name}: dial {dial!r} is beyond the track (0 to 1)", element=name)
     return dial
 
 
-def checked_ramp(ramp_n: int, pots: Iterable[str]) -> int:
-    """The samples of a ramp when they are a whole number and not negative, else PotError naming the pots."""
+def check_ramp(ramp_n: int, pots: Iterable[str]) -> int:
+    """Return ramp_n. Raises PotError naming the pots unless it is an integer >= 0."""
     if not (is_integer(ramp_n) and ramp_n >= 0):
         raise PotError(f"pots {', '.join(pots)}: cannot turn in {ramp_n!r} samples")
     return ramp_n
@@ -60,7 +59,7 @@ def coefficient_under_load(dial: float, track_ohm: float, load_ohm: float) -> fl
 
 
 def dial_for(coefficient: float, track_ohm: float, load_ohm: float, name: str = "pot") -> float:
-    """The dial that gives the coefficient under load: the inverse of coefficient_under_load.
+    """Dial for a coefficient under load: the inverse of coefficient_under_load.
 
     Raises PotError naming the pot when the coefficient is not within 0..1.
     """
@@ -79,12 +78,12 @@ def legs_ohm(dial: float, track_ohm: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class PotModel:
-    """A real pot: what it passes at a dial into a load, and where it must stand to pass that.
+    """Real pot: coefficient of a dial under load, and the inverse.
 
-    track_ohm: between the end stops, dial 0 to dial 1; end_ohm: what lies beyond either stop; wiper_ohm: of the wiper's
-    contact, in series with the load. windings: turns of wire on which the wiper can rest, so that the dial acts in
-    steps of 1 / windings; 0 for a continuous track. wiper_noise_ohm: by how much the contact's resistance rises at
-    most while the wiper moves (the datasheets' equivalent noise resistance; 100 ohm is usual for wire).
+    track_ohm: resistance between the end stops, dial 0 to dial 1; end_ohm: resistance beyond either stop; wiper_ohm:
+    contact resistance in series with the load. windings: turns of wire, so that the dial acts in steps of 1 / windings;
+    0 for a continuous track. wiper_noise_ohm: largest rise of the contact resistance while the wiper moves
+    (the datasheets' equivalent noise resistance; 100 ohm is usual for wire).
     Raises CircuitError naming the field.
     """
 
@@ -107,15 +106,15 @@ class PotModel:
         return self.track_ohm + 2.0 * self.end_ohm
 
     def coefficient(self, dial: float, load_ohm: float) -> float:
-        """What the pot passes (V/V) at that dial into load_ohm, from a stiff source."""
+        """Coefficient (V/V) at a dial into load_ohm, from a stiff source."""
         fraction = self.end_ohm / self._total_ohm + dial * (self.track_ohm / self._total_ohm)
         driven_ohm = load_ohm + self.wiper_ohm
         return coefficient_under_load(fraction, self._total_ohm, driven_ohm) * (load_ohm / driven_ohm)
 
     def dial(self, coefficient: float, load_ohm: float, name: str = "pot") -> float:
-        """The dial that passes the coefficient into load_ohm, were the track continuous.
+        """Dial for a coefficient into load_ohm, on a continuous track.
 
-        Raises PotError naming the pot when there is none between the end stops.
+        Raises PotError naming the pot if the dial lies beyond an end stop.
         """
         driven_ohm = load_ohm + self.wiper_ohm
         fraction = dial_for(coefficient * (driven_ohm / load_ohm), self._total_ohm, driven_ohm, name)
@@ -125,12 +124,12 @@ class PotModel:
         return dial
 
     def resting(self, dial: float) -> float:
-        """Where the wiper comes to rest when the dial is turned there: on the nearest winding."""
+        """Dial of the winding nearest to a dial, where the wiper rests."""
         return round(dial * self.windings) / self.windings if self.windings else dial
 
     def contact(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """What part of wiper_noise_ohm the moving wiper meets along one specimen's track: (places,), 0..1.
+        """Fraction of wiper_noise_ohm at each place of one specimen's track: (places,), 0..1.
 
-        A place is a winding, or a five-thousandth of a continuous track; the same place has always the same.
+        A place is a winding, or a five-thousandth of a continuous track.
         """
         return rng.uniform(0.0, 1.0, (self.windings or _PLACES) + 1)

@@ -45,7 +45,7 @@ _WRAP = 8
 
 
 LIMITLESS = 1e99
-"""What stands for infinity in a deck."""
+"""Infinity in a deck."""
 
 LIBRARY: Mapping[str, str] = MappingProxyType(
     {
@@ -90,7 +90,7 @@ Vnode node 0 PULSE(0 1 0 1n 1n {period / 2} {period})
 .ends""",
     }
 )
-"""The subcircuits of which decks are made, by name."""
+"""Subcircuits by name."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class Deck:
         Raises CircuitError for an unknown input, pot, state or node, for a name that SPICE does not allow, and for a
         ramp.
         """
-        writer = _Writer(self)
+        writer = _DeckWriter(self)
         writer.check(nodes)
         return "\n".join(writer.lines(accuracy or Accuracy(), nodes)) + "\n"
 
@@ -162,7 +162,7 @@ def to_spice(
     return Deck(circuit, **played).text(nodes, accuracy)
 
 
-class _Writer:
+class _DeckWriter:
     def __init__(self, deck: Deck) -> None:
         self._deck = deck
         self._circuit = deck.circuit
@@ -243,7 +243,7 @@ class _Writer:
                 yield f".ic v({_card('X', amp.name)}.state)={_number(self._deck.initial_v[amp.name])}"
 
     def _free(self, name: str) -> str:
-        """The name itself, or with as many underscores as make it one that nothing else in the deck has."""
+        """Name with as many underscores appended as make it unique in the deck."""
         while name.lower() in self._taken:
             name += "_"
         self._taken.add(name.lower())
@@ -263,9 +263,9 @@ _LETTERS: Mapping[type, str] = {
 
 
 def _card(letter: str, name: str) -> str:
-    """The name of an element's card: its own where that begins as SPICE wants it, else with the letter and _ before it.
+    """Name of an element's card: its own if it begins with SPICE's letter, else with letter and _ before it.
 
-    A name like R_1 gets them too, so that whoever takes the prefix off again has the name.
+    A name like R_1 gets the prefix too, so that removing prefixes restores names.
     """
     begins = name[:1].upper() == letter and name[1:2] != "_"
     return name if begins else f"{letter}_{name}"
@@ -278,7 +278,7 @@ def _known(what: str, names: Iterable[str], there: Sequence[str]) -> None:
 
 
 def _levels(edges: Edges, period_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Instants in s and levels, beginning at 0 s; without levels that do not last as long as a step takes."""
+    """Instants in s and levels from 0 s on, without levels shorter than a step."""
     times_s = edges.ticks.astype(np.float64) * (period_s / TICKS_PER_SAMPLE)
     lasting = np.append(times_s[1:] > times_s[:-1] + STEP_S, True)[: times_s.size]
     times_s, levels_v = times_s[lasting], edges.levels_v[lasting]

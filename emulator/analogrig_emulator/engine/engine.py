@@ -1,4 +1,4 @@
-"""The engine: a piecewise-linear circuit, stepped exactly from sample to sample (engine/engine.h explains how)."""
+"""Exact sample-by-sample solution of a piecewise-linear circuit; engine.h describes the method."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, Piec
 from analogrig_emulator.errors import EngineError
 
 _Trains = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]
-"""Ticks, inputs and levels of all edges, in order of time."""
+"""Ticks, inputs and levels of all edges, in time order."""
 
 _REASONS = {
     1: "out of memory",
@@ -33,9 +33,9 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class EngineCounts:
-    """What an engine has done so far.
+    """Work counters of an engine.
 
-    samples: recorded; events: changes of mode found between edges; steps: matrix products; quiet: samples stepped with
+    samples: samples recorded; events: mode changes between edges; steps: matrix products; quiet: samples stepped with
     the slow states alone; modes_built: ladders.
     """
 
@@ -47,10 +47,10 @@ class EngineCounts:
 
 
 class Engine:
-    """Runs a circuit. It starts at rest (x = 0, u = 0), before its first sample.
+    """Solver of one circuit. It starts at rest (x = 0, u = 0), before its first sample.
 
-    system: the circuit; outputs: the nodes whose voltages are recorded; sample_rate_hz: the card's; events_per_sample:
-    bound on the mode changes within one sample period, beyond which EngineError is raised.
+    system: circuit; outputs: nodes to record; events_per_sample: most mode changes within a sample period, beyond which
+    EngineError is raised.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class Engine:
 
     @property
     def recorded(self) -> int:
-        """Samples recorded so far; the engine stands at the instant of the last of them, index recorded - 1."""
+        """Number of samples recorded; the present instant is that of the last one."""
         return self._recorded
 
     @property
     def counts(self) -> EngineCounts:
-        """Events, steps and modes so far."""
+        """Counters of samples, events, steps and modes."""
         counts = library.Counts()
         self._library.engine_get_counts(self._handle, ctypes.byref(counts))
         return EngineCounts(counts.samples, counts.events, counts.steps, counts.quiet, counts.modes_built)
@@ -106,40 +106,37 @@ class Engine:
         self._check(self._library.engine_set_state(self._handle, state.ctypes.data))
 
     def set_system(self, system: PiecewiseLinear) -> None:
-        """Replaces the circuit by another of the same states, inputs and kinks, at the last instant recorded.
+        """Replace the circuit by another of the same states, inputs and kinks, at the last instant recorded.
 
-        That sample is still the old circuit's, the next is the first of the new. Voltages of capacitors and op-amps
-        carry over. An equal circuit changes nothing, to the bit. Raises EngineError; the engine then plays nothing
-        until it is given a circuit that it accepts.
+        The next sample is the first of the new circuit. Voltages of capacitors and op-amps carry over. An equal circuit
+        changes no bit. Raises EngineError; the engine then runs only after it has accepted another circuit.
         """
         if (system.states, system.inputs) != self._names:
             raise EngineError(
                 f"the new circuit has states {system.states} and inputs {system.inputs}, not {self._names}"
             )
-        block, starts = _laid_out(system, self._outputs)
+        block, starts = _pack(system, self._outputs)
         circuit = library.System(*(block.ctypes.data + start for start in starts))
         self._check(self._library.engine_set_system(self._handle, ctypes.byref(circuit)))
 
     def run(self, samples: int, edges: Mapping[str, Edges] | None = None) -> NDArray[np.float64]:
-        """Records the next samples, each after the edges that fall on its very instant: float64 (samples, outputs), V.
+        """Record the next samples, each after the edges at its instant: float64 (samples, outputs), V.
 
-        edges: by input; every edge from the instant where the engine stands to the last of this run. One at the very
-        instant of the last sample recorded comes after it; in a run that is cut, window() says which ticks each part
-        takes. Cutting a run into several calls gives the same bits. Raises EngineError; the engine is then of no
-        further use.
+        edges: by input, all within window(samples). Cutting a run into several calls changes no bit.
+        Raises EngineError; the engine is then unusable.
         """
-        volts = self._room(samples)
+        volts = self._allocate(samples)
         trains = self._merge(edges or {})
         self._run_until((self._recorded + samples - 1) * TICKS_PER_SAMPLE, trains, volts)
-        self._note(samples)
+        self._advance_clock(samples)
         return volts
 
-    def _room(self, samples: int) -> NDArray[np.float64]:
+    def _allocate(self, samples: int) -> NDArray[np.float64]:
         if samples < 0:
             raise EngineError(f"cannot record {samples} samples")
         return np.empty((samples, len(self._outputs)))
 
-    def _note(self, samples: int) -> None:
+    def _advance_clock(self, samples: int) -> None:
         self._recorded += samples
         if samples:
             self._now_tick = (self._recorded - 1) * TICKS_PER_SAMPLE
@@ -155,19 +152,19 @@ class Engine:
         edges: Mapping[str, Edges] | None = None,
         pieces_per_sample: int = 1,
     ) -> NDArray[np.float64]:
-        """As run(), while pots are being turned: turning(t) is the circuit at t sample periods after sample 0.
+        """Record the next samples like run() while pots turn: turning(t) is the circuit at t sample periods.
 
-        Each of the pieces of 1/pieces_per_sample is stepped exactly, with the circuit of its middle; every sample is in
-        the middle of one, so it shows the circuit of its very instant. Afterwards the circuit is that of the last
-        sample. Cutting a run into several calls gives the same bits.
+        Each piece of 1/pieces_per_sample is stepped exactly with the circuit of its middle. Every sample is the middle
+        of a piece, so it shows the circuit of its instant. The circuit of the last sample stays.
+        Cutting a run into several calls changes no bit.
 
-        Error: for a piece of h seconds and a dial that moves at r per second, at most r h^2 / 8 times the largest
-        |d(dx/dt)/d(dial)|, in V/s per unit of the dial, and again r h^2 / 12 times what its rate of change adds up to
-        over the memory of the circuit: four times as many pieces per sample, a sixteenth of the error.
+        Error for pieces of h seconds and a dial moving at r per second: at most r h^2 / 8 max |d(dx/dt)/d(dial)|, plus
+        r h^2 / 12 times the integral of its rate of change over the circuit's memory. Four times as many pieces leave
+        a sixteenth of the error.
         """
         if pieces_per_sample < 1:
             raise EngineError(f"pieces_per_sample must be at least 1, got {pieces_per_sample}")
-        volts = self._room(samples)
+        volts = self._allocate(samples)
         ticks, inputs, levels_v = self._merge(edges or {})
         last, first_edge = self._recorded + samples - 1, 0
         for piece in range(max(self._recorded - 1, 0) * pieces_per_sample, last * pieces_per_sample + 1):
@@ -178,30 +175,30 @@ class Engine:
             recorded = self.counts.samples
             self._run_until(stop, (ticks[now], inputs[now], levels_v[now]), volts[recorded - self._recorded :])
             first_edge = next_edge
-        self._note(samples)
+        self._advance_clock(samples)
         return volts
 
     def play(self, schedule: CircuitSchedule, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        """A whole play from rest, as that of a new engine: float64 (schedule.samples, outputs), V.
+        """Play a schedule from rest: float64 (schedule.samples, outputs), V.
 
-        As set_system() and run() by turns, at a fraction of their cost; the clock and what watch() saw begin anew.
+        Equals alternating set_system() and run() on a new engine, at a fraction of the cost. Clock and watch() restart.
         Raises EngineError.
         """
         self._library.engine_restart(self._handle)
         self._library.engine_watch(self._handle, schedule.patience_ticks)
         self._recorded, self._now_tick = 0, -1
-        volts = self._room(schedule.samples)
+        volts = self._allocate(schedule.samples)
         trains = self._merge(edges)
         addresses = [array.ctypes.data for array in (*trains, volts)]
         turned = (len(schedule.circuits), schedule.circuits, schedule.until_ticks.ctypes.data)
         self._check(self._library.engine_play(self._handle, *turned, trains[0].size, *addresses))
-        self._note(schedule.samples)
+        self._advance_clock(schedule.samples)
         return volts
 
     def advance(self, tick: int, edges: Mapping[str, Edges] | None = None) -> None:
-        """Goes to an instant before the next sample's and records nothing; it takes the edges up to it.
+        """Go to an instant before the next sample without recording; apply the edges up to it.
 
-        So the circuit can be changed between two samples. Raises EngineError, as run does, and for another instant.
+        The circuit can then be changed between two samples. Raises EngineError like run(), and for another instant.
         """
         if not self._now_tick <= tick < self._recorded * TICKS_PER_SAMPLE:
             raise EngineError(f"after {self._recorded} samples: tick {tick} is past, or not before the next sample's")
@@ -209,27 +206,27 @@ class Engine:
         self._now_tick = tick
 
     def watch(self, patience_ticks: int) -> None:
-        """Looks out, from here on, for kinks that stay outside their middle piece for so long without a break."""
+        """Watch from now on for kinks outside their middle piece for patience_ticks without a break."""
         self._library.engine_watch(self._handle, patience_ticks)
 
     @property
     def overdue_ticks(self) -> NDArray[np.int64]:
-        """For each kink the first tick at which it had been outside for the ticks of watch(); -1 where it has not."""
+        """First tick by kink at which it had been outside for the ticks of watch(), else -1: int64 (kinks,)."""
         ticks = np.empty(self._kinks, np.int64)
         self._library.engine_get_overdue(self._handle, ticks.ctypes.data)
         return ticks
 
     @property
     def now_tick(self) -> int:
-        """Where the engine stands: the instant of the last sample, or of advance(); -1 before either."""
+        """Present instant: that of the last sample or of advance(); -1 before either."""
         return self._now_tick
 
     def window(self, samples: int) -> tuple[int, int]:
-        """The ticks (start, stop) of the edges that run(samples) takes next: start <= tick < stop."""
+        """Range of ticks (start, stop) of the edges that run(samples) accepts: start <= tick < stop."""
         return self._now_tick + 1, (self._recorded + samples - 1) * TICKS_PER_SAMPLE + 1
 
     def _merge(self, edges: Mapping[str, Edges]) -> _Trains:
-        """All edges in order of time; at the same tick in order of input."""
+        """All edges in time order; at the same tick in order of input."""
         for name, train in edges.items():
             if name not in self._names[1]:
                 raise EngineError(f"no input is called {name!r}; there are {', '.join(self._names[1]) or 'none'}")
@@ -252,13 +249,13 @@ class Engine:
 
 
 class CircuitSchedule:
-    """The circuits that a play goes through, laid out as the engine takes them, so that it can be played repeatedly.
+    """Circuits of one play in the engine's memory layout, for repeated plays.
 
-    systems: of the same states, inputs and kinks; last_samples: for each the last sample that it shows, in order of
-    time, that of the last one being the last of the play; patience_ticks: as of Engine.watch.
+    systems: of the same states, inputs and kinks; last_samples: last sample of each, ascending; patience_ticks: as for
+    Engine.watch.
 
-    blocks: (turns, numbers); the numbers of a circuit in one row, to be changed at abc_places and cde_places: where in
-    a row the last columns of abc and of cde stand, (n,) and (q,).
+    blocks: (systems, numbers), a row per circuit. abc_places (n,), cde_places (q,): indices in a row of the last
+    columns of abc and cde, which may be changed.
     """
 
     def __init__(
@@ -268,7 +265,7 @@ class CircuitSchedule:
         last_samples: Sequence[int],
         patience_ticks: int,
     ) -> None:
-        laid_out = [_laid_out(system, outputs) for system in systems]
+        laid_out = [_pack(system, outputs) for system in systems]
         starts = laid_out[0][1]
         self.blocks = np.stack([block for block, _ in laid_out])
         self.circuits = (library.System * len(systems))(
@@ -284,8 +281,8 @@ class CircuitSchedule:
         )
 
 
-def _laid_out(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[np.float64], list[int]]:
-    """One block of memory with the arrays of engine_system_t, and where each begins in it, in bytes."""
+def _pack(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[np.float64], list[int]]:
+    """One block of memory with the arrays of engine_system_t, and the offset of each in bytes."""
     rows = system.rows(outputs)
     arrays = (system.abc, system.g, system.cde, system.w_phi, system.lmn[rows], system.v_phi[rows])
     parts = [array.ravel() for array in (*arrays, _kink_table(system.kinks))]
@@ -294,5 +291,5 @@ def _laid_out(system: PiecewiseLinear, outputs: Sequence[str]) -> tuple[NDArray[
 
 @functools.lru_cache(maxsize=64)
 def _kink_table(kinks: tuple[Kink, ...]) -> NDArray[np.float64]:
-    """One engine_kink_t a row: (kinks, 8)."""
+    """Rows of engine_kink_t: (kinks, 8)."""
     return np.array([(kink.lower, kink.upper, *kink.slopes, *kink.intercepts) for kink in kinks]).reshape(-1, 8)

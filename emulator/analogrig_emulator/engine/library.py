@@ -52,7 +52,7 @@ _PROTOTYPES: tuple[tuple[str, type | None, tuple[type, ...]], ...] = (
 
 @functools.cache
 def load() -> ctypes.CDLL:
-    """The library, with its prototypes declared. Raises EngineError saying how to build it when it is absent."""
+    """The library, with its prototypes declared. Raises EngineError with the build command if it is absent."""
     paths = sorted(_HERE.glob("_engine*.so"))
     if not paths:
         raise EngineError(f"the circuit engine is not built in {_HERE}: run `pip install -e .`, or `{_BUILD}`")

@@ -25,7 +25,7 @@ TICKS_PER_SAMPLE = 1 << 22
 Matrix = NDArray[np.float64]
 
 _PIECE_SLACK = 1e-9
-"""Of a kink's bound: less than this beyond it may be rounding."""
+"""Relative excess over a kink's bound that may be rounding."""
 
 
 def is_integer(number: object) -> bool:
@@ -79,7 +79,7 @@ class Kink:
     upper: float
     slopes: tuple[float, float, float]
     element: str = ""
-    """The name of the element that it limits."""
+    """Name of the element with this limit."""
 
     @classmethod
     def clip(cls, limit: float) -> Kink:
@@ -88,7 +88,7 @@ class Kink:
 
     @classmethod
     def deadzone(cls, lower: float, upper: float) -> Kink:
-        """What of w is beyond lower..upper, and 0 within."""
+        """Excess of w over lower..upper, 0 within."""
         return cls(lower, upper, (1.0, 0.0, 1.0))
 
     @property
@@ -100,7 +100,7 @@ class Kink:
         return at_lower, 0.0, at_upper
 
     def piece(self, w: float, now: int) -> int:
-        """In which piece w lies: 0, 1 or 2; the present one where rounding may be all that puts it beyond."""
+        """Piece of w: 0, 1 or 2; stays `now` if only rounding may put w beyond its bound."""
         for piece, bound in ((0, self.lower), (1, self.upper)):
             slack = _PIECE_SLACK * (1.0 + abs(bound))
             if math.isfinite(bound) and w < bound + (slack if now <= piece else -slack):
@@ -109,7 +109,7 @@ class Kink:
 
 
 class Rest(NamedTuple):
-    """Where a circuit rests: its state, (n,) in V, and the voltage of every node."""
+    """Rest of a circuit: its state, (n,) in V, and the voltage of every node."""
 
     state: Matrix
     volts: Mapping[str, float]
@@ -117,7 +117,7 @@ class Rest(NamedTuple):
 
 @dataclass(frozen=True)
 class PiecewiseLinear:
-    """The state space of a circuit, in the form of the module's docstring.
+    """The state space of a circuit, in the form of the module docstring.
 
     Columns of abc, cde and lmn: states, inputs, constant.
 
@@ -138,11 +138,11 @@ class PiecewiseLinear:
     v_phi: Matrix
 
     def readings(self, nodes: Sequence[str]) -> Matrix:
-        """The rows of lmn for these nodes, in this order. Raises CircuitError for a node that is not there."""
+        """Rows of lmn for these nodes, in this order. Raises CircuitError for an unknown node."""
         return self.lmn[self.rows(nodes)]
 
     def rows(self, nodes: Sequence[str]) -> list[int]:
-        """Which rows of lmn and v_phi belong to these nodes. Raises CircuitError for a node that is not there."""
+        """Row indices of these nodes in lmn and v_phi. Raises CircuitError for an unknown node."""
         try:
             return [self.nodes.index(node) for node in nodes]
         except ValueError:
@@ -150,11 +150,11 @@ class PiecewiseLinear:
             raise CircuitError(f"no node is called {missing!r}; there are {', '.join(self.nodes)}") from None
 
     def rest(self, levels_v: Matrix) -> Rest:
-        """Where nothing moves with the inputs held at levels_v (m,): the limits that are reached there count.
+        """Rest with the inputs held at levels_v (m,), limits included.
 
-        Pieces are tried from the middle ones on, each time those in which the rest of the last ones lies, until they
-        stand; so this needs not be the only rest, nor the one to which the circuit would come from its present state.
-        Raises CircuitError naming a state that nothing brings to rest, or what has no rest in any piece tried.
+        Pieces are tried from the middle ones on: each time those that hold the rest of the last ones, until they agree.
+        The rest need not be unique, nor the one that the circuit would reach from its present state.
+        Raises CircuitError naming a state that nothing brings to rest, or elements without a rest in any piece tried.
         """
         pieces = np.ones(len(self.kinks), np.intp)
         for _ in range(2 * len(self.kinks) + 1):
@@ -167,7 +167,7 @@ class PiecewiseLinear:
         raise CircuitError(f"nothing brings {', '.join(names)} to rest: no piece of its limits holds a rest")
 
     def _rest_within(self, pieces: NDArray[np.intp], levels_v: Matrix) -> tuple[Rest, Matrix]:
-        """The rest, and w there, were every kink the line of that piece everywhere."""
+        """Rest and its w if every kink were the line of its piece everywhere."""
         states, kinks = len(self.states), range(len(self.kinks))
         slopes = np.array([self.kinks[k].slopes[pieces[k]] for k in kinks])
         intercepts = np.array([self.kinks[k].intercepts[pieces[k]] for k in kinks])

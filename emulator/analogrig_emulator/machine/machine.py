@@ -1,13 +1,13 @@
-"""The analogue computer as it is operated: its modes, its pots, and its overload lamps.
+"""Operation of the analogue computer: modes, pots and overload lamps.
 
-    POT SET            integrators as in INITIAL CONDITION, and every amplifier's inputs lifted off its junction onto
-                       ground, so that pots keep their loads; a pot's top is put on the reference to read it
+    POT SET            integrators as in INITIAL CONDITION; every amplifier's inputs on ground instead of the junction,
+                       so that pots keep their loads; a pot is read with its top on the reference
     INITIAL CONDITION  integrators charge to their initial voltages
-    HOLD               integrators' inputs lie on ground and not on the junction: the capacitors keep what they have
+    HOLD               integrators' inputs on ground instead of the junction: capacitors keep their voltages
     OPERATE            the circuit as patched
 
-A mode is the circuit with its relays in another position, solved by nodal analysis like any other; capacitors and
-op-amps have the same states in all of them and carry them over. Relays switch at any tick, in no time and without
+A mode is the circuit with its relays in another position, solved by nodal analysis like any other. Capacitors and
+op-amps keep their states across modes. Relays switch at any tick, in no time and without
 bounce.
 """
 
@@ -39,32 +39,32 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.components import NOMINAL, Components, contact_of, is_part_of
 from analogrig_emulator.circuit.nodal import Nodal
-from analogrig_emulator.circuit.pot import END_FRACTION, checked_dial, checked_ramp
+from analogrig_emulator.circuit.pot import END_FRACTION, check_dial, check_ramp
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, Kink, PiecewiseLinear
 from analogrig_emulator.errors import CircuitError, EmulatorError, EngineError, ModeError, PotError
 from analogrig_emulator.machine.patching import Patch, patches
 
 REFERENCE_V = 10.0
-"""The machine's reference, on which a pot's top lies while its coefficient is read."""
+"""Reference voltage at a pot's top while its coefficient is read."""
 
 LAMP_DELAY_S = 10e-6
-"""How long an amplifier must have lost its virtual ground before its lamp lights."""
+"""Time without virtual ground after which an amplifier's lamp lights, in s."""
 
 _AT_ONCE_OHM = 10e3
 _BISECTIONS = 53
 
 _SLOW_PER_SAMPLE = 5e-5
-"""A dial that turns by so much a sample may stand still from one sample to the next."""
+"""Dial speed per sample below which one piece per sample suffices."""
 
 _MOST_PIECES = 64
 
 _READING_TOLERANCE = 2 * END_FRACTION
-"""The end stops leave so much of the track."""
+"""Largest error of a coefficient, from the track left at the end stops."""
 
 
 class Mode(enum.Enum):
-    """In which position the relays are."""
+    """Position of the relays."""
 
     POT_SET = "POT SET"
     INITIAL_CONDITION = "INITIAL CONDITION"
@@ -73,7 +73,7 @@ class Mode(enum.Enum):
 
 
 RelaySwitch = tuple[int, Mode]
-"""(tick, mode): the relays switch at that tick, after whatever sample or edge falls on it."""
+"""(tick, mode): the relays switch at that tick, after its sample and edges."""
 
 _FOLLOWERS: Mapping[Mode, frozenset[Mode]] = MappingProxyType(
     {
@@ -86,22 +86,20 @@ _FOLLOWERS: Mapping[Mode, frozenset[Mode]] = MappingProxyType(
 
 
 class AnalogComputer:
-    """A machine with a circuit patched on it.
+    """Machine with a circuit patched on it. It begins in INITIAL CONDITION, before sample 0.
 
-    readings: the nodes that run() records. initial_v: which amplifiers are integrators, each with the output voltage
-    to which INITIAL CONDITION charges it. ic_ohm: the resistors through which it does, one from the reference and one
-    across the capacitor, with the time constant ic_ohm C; None charges at once: on entering INITIAL CONDITION all
-    that would settle has settled. The machine begins in INITIAL CONDITION, its capacitors empty (or, with None,
-    charged), before sample 0.
+    readings: nodes that run() records. initial_v: output voltage of each integrator (an amplifier) to which INITIAL
+    CONDITION charges it. ic_ohm: charging resistors, one from the reference and one across the capacitor, with time
+    constant ic_ohm C and empty capacitors at the start; None charges at once.
 
     An amplifier's overload lamp lights when its output has been unable to follow, at its swing or at its slew rate,
     for lamp_delay_s without a break: then its junction is off virtual ground, by more than slew / (2 pi GBW) (0.7 V
     for a TL07x). Amplifiers without such limits have a lamp that stays dark.
 
-    components: with which the circuit was fitted; they say where wipers come to rest, and how they sound on the way.
+    components: those fitted to the circuit; they determine resting places and noise of wipers.
 
-    Raises CircuitError for errors of patching, a reading that is no node and an integrator that is none, EngineError
-    for a rate or a delay that cannot be.
+    Raises CircuitError for errors of patching, an unknown reading or an amplifier that is no integrator, EngineError
+    for a rate or delay out of range.
     """
 
     def __init__(
@@ -121,7 +119,7 @@ class AnalogComputer:
             raise EngineError(f"sample_rate_hz must be positive and finite, got {sample_rate_hz!r}")
         if not 0 <= lamp_delay_s < math.inf:
             raise EngineError(f"lamp_delay_s must be finite and not negative, got {lamp_delay_s!r}")
-        # First, for it refuses a circuit that is too large at once.
+        # First: it rejects a circuit that is too large at once.
         self._nodals = {Mode.OPERATE: Nodal(circuit)}
         if missing := [node for node in readings if node not in circuit.nodes]:
             raise CircuitError(f"readings: no node is called {missing[0]!r}; there are {', '.join(circuit.nodes)}")
@@ -139,42 +137,42 @@ class AnalogComputer:
         self._check_integrators(self._initial_v)
         self.restart()
 
-    # ---- what it shows
+    # ---- state
 
     @property
     def mode(self) -> Mode:
-        """The present mode."""
+        """Present mode."""
         return self._mode
 
     @property
     def circuit(self) -> Circuit:
-        """The circuit as patched, its pots and switches as they are set now."""
-        return self._as_set(self._patched)
+        """Circuit as patched, with the present pots and switches."""
+        return self._with_settings(self._patched)
 
     @property
     def wiring(self) -> Circuit:
-        """The circuit with the relays, pots and switches as they stand now; to_spice writes it as any other."""
-        return self._as_set(self._wired(self._mode))
+        """Circuit with the present relays, pots and switches, for to_spice for instance."""
+        return self._with_settings(self._circuit_in(self._mode))
 
-    def _as_set(self, circuit: Circuit) -> Circuit:
+    def _with_settings(self, circuit: Circuit) -> Circuit:
         circuit = circuit.with_dials(self._dials)
         return circuit.with_switches(self._closed) if self._closed else circuit
 
     @property
     def dials(self) -> dict[str, float]:
-        """Where the pots stand, 0..1."""
+        """Dials of the pots, 0..1."""
         return {pot: self._dials[pot] for pot in self._wipers.pots}
 
     @property
     def recorded(self) -> int:
-        """Samples recorded since the last restart."""
+        """Number of samples recorded since the last restart."""
         return self._engine.recorded
 
     @property
     def lamps(self) -> dict[str, int | None]:
-        """For each amplifier the first sample that was taken with its overload lamp lit, None while it is dark."""
+        """First sample by amplifier with its overload lamp lit, None while it is dark."""
         amplifiers = [amp.name for amp in self._patched.of(OpAmp)]
-        return lit(amplifiers, self._system.kinks, self._engine.overdue_ticks)
+        return lamp_samples(amplifiers, self._system.kinks, self._engine.overdue_ticks)
 
     @property
     def lamp_delay_ticks(self) -> int:
@@ -182,11 +180,11 @@ class AnalogComputer:
         return self._lamp_delay_ticks
 
     def clear_lamps(self) -> None:
-        """Puts the lamps out. One whose amplifier is still overloaded lights again after its delay."""
+        """Put the lamps out. The lamp of an amplifier still overloaded lights again after its delay."""
         self._engine.watch(self._lamp_delay_ticks)
 
     def read(self) -> dict[str, float]:
-        """The voltage of every node of the circuit at the present instant, in any mode."""
+        """Voltage of every node at the present instant, in any mode."""
         nodes = self._patched.nodes
         probe = Engine(self._system, nodes, self._sample_rate_hz)
         probe.state = self._engine.state
@@ -196,18 +194,16 @@ class AnalogComputer:
     # ---- pots
 
     def turn(self, dials: Mapping[str, float], ramp_n: int = 0) -> None:
-        """Turns pots to these dials, in any mode; a running machine keeps its voltages.
+        """Turn pots to these dials, in any mode; a running machine keeps its voltages.
 
-        With ramp_n they turn evenly while run() plays on, and arrive ramp_n samples after the last one taken (sample 0
-        when there is none yet). Wipers rest on the nearest winding, on the way too. A pot that is turned again goes on
-        from where it is.
-        Raises PotError for a dial off its track, a pot that is not there or a ramp of no whole number of samples, and
-        EngineError for a circuit that the engine refuses (a machine that has not been played yet: run() does); nothing
-        is turned then.
+        With ramp_n they turn evenly during run(), and arrive ramp_n samples after the last one taken, or sample 0.
+        Wipers rest on the nearest winding, also during a ramp. A pot turned again starts from its present dial.
+        Raises PotError for a dial off its track, an unknown pot or a ramp_n that is no integer, and EngineError for a
+        circuit that the engine rejects (before the first run(), that raises instead). No pot is turned then.
         """
         goals = self.resting(dials)
-        checked_ramp(ramp_n, dials)
-        with self._changing():
+        check_ramp(ramp_n, dials)
+        with self._all_or_nothing():
             for pot in goals:
                 self._turns.pop(pot, None)
             if ramp_n:
@@ -222,10 +218,10 @@ class AnalogComputer:
             self._dials |= self._wipers.contacts_at_rest(goals)
 
     def resting(self, dials: Mapping[str, float]) -> dict[str, float]:
-        """Where the wipers come to rest when pots are turned to these dials. Raises PotError, as turn does."""
+        """Dials at which wipers rest when pots are turned to these dials. Raises PotError like turn()."""
         for pot, dial in dials.items():
             self._check_pot(pot)
-            checked_dial(dial, pot)
+            check_dial(dial, pot)
         return {pot: self._wipers.resting(pot, dial) for pot, dial in dials.items()}
 
     def _check_pot(self, pot: str) -> None:
@@ -233,23 +229,23 @@ class AnalogComputer:
             raise PotError(f"no pot is called {pot!r}; there are {', '.join(sorted(self._wipers.pots)) or 'none'}")
 
     def throw(self, closed: Mapping[str, bool]) -> None:
-        """Throws switches of the circuit, in any mode.
+        """Throw switches of the circuit, in any mode.
 
-        Raises CircuitError for one that is not there, EngineError as turn() does; nothing is thrown then.
+        Raises CircuitError for an unknown switch, EngineError like turn(). No switch is thrown then.
         """
         self._patched.with_switches(closed)
-        with self._changing():
+        with self._all_or_nothing():
             self._closed |= closed
 
     def coefficient(self, pot: str) -> float:
-        """Reads a pot in POT SET: the voltage of its wiper, under load, with its top on the reference, per reference.
+        """Coefficient of a pot in POT SET: wiper voltage under load with the top on the reference, per reference.
 
-        Raises ModeError in another mode, PotError for a pot that is not there.
+        Raises ModeError in another mode, PotError for an unknown pot.
         """
         return self._reading(self._pot_on_reference(pot), pot, self._dials[pot])
 
     def set_coefficient(self, pot: str, coefficient: float) -> None:
-        """Turns a pot in POT SET until coefficient() reads so, to the nearest winding.
+        """Turn a pot in POT SET until coefficient() reads the value, to the nearest winding.
 
         Raises ModeError, and PotError beyond the track.
         """
@@ -266,9 +262,9 @@ class AnalogComputer:
     # ---- operation
 
     def restart(self, mode: Mode = Mode.INITIAL_CONDITION) -> None:
-        """Power off and on: empty capacitors, inputs at 0 V, dark lamps, the clock before sample 0; in that mode.
+        """Restart in a mode: empty capacitors, inputs at 0 V, dark lamps, clock before sample 0.
 
-        The pots and the initial voltages stay as they are set; a pot on its way stays where it is.
+        Pots and initial voltages stay; a ramp stops at its present dial.
         """
         self._mode = mode
         self._dials |= self._wipers.contacts_at_rest(self._turns)
@@ -278,40 +274,40 @@ class AnalogComputer:
         self._solved: PiecewiseLinear | None = None
 
     def set_initial(self, initial_v: Mapping[str, float]) -> None:
-        """Sets the output voltages to which INITIAL CONDITION charges integrators.
+        """Set the output voltages to which INITIAL CONDITION charges integrators.
 
-        Raises CircuitError and, as turn() does, EngineError; nothing is set then.
+        Raises CircuitError and, like turn(), EngineError. No voltage is set then.
         """
         wanted = self._initial_v | dict(initial_v)
         if wanted.keys() != self._initial_v.keys():
             strangers = ", ".join(sorted(wanted.keys() - self._initial_v.keys()))
             raise CircuitError(f"{strangers}: no such integrator; there are {', '.join(self._initial_v) or 'none'}")
         self._check_integrators(wanted)
-        with self._changing(charged=self._powered):
+        with self._all_or_nothing(charged=self._powered):
             self._initial_v = wanted
             self._nodals = {mode: nodal for mode, nodal in self._nodals.items() if mode in (Mode.HOLD, Mode.OPERATE)}
 
     def switch(self, mode: Mode) -> None:
-        """Switches at the present instant. The present mode again changes nothing.
+        """Switch to a mode at the present instant. The present mode changes nothing.
 
-        Raises ModeError, and EngineError or CircuitError for a circuit that cannot be in that mode; the machine stays
-        in its mode then.
+        Raises ModeError, and EngineError or CircuitError for a circuit without a solution in that mode. The machine
+        stays in its mode then.
         """
         self._check_switches([mode])
         self._enter(mode)
 
     def window(self, samples: int) -> tuple[int, int]:
-        """The ticks (start, stop) of the edges and switches that run(samples) takes next: start <= tick < stop."""
+        """Range of ticks (start, stop) of edges and switches that run(samples) accepts: start <= tick < stop."""
         return self._engine.window(samples)
 
     def run(
         self, samples: int, edges: Mapping[str, Edges] | None = None, switches: Sequence[RelaySwitch] = ()
     ) -> NDArray[np.float64]:
-        """Records the next samples: float64 (samples, readings), V.
+        """Record the next samples: float64 (samples, readings), V.
 
-        edges: by input, within window(samples). switches: in order of time, from the present instant to the last of
-        the run; one at the instant of a sample comes right after that sample. There are none while a pot is turning.
-        Raises ModeError and EngineError, the former before anything is played.
+        edges: by input, within window(samples). switches: in time order, from the present instant to the last of the
+        run, none during a ramp; a switch at the instant of a sample comes right after that sample.
+        Raises ModeError before anything is played, and EngineError.
         """
         edges = edges or {}
         self._check_switches([mode for _, mode in switches])
@@ -323,21 +319,21 @@ class AnalogComputer:
         self._check_instants(samples, [tick for tick, _ in switches])
         volts = []
         stop = self.recorded + samples
-        for (tick, mode), taken in zip(switches, _portions(edges, [tick for tick, _ in switches]), strict=False):
+        for (tick, mode), taken in zip(switches, _split_at(edges, [tick for tick, _ in switches]), strict=False):
             volts.append(self._play_to(tick, taken))
             self._enter(mode)
-        rest = _after(edges, switches[-1][0]) if switches else edges
+        rest = _edges_after(edges, switches[-1][0]) if switches else edges
         volts.append(self._play(stop - self.recorded, rest))
         return volts[0] if len(volts) == 1 else np.concatenate(volts)
 
     def repeat(
         self, cycles: int, initial_ticks: int, operate_ticks: int, edges: Mapping[str, Edges] | None = None
     ) -> NDArray[np.float64]:
-        """Repetitive operation: INITIAL CONDITION and OPERATE by turns; float64 (cycles, samples, readings), V.
+        """Alternate INITIAL CONDITION and OPERATE (repetitive operation): float64 (cycles, samples, readings), V.
 
-        A cycle begins right after a sample (sample 0 is taken first when there is none yet) and must last a whole
-        number of samples; edges: by input, at ticks counted from the beginning of each cycle. With ic_ohm None, and
-        inputs that begin each cycle at the same level, all cycles are equal bit for bit.
+        A cycle begins right after a sample, sample 0 if none is taken yet, and lasts a whole number of samples.
+        edges: by input, at ticks from the beginning of each cycle. With ic_ohm None and inputs that begin each cycle at
+        the same level, all cycles are equal to the bit.
         Raises ModeError and EngineError.
         """
         period = initial_ticks + operate_ticks
@@ -358,7 +354,7 @@ class AnalogComputer:
 
     @property
     def _engine(self) -> Engine:
-        """Made when it is first needed after a restart: most machines have their pots set before they are played."""
+        """Engine, made on first use after a restart: most machines have their pots set before they are played."""
         if self._powered is None:
             self._powered = Engine(self._system, self._readings, self._sample_rate_hz)
             self._powered.watch(self._lamp_delay_ticks)
@@ -367,27 +363,27 @@ class AnalogComputer:
 
     @property
     def _system(self) -> PiecewiseLinear:
-        """The state space of the present mode, the pots as they are set now."""
+        """State space of the present mode and pots."""
         if self._solved is None:
             self._solved = self._nodal.at(self._dials, self._closed)
         return self._solved
 
     @property
     def _nodal(self) -> Nodal:
-        """Of the present mode, at any setting of the pots."""
+        """Nodal analysis of the present mode."""
         nodal = self._nodals.get(self._mode)
         if nodal is None:
-            nodal = self._nodals[self._mode] = Nodal(self._wired(self._mode))
+            nodal = self._nodals[self._mode] = Nodal(self._circuit_in(self._mode))
         return nodal
 
     def _play_to(self, tick: int, edges: Mapping[str, Edges]) -> NDArray[np.float64]:
-        """Records what samples there are up to a tick, and goes there."""
+        """Record the samples up to a tick and go there."""
         samples = max(tick // TICKS_PER_SAMPLE + 1 - self.recorded, 0)
         if not samples:
             volts, later = np.empty((0, len(self._readings))), edges
         else:
             at_last = (self.recorded + samples - 1) * TICKS_PER_SAMPLE
-            volts, later = self._play(samples, _until(edges, at_last)), _after(edges, at_last)
+            volts, later = self._play(samples, _edges_until(edges, at_last)), _edges_after(edges, at_last)
         self._engine.advance(tick, later)
         self._note_levels(later)
         return volts
@@ -396,28 +392,30 @@ class AnalogComputer:
         if not (self._turns and samples):
             volts = self._engine.run(samples, edges)
         else:
-            volts = np.concatenate(list(self._turned(self.recorded + samples, edges)))
+            volts = np.concatenate(list(self._run_ramps(self.recorded + samples, edges)))
         self._note_levels(edges)
         return volts
 
-    def _turned(self, stop: int, edges: Mapping[str, Edges]) -> Iterator[NDArray[np.float64]]:
-        """Records samples up to stop, in stretches in which the same pots are being turned."""
+    def _run_ramps(self, stop: int, edges: Mapping[str, Edges]) -> Iterator[NDArray[np.float64]]:
+        """Record samples up to stop, in stretches with the same pots turning."""
         while self._turns and self.recorded < stop:
             last = min(stop - 1, *(turn.last for turn in self._turns.values()))
             pieces = max(turn.pieces for turn in self._turns.values())
             until = last * TICKS_PER_SAMPLE
-            yield self._engine.run_turning(last + 1 - self.recorded, self._while_turning, _until(edges, until), pieces)
-            edges = _after(edges, until)
+            yield self._engine.run_turning(
+                last + 1 - self.recorded, self._system_during_ramps, _edges_until(edges, until), pieces
+            )
+            edges = _edges_after(edges, until)
             self._dials |= self._dials_at(last)
             self._turns = {pot: turn for pot, turn in self._turns.items() if turn.last > last}
-            self._changed()
+            self._update_system()
         yield self._engine.run(stop - self.recorded, edges)
 
-    def _while_turning(self, sample: float) -> PiecewiseLinear:
+    def _system_during_ramps(self, sample: float) -> PiecewiseLinear:
         return self._nodal.at(self._dials | self._dials_at(sample), self._closed)
 
     def _dials_at(self, sample: float) -> dict[str, float]:
-        """The pots on their way, and the contacts of their wipers."""
+        """Dials of the turning pots and of their contacts."""
         dials: dict[str, float] = {}
         for pot, turn in self._turns.items():
             dials[pot] = self._wipers.resting(pot, turn.at(sample))
@@ -444,24 +442,24 @@ class AnalogComputer:
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self._mode:
-            with self._changing(charged=self._engine):
+            with self._all_or_nothing(charged=self._engine):
                 self._mode = mode
 
     @contextlib.contextmanager
-    def _changing(self, charged: Engine | None = None) -> Iterator[None]:
-        """Relays, pots, switches or initial voltages get another position within; all or, when it is refused, none."""
+    def _all_or_nothing(self, charged: Engine | None = None) -> Iterator[None]:
+        """Apply the changes made in the body to the engine, or undo them if they raise EmulatorError."""
         before = self._position
         try:
             yield
-            self._changed()
+            self._update_system()
             if charged is not None:
                 self._charge_at_once(charged)
         except EmulatorError:
             self._position = before
-            self._changed()
+            self._update_system()
             raise
 
-    def _changed(self) -> None:
+    def _update_system(self) -> None:
         self._solved = None
         if self._powered is not None:
             self._powered.set_system(self._system)
@@ -480,20 +478,20 @@ class AnalogComputer:
             levels_v = [self._levels_v[name] for name in self._system.inputs]
             engine.state = self._system.rest(np.array(levels_v)).state
 
-    def _wired(self, mode: Mode) -> Circuit:
-        """The circuit with the relays in the position of a mode."""
+    def _circuit_in(self, mode: Mode) -> Circuit:
+        """Circuit with the relays in the position of a mode."""
         if mode is Mode.OPERATE:
             return self._patched
         lifted = self._patches if mode is Mode.POT_SET else self._initial_v
         elements = list(self._patched.elements)
         for amplifier in lifted:
-            elements = [_lifted(element, self._patches[amplifier]) for element in elements]
+            elements = [_lift_inputs(element, self._patches[amplifier]) for element in elements]
         if mode is not Mode.HOLD:
-            elements += [part for name in self._initial_v for part in self._charging(self._patches[name])]
+            elements += [part for name in self._initial_v for part in self._charging_circuit(self._patches[name])]
         return Circuit(elements)
 
-    def _charging(self, patch: Patch) -> list[Element]:
-        """The relays' charging circuit of one integrator: an inverter of gain 1 with the capacitor across it."""
+    def _charging_circuit(self, patch: Patch) -> list[Element]:
+        """Charging circuit of one integrator: an inverter of gain 1 with the capacitor across it."""
         name, node, ohm = f"IC_{patch.amplifier}", f"ic_{patch.amplifier}", self._ic_ohm or _AT_ONCE_OHM
         return [
             VoltageSource(name, node, dc_v=-self._initial_v[patch.amplifier]),
@@ -517,10 +515,10 @@ class AnalogComputer:
                 raise CircuitError(
                     f"integrator {name}: initial voltage {volts:g} V is beyond the reference of {REFERENCE_V:g} V"
                 )
-        self._check_forgotten(initial_v)
+        self._check_uncharged(initial_v)
 
-    def _check_forgotten(self, initial_v: Mapping[str, float]) -> None:
-        """An amplifier that only a capacitor feeds back drifts into its limit unless INITIAL CONDITION charges it."""
+    def _check_uncharged(self, initial_v: Mapping[str, float]) -> None:
+        """Raise CircuitError for an integrator without initial voltage: it would drift into its limit."""
         ends = [frozenset(part.nodes) for part in self._patched.elements if not isinstance(part, Capacitor | OpAmp)]
         for amp in self._patched.of(OpAmp):
             patch = self._patches[amp.name]
@@ -536,13 +534,13 @@ class AnalogComputer:
         self._check_pot(pot)
         pot_top = self._terminal(pot, "top")
         elements = [
-            _moved(element, pot_top, "reference") if element.name == pot or is_part_of(element, pot) else element
-            for element in self._wired(Mode.POT_SET).elements
+            _move_ends(element, pot_top, "reference") if element.name == pot or is_part_of(element, pot) else element
+            for element in self._circuit_in(Mode.POT_SET).elements
         ]
         return Nodal(Circuit([*elements, VoltageSource("reference", "reference", dc_v=REFERENCE_V)]))
 
     def _terminal(self, pot: str, end: str) -> str:
-        """The node at which that end of a pot is patched: where what fitted() put there meets anything else."""
+        """Node at which an end of a pot is patched: where the parts added by fit() meet other elements."""
         own = [element for element in self._patched.elements if element.name == pot or is_part_of(element, pot)]
         parts = [bond for element in own if element.name != pot for bond in element.bonds]
         patched = {
@@ -561,8 +559,10 @@ class AnalogComputer:
         return system.rest(levels_v).volts[self._terminal(pot, "wiper")] / REFERENCE_V
 
 
-def lit(amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray[np.int64]) -> dict[str, int | None]:
-    """AnalogComputer.lamps, from what the engine saw of each kink."""
+def lamp_samples(
+    amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray[np.int64]
+) -> dict[str, int | None]:
+    """Value of AnalogComputer.lamps, from the overdue ticks of each kink."""
     lamps: dict[str, int | None] = dict.fromkeys(amplifiers)
     for kink, tick in zip(kinks, overdue_ticks.tolist(), strict=True):
         if tick >= 0 and kink.element in lamps:
@@ -573,7 +573,7 @@ def lit(amplifiers: Iterable[str], kinks: Iterable[Kink], overdue_ticks: NDArray
 
 @dataclass(frozen=True)
 class _Ramp:
-    """A pot on its way, evenly, from one dial at sample `first` to another at sample `last`."""
+    """Even motion of a pot from one dial at sample `first` to another at sample `last`."""
 
     start: float
     goal: float
@@ -581,20 +581,20 @@ class _Ramp:
     last: int
 
     def at(self, sample: float) -> float:
-        """The dial."""
+        """Dial at a sample, which may be a fraction."""
         if sample >= self.last:
             return self.goal
         return self.start + (self.goal - self.start) * max(sample - self.first, 0.0) / (self.last - self.first)
 
     @property
     def pieces(self) -> int:
-        """Into how many pieces of standing dials a sample is cut: the error goes with speed / pieces^2."""
+        """Number of pieces with constant dials per sample; the error goes with speed / pieces^2."""
         speed_per_sample = abs(self.goal - self.start) / (self.last - self.first)
         return min(max(math.ceil(math.sqrt(speed_per_sample / _SLOW_PER_SAMPLE)), 1), _MOST_PIECES)
 
 
 class _Position(NamedTuple):
-    """All that decides which circuit the machine is."""
+    """State that determines the circuit of the machine."""
 
     mode: Mode
     nodals: dict[Mode, Nodal]
@@ -605,7 +605,7 @@ class _Position(NamedTuple):
 
 
 class _Wipers:
-    """What the wipers of a circuit's pots do: where they rest, and what their contacts do on the way."""
+    """Wipers of a circuit's pots: resting places, and noise of the contacts."""
 
     def __init__(self, circuit: Circuit, components: Components) -> None:
         names = [pot.name for pot in circuit.of(Pot)]
@@ -616,44 +616,44 @@ class _Wipers:
         self._contacts = {pot.name: components.contact(pot) for pot in circuit.of(Pot) if contact_of(pot.name) in names}
 
     def resting(self, pot: str, dial: float) -> float:
-        """On the nearest winding."""
+        """Dial of the nearest winding."""
         return self.pots[pot].resting(dial)
 
     def contacts_at_rest(self, pots: Iterable[str]) -> dict[str, float]:
-        """The dials of the contacts of these pots while their wipers stand: no resistance."""
+        """Dials of the contacts of resting wipers: no resistance."""
         return {contact_of(pot): 1.0 for pot in pots if pot in self._contacts}
 
     def contacts_moving(self, pot: str, dial: float) -> dict[str, float]:
-        """The dial of the contact while the wiper passes there."""
+        """Dial of the contact while the wiper passes a dial."""
         if pot not in self._contacts:
             return {}
         places = self._contacts[pot]
         return {contact_of(pot): 1.0 - float(places[round(dial * (len(places) - 1))])}
 
 
-def _lifted(element: Element, patch: Patch) -> Element:
-    """An input of an amplifier with its end at the junction put on ground."""
-    return _moved(element, patch.junction, GROUND) if element.name in patch.inputs else element
+def _lift_inputs(element: Element, patch: Patch) -> Element:
+    """Element with its end at the junction moved to ground, if it is an input of the patch."""
+    return _move_ends(element, patch.junction, GROUND) if element.name in patch.inputs else element
 
 
-def _moved(element: Element, node: str, to: str) -> Element:
-    """The element with its ends at one node moved to another."""
+def _move_ends(element: Element, node: str, to: str) -> Element:
+    """Element with its ends at one node moved to another."""
     ends: dict[str, Any] = {
         field.name: to for field in fields(element) if field.name != "name" and getattr(element, field.name) == node
     }
     return replace(element, **ends)
 
 
-def _portions(edges: Mapping[str, Edges], ticks: Sequence[int]) -> Iterator[Mapping[str, Edges]]:
-    """The edges up to the first of the ticks, from there up to the second, and so on."""
+def _split_at(edges: Mapping[str, Edges], ticks: Sequence[int]) -> Iterator[Mapping[str, Edges]]:
+    """Edges up to the first tick, from there up to the second, and so on."""
     for tick in ticks:
-        yield _until(edges, tick)
-        edges = _after(edges, tick)
+        yield _edges_until(edges, tick)
+        edges = _edges_after(edges, tick)
 
 
-def _until(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
+def _edges_until(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
     return {name: train.until(tick) for name, train in edges.items()}
 
 
-def _after(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
+def _edges_after(edges: Mapping[str, Edges], tick: int) -> dict[str, Edges]:
     return {name: train.after(tick) for name, train in edges.items()}

@@ -1,16 +1,15 @@
 """Thermal noise of the resistors and input noise of the op-amps, exact at the samples.
 
-The noise is small, so it is the solution of the linear circuit driven by white sources alone (no amplifier at a limit
-and no diode limiter conducting, also while they are: a bump stop that is reached does not change its noise), and adds
-to what the engine plays. With dx = A x dt + B dw, one sample period T takes the noise x to
+The noise is small: it is the solution of the linear circuit with white sources, and adds to the engine's voltages.
+No amplifier limits and no diode limiter conducts in that circuit, so a bump stop does not change the noise.
+With dx = A x dt + B dw, one sample period T takes the noise x to
 
     Phi x + w,   Phi = exp(A T),   cov(w) = integral over 0..T of exp(A s) B B' exp(A' s) ds
 
 both by doubling a short step (engine/noise.c). Sources (two-sided densities): 2 k T / R across each resistor and each
-leg of a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. What reaches an output
-without passing a state is left out: a resistor's noise divided down by an output resistance, white without bound in
-this model, some nV per root Hz in a real one. Elementwise arithmetic only, so a seed has the same bits on every
-machine.
+leg of a pot, en^2 / 2 in series with the + input of an op-amp, in^2 / 2 into each of its inputs. Noise that reaches an
+output without passing a state is omitted: white without bound in this model, some nV per root Hz in reality.
+Elementwise arithmetic only, so a seed has the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ Matrix = NDArray[np.float64]
 
 
 class CircuitNoise:
-    """The noise of a circuit's nodes at the samples; it starts at none.
+    """Noise of a circuit's nodes at the samples, from zero.
 
-    outputs: nodes; op_amps: whose noise_v_per_rthz and noise_a_per_rthz every op-amp has; temperature_c: of the
-    resistors. Raises CircuitError for a node that is not there or a circuit that is singular.
+    outputs: nodes; op_amps: grade with noise_v_per_rthz and noise_a_per_rthz of every op-amp; temperature_c:
+    temperature of the resistors. Raises CircuitError for an unknown node or a singular circuit.
     """
 
     def __init__(
@@ -72,16 +71,16 @@ class CircuitNoise:
         self._x = np.zeros(len(self.transition))
 
     def turn(self, dials: Mapping[str, float]) -> None:
-        """Goes on with the pots named in dials turned there."""
+        """Turn pots to dials."""
         self._dials |= dials
         system = self._nodal.at(self._dials)
-        a = _linear(system)
+        a = _linear_matrix(system)
         drives = self._drives(self._nodal.disturbances(self._dials))
-        self.transition, self.covariance, self._factor = _gathered(a, _product(drives.T, drives), self._period_s)
+        self.transition, self.covariance, self._factor = _propagate(a, _product(drives.T, drives), self._period_s)
         self._reading = np.ascontiguousarray(system.readings(self._outputs)[:, : len(a)])
 
     def volts(self, samples: int, rng: np.random.Generator) -> Matrix:
-        """The noise at the next samples, (samples, outputs), in V. Cutting a run into blocks changes no bit."""
+        """Noise at the next samples: (samples, outputs), V. Cutting a run into blocks changes no bit."""
         normal = rng.standard_normal((samples, len(self._x)))
         volts = np.empty((samples, len(self._reading)))
         matrices = (self.transition, self._factor, self._reading, normal, self._x, volts)
@@ -90,19 +89,19 @@ class CircuitNoise:
         return volts
 
     def _drives(self, response: Mapping[str, Matrix]) -> Matrix:
-        """What each source adds to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
+        """Contribution of each source to dx/dt, in V/s per root of its two-sided density: (sources, n)."""
         legs_of_pots = [legs_ohm(self._dials[name], track_ohm) for name, track_ohm in self._tracks_ohm]
         ohm = np.array([*self._fixed_ohm, *itertools.chain.from_iterable(legs_of_pots)])
-        thermal = _of(response, self._from) - _of(response, self._to)
+        thermal = _rows_of(response, self._from) - _rows_of(response, self._to)
         thermal *= np.sqrt(2 * BOLTZMANN_J_PER_K * self._temperature_k / ohm)[:, None]
-        voltages = _of(response, [amp.name for amp in self._amps]) * (self._op_amps.noise_v_per_rthz / _ROOT_TWO)
+        voltages = _rows_of(response, [amp.name for amp in self._amps]) * (self._op_amps.noise_v_per_rthz / _ROOT_TWO)
         inputs = [node for amp in self._amps for node in (amp.plus, amp.minus)]
-        currents = _of(response, inputs) * (self._op_amps.noise_a_per_rthz / _ROOT_TWO)
+        currents = _rows_of(response, inputs) * (self._op_amps.noise_a_per_rthz / _ROOT_TWO)
         return np.concatenate((thermal, voltages, currents))
 
 
 class NoisySuspension:
-    """A SuspensionComputer with the noise of its resistors and op-amps added to every voltage that it plays."""
+    """SuspensionComputer whose voltages include the noise of its resistors and op-amps."""
 
     def __init__(
         self,
@@ -119,7 +118,7 @@ class NoisySuspension:
 
     @property
     def sample_rate_hz(self) -> float:
-        """The computer's."""
+        """Sample rate of the computer."""
         return self._computer.sample_rate_hz
 
     def play(
@@ -129,9 +128,9 @@ class NoisySuspension:
         changes: Sequence[PotChange] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[Matrix]:
-        """As SuspensionComputer.play; set() between two blocks does not reach the noise, a ramp when it has ended."""
+        """Play like SuspensionComputer.play. The noise ignores set() between blocks, and follows a ramp at its end."""
         computer = self._computer
-        turns = [(turn.sample + 1 + turn.ramp_n, turn.values) for turn in computer.planned(changes, samples)]
+        turns = [(turn.sample + 1 + turn.ramp_n, turn.values) for turn in computer.plan(changes, samples)]
         turns.sort(key=lambda turn: turn[0])
         noise = CircuitNoise(
             computer.circuit,
@@ -158,20 +157,20 @@ class NoisySuspension:
             yield block
 
 
-def _of(response: Mapping[str, Matrix], names: Sequence[str]) -> Matrix:
-    """One row a name: (names, n)."""
+def _rows_of(response: Mapping[str, Matrix], names: Sequence[str]) -> Matrix:
+    """Rows by name: (names, n)."""
     return np.array([response[name] for name in names]).reshape(len(names), len(response[GROUND]))
 
 
-def _linear(system: PiecewiseLinear) -> Matrix:
-    """A when no amplifier is at a limit and no diode limiter conducts: (n, n)."""
+def _linear_matrix(system: PiecewiseLinear) -> Matrix:
+    """Matrix A without active limits: (n, n)."""
     slopes = np.array([kink.slopes[1] for kink in system.kinks])
     n = len(system.states)
     return system.abc[:, :n] + _product(system.g * slopes, system.cde[:, :n])
 
 
-def _gathered(a: Matrix, intensity: Matrix, period_s: float) -> tuple[Matrix, Matrix, Matrix]:
-    """exp(A T), the covariance gathered over T, and its Cholesky factor."""
+def _propagate(a: Matrix, intensity: Matrix, period_s: float) -> tuple[Matrix, Matrix, Matrix]:
+    """exp(A T), the covariance accumulated over T, and its Cholesky factor."""
     arrays = (np.ascontiguousarray(a), intensity, *(np.empty_like(intensity) for _ in range(3)))
     if not library.load().engine_noise_gather(len(a), period_s, *(array.ctypes.data for array in arrays)):
         raise CircuitError("the noise of this circuit has no bound: the circuit is unstable")

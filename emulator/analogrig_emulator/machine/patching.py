@@ -1,7 +1,7 @@
-"""What is wrong with a patch panel, and which cords lead into which amplifier.
+"""Checks of a patch panel, and the cords into each amplifier.
 
-A Circuit may be any netlist, a comparator and a lone RC ladder included. On an analogue computer every amplifier works
-with feedback on a summing junction, and every cord leads from an output to an input; what breaks that is refused here.
+A Circuit may be any netlist, including a comparator. On an analogue computer every amplifier has feedback on a summing
+junction, and every cord leads from an output to an input; this module rejects all else.
 """
 
 from __future__ import annotations
@@ -28,12 +28,11 @@ from analogrig_emulator.errors import CircuitError
 
 @dataclass(frozen=True)
 class Patch:
-    """How one amplifier is patched.
+    """Connections of one amplifier.
 
-    junction: the node of its inverting input; out: of its output; inputs: the names of the elements that bring current
-    to the junction from elsewhere, empty for a follower; capacitors: of those straight from junction to out. What else
-    is at the junction, a capacitor's leakage or an input capacitance, belongs to the amplifier, and so does all that
-    is_part_of says.
+    junction: node of its inverting input; out: node of its output; inputs: names of the elements that feed the
+    junction, empty for a follower; capacitors: names of those from junction to out. Other elements at the junction,
+    such as a leakage or those of is_part_of, belong to the amplifier.
     """
 
     amplifier: str
@@ -44,26 +43,26 @@ class Patch:
 
 
 def patches(circuit: Circuit) -> dict[str, Patch]:
-    """How each amplifier of the circuit is patched, by name.
+    """Patch of each amplifier of the circuit, by name.
 
     Raises CircuitError, naming the element and the node, for two outputs joined, a wiper or an end of an element left
     open, an amplifier without feedback of its own (a loop through other amplifiers does not count), and an input or an
-    amplifier that nothing feeds. (An amplifier's input left open is refused by Circuit already: its node floats.)
+    amplifier that nothing feeds. (Circuit already rejects an open amplifier input: its node floats.)
     """
     wires = tuple((type(element), element.name, element.nodes) for element in circuit.elements)
-    return dict(_patches(_Panel(wires, circuit)))
+    return dict(_patches(_Wiring(wires, circuit)))
 
 
 @dataclass(frozen=True)
-class _Panel:
-    """A circuit that counts as equal to one of the same wiring, whatever its component values."""
+class _Wiring:
+    """Circuit compared by its wiring alone, as a cache key."""
 
     wires: tuple[tuple[type, str, tuple[str, ...]], ...]
     circuit: Circuit = field(compare=False)
 
 
 @functools.lru_cache(maxsize=64)
-def _patches(panel: _Panel) -> dict[str, Patch]:
+def _patches(panel: _Wiring) -> dict[str, Patch]:
     circuit = panel.circuit
     drivers = _drivers(circuit)
     _check_ends(circuit)
@@ -78,7 +77,7 @@ def _patches(panel: _Panel) -> dict[str, Patch]:
 
 
 def _drivers(circuit: Circuit) -> set[str]:
-    """The nodes that an output holds."""
+    """Nodes driven by an output."""
     holder: dict[str, Element] = {}
     for element in circuit.elements:
         node = _output(element)
@@ -98,7 +97,7 @@ def _output(element: Element) -> str | None:
 
 
 def _check_ends(circuit: Circuit) -> None:
-    """Every node joins two ends at least; only an output may lead nowhere."""
+    """Raise CircuitError for a node with one end, unless that is an output."""
     ends = Counter(node for element in circuit.elements for node in element.nodes)
     for element in circuit.elements:
         for node in element.nodes:
@@ -115,7 +114,7 @@ def _open_end(element: Element, node: str) -> str:
 
 
 def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
-    """Cords and passive elements that hang together must lead to an output somewhere, or rest an input on ground."""
+    """Raise CircuitError for passive elements that neither reach an output nor ground an input."""
     junctions = {amp.minus for amp in circuit.of(OpAmp)}
     drivers = drivers | {node for source in circuit.of(CurrentSource) for node in source.nodes}
     rests = {amp.plus for amp in circuit.of(OpAmp)}
@@ -124,14 +123,14 @@ def _check_feeds(circuit: Circuit, drivers: set[str]) -> None:
         for node in element.nodes:
             if node in drivers | junctions | {GROUND}:
                 continue
-            reached = _reached(node, bonds, drivers | junctions | {GROUND})
+            reached = _reachable(node, bonds, drivers | junctions | {GROUND})
             if not reached & drivers and not (GROUND in reached and reached & rests):
                 raise CircuitError(f"{label(element)}: nothing feeds its node {node}")
 
 
 def _check_feedback(circuit: Circuit, amp: OpAmp, drivers: set[str]) -> None:
     bonds = [bond for element in circuit.elements for bond in _passive_bonds(element)]
-    if amp.minus != amp.out and amp.out not in _reached(amp.minus, bonds, drivers | {GROUND}):
+    if amp.minus != amp.out and amp.out not in _reachable(amp.minus, bonds, drivers | {GROUND}):
         raise CircuitError(f"{label(amp)}: no feedback leads from its output, node {amp.out}, to node {amp.minus}")
 
 
@@ -142,9 +141,9 @@ def _patch(circuit: Circuit, amp: OpAmp) -> Patch:
 
 
 def _inputs(circuit: Circuit, amp: OpAmp) -> Iterator[Element]:
-    """What is at the junction and leads elsewhere than, by a way of its own, to the amplifier's output."""
+    """Elements at the junction that also connect to something other than the amplifier's own output."""
     bonds = [bond for element in circuit.elements for bond in element.bonds]
-    elsewhere = _reached(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
+    elsewhere = _reachable(GROUND, bonds, {amp.minus, amp.out}) - {amp.minus, amp.out, GROUND}
     for element in circuit.elements:
         if isinstance(element, OpAmp | VoltageSource | Capacitor) or amp.minus not in element.nodes:
             continue
@@ -156,8 +155,8 @@ def _passive_bonds(element: Element) -> tuple[tuple[str, str], ...]:
     return () if isinstance(element, OpAmp | VoltageSource) else element.bonds
 
 
-def _reached(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:
-    """The nodes that bonds join to start, borders included but not passed."""
+def _reachable(start: str, bonds: list[tuple[str, str]], borders: set[str]) -> set[str]:
+    """Nodes that bonds join to start, up to and including borders."""
     reached, fresh = {start}, {start}
     while fresh:
         fresh = {node for bond in bonds if fresh.intersection(bond) for node in bond} - reached

@@ -1,4 +1,4 @@
-"""A program of the analogue computer: what is patched, what its voltages stand for, and what its pots show.
+"""Program of the analogue computer: wiring, scales and pots.
 
 Every program is three tables: its wiring (netlist), its scales (Scales: node, sign and full scale of each quantity) and
 its pots (Parameter: which pot shows a parameter, into which resistor, with which coefficient).
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig_emulator.circuit.circuit import Element
-from analogrig_emulator.circuit.opamp import OpAmpModel
+from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel
 from analogrig_emulator.errors import PotError
 
 CHANNELS = ("force", "displacement", "velocity", "net_force")
-"""What the card's four channels read, in order; quantities that every program has."""
+"""Quantities on the card's four channels, in order. Every program has them."""
 
 SOURCE = "F"
 """Name of every program's input, and its node is "in"."""
@@ -28,7 +28,7 @@ SOURCE = "F"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A row of the scaling table: node, sign there, and what 10 V stand for, in N, m or m/s."""
+    """Row of the scaling table: node, sign there, and full scale (10 V) in N, m or m/s."""
 
     node: str
     sign: float
@@ -37,13 +37,13 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Scales:
-    """The scaling table by quantity. time: how much faster the machine runs than what it models."""
+    """Scaling table by quantity. time: speed of the machine relative to the plant."""
 
     time: float
     quantities: Mapping[str, Quantity]
 
     def full(self, quantity: str) -> float:
-        """What 10 V stand for (N, m, m/s)."""
+        """Full scale of a quantity: value of 10 V in N, m or m/s."""
         return self.quantities[quantity].full
 
     def volts(self, quantity: str) -> float:
@@ -57,9 +57,9 @@ class Scales:
 
 @dataclass(frozen=True)
 class Parameter(ABC):
-    """A row of the table of pots.
+    """Row of the pot table.
 
-    pot: its name; load: the resistor that its wiper drives, the far end being at virtual ground; value: of the program.
+    pot: name; load: resistor from its wiper to a virtual ground; value: value in the program.
     """
 
     pot: str
@@ -68,12 +68,12 @@ class Parameter(ABC):
 
     @abstractmethod
     def coefficient(self, value: float) -> float:
-        """What the pot has to pass under that load to show a value (kg, N s/m, N/m)."""
+        """Coefficient under load for a value in kg, N s/m or N/m."""
 
 
 @dataclass(frozen=True)
 class Mass(Parameter):
-    """Of a pot before an integrator of velocity: numerator = time x N per 10 V x R C; full_out: m/s per 10 V."""
+    """Mass pot before an integrator of velocity: numerator = time x N per 10 V x R C; full_out: m/s per 10 V."""
 
     numerator: float
     full_out: float
@@ -84,7 +84,7 @@ class Mass(Parameter):
 
 @dataclass(frozen=True)
 class ForceLaw(Parameter):
-    """Of a pot before a summer of forces, damper or spring.
+    """Damper or spring pot before a summer of forces.
 
     full_in: m/s or m per 10 V at the pot; full_out: N per 10 V of the sum; gain: R / R_feedback of the summer.
     """
@@ -98,53 +98,57 @@ class ForceLaw(Parameter):
 
 
 class Program(ABC):
-    """A circuit that can be patched on the machine, with its scales and its pots."""
+    """Circuit for the machine, with its scales and pots."""
 
     name: str
 
     @property
     @abstractmethod
     def scales(self) -> Scales:
-        """What the voltages stand for; CHANNELS and whatever else the program shows."""
+        """Scales of CHANNELS and of any other quantity of the program."""
 
     @property
     @abstractmethod
     def parameters(self) -> Mapping[str, Parameter]:
-        """What the pots show, by the name of the setting ("M_kg"); first mass, damper and spring of the sprung mass."""
+        """Parameters by setting ("M_kg"), first mass, damper and spring of the sprung mass."""
 
     @property
     @abstractmethod
     def amplifiers(self) -> int:
-        """How many there are: U1, U2, ..."""
+        """Number of amplifiers U1, U2, ..."""
 
     @property
     @abstractmethod
     def integrators(self) -> tuple[str, ...]:
-        """Which of them are integrators."""
+        """Names of the amplifiers that are integrators."""
 
     @abstractmethod
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
-        """The diagram, its pots at 0; models: of U1, U2, ..."""
+        """Elements of the diagram with pots at 0; models: op-amp models of U1, U2, ..."""
+
+    def element_names(self, *kinds: type[Element]) -> tuple[str, ...]:
+        """Names of the elements of these kinds, in the order of the diagram."""
+        return tuple(each.name for each in self.netlist([IDEAL] * self.amplifiers) if isinstance(each, kinds))
 
     @functools.cached_property
     def values(self) -> dict[str, float]:
-        """The value of every parameter, by the name of the setting."""
+        """Value of every parameter by setting."""
         return {name: parameter.value for name, parameter in self.parameters.items()}
 
     @functools.cached_property
     def channel_nodes(self) -> tuple[str, ...]:
-        """The nodes that CHANNELS read."""
+        """Nodes of CHANNELS."""
         return tuple(self.scales.quantities[channel].node for channel in CHANNELS)
 
     @functools.cached_property
     def channel_signs(self) -> NDArray[np.float64]:
-        """The signs with which they read them: a card's differential input can be wired the other way round."""
+        """Signs of CHANNELS at their nodes: a card's differential input can be reversed."""
         return np.array([self.scales.quantities[channel].sign for channel in CHANNELS])
 
     def coefficient(self, setting: str, value: float) -> float:
-        """What the pot of a setting has to pass under its load for the machine to show the value (kg, N s/m, N/m).
+        """Coefficient under load of the pot of a setting, for a value in kg, N s/m or N/m.
 
-        It may exceed 1, which is for the pot to refuse. Raises PotError for a value that is not positive and finite.
+        It may exceed 1; PotModel.dial rejects that. Raises PotError for a value that is not positive and finite.
         """
         parameter = self.parameters[setting]
         if not (math.isfinite(value) and value > 0):

@@ -7,7 +7,8 @@
     U5               -> +e_x     inverts for the card
     pot K            feeds -e_x to the summer
 
-The summer puts out net force and not acceleration, so that a jump of M moves one pot. README.md draws the circuit.
+The summer puts out net force and not acceleration, so that a jump of M moves one pot.
+The documentation draws the circuit.
 """
 
 from __future__ import annotations
@@ -59,9 +60,10 @@ class SuspensionParts:
 
 @dataclass(frozen=True)
 class BumpStop:
-    """Where the stop is met, and how stiff it is; off_ohm: of its limiter before it is met.
+    """Second spring K_stop max(0, x - x_stop) of a suspension: a diode limiter from the summer's input to -e_x.
 
-    The defaults suit the front suspension: 60 kN/m from 0.1 m on, in the machine 24.55k from 5.01 V on.
+    Beyond its threshold it draws (e_x - e_stop) / R_on, like one more input of the summer. off_ohm: its resistance
+    below the threshold. The defaults suit the front suspension: 60 kN/m beyond 0.1 m, or 24.55k beyond 5.01 V.
     Raises CircuitError for values that are not positive and finite.
     """
 
@@ -76,7 +78,7 @@ class BumpStop:
                 raise CircuitError(f"bump stop: {name} must be positive and finite, got {value!r}")
 
     def limiter(self, scales: Scales, feedback_ohm: float) -> DiodeLimiter:
-        """The element between the nodes of a suspension on these scales, its summer fed back by feedback_ohm."""
+        """Diode limiter for a suspension on these scales, with feedback_ohm across its summer."""
         spring_at_feedback_n_per_m = scales.full("force") / scales.full("displacement")
         on_ohm = feedback_ohm * spring_at_feedback_n_per_m / self.stiffness_n_per_m
         return DiodeLimiter("STOP", "s1", "u3", self.stop_m * scales.volts("displacement"), on_ohm, self.off_ohm)
@@ -84,10 +86,9 @@ class BumpStop:
 
 @dataclass(frozen=True)
 class SuspensionProgram(Program):
-    """A set of parameters with the scaling and the nominal parts that suit it.
+    """Parameters with suitable scaling and nominal parts.
 
-    force_n, velocity_m_per_s: what 10 V stand for; the displacement's scale, time velocity R2 C2, follows.
-    stop: a second spring beyond some displacement.
+    force_n, velocity_m_per_s: full scale, 10 V; the displacement's is time velocity R2 C2. stop: optional bump stop.
     """
 
     name: str
@@ -150,7 +151,7 @@ BUMP_STOP = SuspensionProgram("bump-stop", 115.0, 3021.0, 24500.0, force_n=2940.
 
 
 def _netlist(parts: SuspensionParts, models: Sequence[OpAmpModel]) -> list[Element]:
-    """The diagram, its pots at 0."""
+    """Elements of the diagram, with pots at 0."""
     u1, u2, u3, u4, u5 = models
     return [
         VoltageSource(SOURCE, "in"),

@@ -1,7 +1,7 @@
-"""A play that is made again and again, of other specimens of the amplifiers and under another excitation.
+"""Repeated plays that differ in amplifier offsets and excitation.
 
-Volts and lamps are those of SuspensionComputer.play, to the bit. What neither offsets nor edges change (wiring, pots,
-state spaces) is worked out once, which for some thousand samples takes longer than to play them.
+Volts and lamps equal those of SuspensionComputer.play to the bit. State spaces are computed once: for some thousand
+samples that takes longer than to play them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from analogrig_emulator.circuit.circuit import OpAmp
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.pot import PotChange
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
-from analogrig_emulator.machine.machine import lit
+from analogrig_emulator.machine.machine import lamp_samples
 from analogrig_emulator.machine.program import SOURCE
 from analogrig_emulator.machine.suspension import SuspensionComputer
 
 
 class Repeat(NamedTuple):
-    """One play: volts of CHANNELS, float64 (samples, 4), and the lamps as of AnalogComputer.lamps."""
+    """One play: volts of CHANNELS, float64 (samples, 4), and AnalogComputer.lamps."""
 
     volts: NDArray[np.float64]
     lamps: Mapping[str, int | None]
@@ -36,18 +36,18 @@ def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotChange]) ->
 
 
 class RepeatedPlay:
-    """A play of `samples` (at least 1) from rest, with the computer's pots as they stand and changes as of its play().
+    """Play of `samples` (at least 1) from rest, with the computer's present pots and changes as for its play().
 
-    The computer itself is not touched. Raises PotError for impossible changes, CircuitError unless is_repeatable().
+    The computer does not change. Raises PotError for impossible changes, CircuitError unless is_repeatable().
     """
 
     def __init__(self, computer: SuspensionComputer, samples: int, changes: Sequence[PotChange] = ()) -> None:
-        turns = computer.planned(changes, samples)
+        turns = computer.plan(changes, samples)
         nodal, dials = Nodal(computer.circuit), dict(computer.dials)
-        solved = [nodal.trimmed(dials)]
+        solved = [nodal.with_trim(dials)]
         for turn in turns:
             dials |= turn.values
-            solved.append(nodal.trimmed(dials))
+            solved.append(nodal.with_trim(dials))
         systems = [system for system, _ in solved]
         nodes = computer.program.channel_nodes
         last_samples = [*(turn.sample for turn in turns), samples - 1]
@@ -66,7 +66,7 @@ class RepeatedPlay:
         )
 
     def play(self, excitation: Excitation, offsets_v: NDArray[np.float64]) -> Repeat:
-        """offsets_v: (amplifiers,) V, the whole input offset of each from U1 on (drawn_offsets_v).
+        """Play with the input offsets offsets_v: (amplifiers,) V from U1 on, as from drawn_offsets_v.
 
         Raises ExcitationError and EngineError.
         """
@@ -74,4 +74,4 @@ class RepeatedPlay:
         edges = excitation.edges(0, int(self._schedule.until_ticks[-1]) + 1, self._rate_hz)
         volts = self._engine.play(self._schedule, {SOURCE: edges})
         volts *= self._signs
-        return Repeat(volts, lit(self._amplifiers, self._kinks, self._engine.overdue_ticks))
+        return Repeat(volts, lamp_samples(self._amplifiers, self._kinks, self._engine.overdue_ticks))

@@ -1,4 +1,4 @@
-"""The wired machine: a program of the analogue computer, its parts, and the operator who sets its pots and plays it."""
+"""Analogue computer wired with a program: pots set by physical values, plays from rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
-from analogrig_emulator.circuit.pot import PotChange, PotModel, checked_dial, checked_ramp
+from analogrig_emulator.circuit.pot import PotChange, PotModel, check_dial, check_ramp
 from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
@@ -27,19 +27,18 @@ PROGRAMS: Mapping[str, Program] = MappingProxyType(
 )
 
 BLOCK_SAMPLES = 32768
-"""1 MB: in smaller blocks the calls cost more than a quiet stretch."""
+"""Default block, 1 MB: in smaller blocks the calls cost more than a quiet stretch."""
 
 
 class SuspensionComputer:
-    """The wired machine: it knows what its pots show, sets them, and is played.
+    """Machine wired with a program.
 
     program: a name in PROGRAMS or a Program. opamp: the name of a preset ("tl07x", "741", "ideal") or a model.
-    components: what is fitted for the parts of the program's diagram; Components(given=...) changes single ones.
-    Pots are set from the program's own values, with the real load connected.
-    rng, offset_v: when an rng is given, each op-amp has an offset of its own, uniform within +-offset_v (drawn from U1
-    on).
-    machine: the AnalogComputer on which it is patched, to be operated by hand: the program's integrators (front: U2 and
-    U3, at +velocity and -displacement) begin at 0 V, and its lamps are those of the last play.
+    components: real components for the program's diagram; Components(given=...) sets single deviations.
+    Pots are set to the program's values, with the real load connected.
+    rng, offset_v: with an rng, each op-amp has an offset uniform within +-offset_v, drawn from U1 on.
+    machine: the AnalogComputer, for operation by hand. The program's integrators (front: U2 and U3, at +velocity and
+    -displacement) begin at 0 V. Its lamps are those of the last play.
     Raises CircuitError, PotError.
     """
 
@@ -56,7 +55,7 @@ class SuspensionComputer:
         self.program = _program(program)
         self.sample_rate_hz = sample_rate_hz
         models = _models(opamp, self.program.amplifiers, rng, offset_v)
-        circuit = Circuit(components.fitted(self.program.netlist(models)))
+        circuit = Circuit(components.fit(self.program.netlist(models)))
         self._pots = _pots(self.program, circuit, components)
         self._signs = self.program.channel_signs
         self.machine = AnalogComputer(
@@ -71,38 +70,38 @@ class SuspensionComputer:
 
     @property
     def circuit(self) -> Circuit:
-        """The netlist, its pots as they are set now."""
+        """Netlist with the present pots."""
         return self.machine.circuit
 
     @property
     def scales(self) -> Scales:
-        """What the voltages stand for."""
+        """Scales of the program."""
         return self.program.scales
 
     @property
     def dials(self) -> dict[str, float]:
-        """Where the pots stand, 0..1, by their names (front: M, B and K)."""
+        """Dials by pot, 0..1 (front: M, B and K)."""
         return self.machine.dials
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """What the pots pass under their load."""
+        """Coefficients by pot, under load."""
         return {pot: self._pots[pot].coefficient(dial) for pot, dial in self.dials.items()}
 
     def set(self, ramp_n: int = 0, /, **settings: float) -> None:
-        """Turns pots to show values (front: M_kg, B_n_s_per_m, K_n_per_m), or to dials (M_dial, B_dial, K_dial, 0..1).
+        """Set pots by value (front: M_kg, B_n_s_per_m, K_n_per_m) or by dial (M_dial, B_dial, K_dial, 0..1).
 
-        The former set the coefficient under load, as an operator in pot-set mode does. A running machine keeps its
-        voltages. With ramp_n the pots arrive so many samples after the last one taken.
-        Raises PotError naming the pot, with nothing turned.
+        Values set the coefficient under load, as in pot-set mode. A running machine keeps its voltages. With ramp_n
+        the pots arrive so many samples after the last one taken.
+        Raises PotError naming the pot; no pot is turned then.
         """
         self.machine.turn(self._resolve(settings), ramp_n)
 
     def dials_for(self, **settings: float) -> dict[str, float]:
-        """The dials to which set(**settings) would turn the pots."""
+        """Dials to which set(**settings) turns the pots."""
         return self.machine.resting(self._resolve(settings))
 
-    def planned(self, changes: Sequence[PotChange], samples: int) -> list[PotChange]:
+    def plan(self, changes: Sequence[PotChange], samples: int) -> list[PotChange]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
         planned = []
         for sample, settings, ramp_n in sorted(changes, key=lambda change: change.sample):
@@ -110,7 +109,7 @@ class SuspensionComputer:
                 raise PotError(
                     f"change of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
                 )
-            planned.append(PotChange(sample, self.dials_for(**settings), checked_ramp(ramp_n, settings)))
+            planned.append(PotChange(sample, self.dials_for(**settings), check_ramp(ramp_n, settings)))
         return planned
 
     def play(
@@ -120,15 +119,15 @@ class SuspensionComputer:
         changes: Sequence[PotChange] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[NDArray[np.float64]]:
-        """Plays from rest; yields the volts of CHANNELS in blocks, float64 (block_samples or, last, fewer; 4).
+        """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
 
-        The excitation's first level is applied at sample 0. A change takes effect right after its sample is
+        The excitation's first level applies at sample 0. A change takes effect right after its sample is
         taken; a ramp begins there. Pots stay where the changes leave them. set() between two blocks acts likewise.
-        Raises PotError, ExcitationError and EngineError; for arguments that cannot be, before anything is played.
+        Raises PotError, ExcitationError and EngineError; for invalid arguments before anything is played.
         """
         if samples < 0 or block_samples < 1:
             raise EngineError(f"cannot play {samples} samples in blocks of {block_samples}")
-        turns = self.planned(changes, samples)
+        turns = self.plan(changes, samples)
         excitation.edges(0, 1, self.sample_rate_hz)
         self.machine.restart(Mode.OPERATE)
         self._plays += 1
@@ -171,10 +170,10 @@ class SuspensionComputer:
                 raise PotError(f"unknown setting {key!r}; there are {', '.join(known)}")
             if pot in dials:
                 raise PotError(f"pot {pot}: set twice at the same time")
-            dials[pot] = self._dial_showing(pot, key, value) if key in parameters else checked_dial(value, pot)
+            dials[pot] = self._dial_for_value(pot, key, value) if key in parameters else check_dial(value, pot)
         return dials
 
-    def _dial_showing(self, pot: str, key: str, value: float) -> float:
+    def _dial_for_value(self, pot: str, key: str, value: float) -> float:
         try:
             return self._pots[pot].dial(self.program.coefficient(key, value))
         except PotError as cause:
@@ -183,7 +182,7 @@ class SuspensionComputer:
 
 @dataclass(frozen=True)
 class _LoadedPot:
-    """A pot in its place: model, name, and the ohms to a virtual ground that it drives."""
+    """Pot with its load to a virtual ground."""
 
     model: PotModel
     name: str
@@ -223,5 +222,5 @@ def _models(opamp: str | OpAmpModel, count: int, rng: np.random.Generator | None
 
 
 def drawn_offsets_v(model: OpAmpModel, count: int, rng: np.random.Generator, offset_v: float) -> NDArray[np.float64]:
-    """Input offsets of so many specimens, U1 first: the model's own and one uniform within +-offset_v; (count,) V."""
+    """Input offsets of op-amps from U1 on: the model's plus one uniform within +-offset_v; (count,) V."""
     return np.asarray(model.vos_v + rng.uniform(-offset_v, offset_v, count))

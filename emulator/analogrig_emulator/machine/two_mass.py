@@ -4,7 +4,7 @@
     M1 x1'' = S - B1 x1' - K1 x1
 
 Four integrators (x2', x1', d, x1), six pots, one for each mass, damper and spring, 200 times faster than the
-suspension. README.md draws the circuit.
+suspension. The documentation draws the circuit.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class TwoMassParts:
 
 @dataclass(frozen=True)
 class TwoMassProgram(Program):
-    """A plant and the parts that are to show it; force_n, velocity_m_per_s: what 10 V stand for.
+    """Plant and parts of the program; force_n, velocity_m_per_s: full scale, 10 V.
 
     All other scales follow from the ratios of the parts. At the edges of a square wave over 0..10 V (0..2940 N) the
     front suspension needs: x2 6.8 V, x2' 4.7 V, S 6.4 V, d 6.0 V, w 4.0 V, x1 5.3 V, x1' 3.4 V, wheel's net force
@@ -84,7 +84,7 @@ class TwoMassProgram(Program):
 
     @functools.cached_property
     def scales(self) -> Scales:
-        """Displacement, velocity and net force are those of M2."""
+        """Scales; displacement, velocity and net force are those of M2."""
         parts, force_n, velocity_m_per_s = self.parts, self.force_n, self.velocity_m_per_s
         suspension_n = force_n * parts.r_force_ohm / parts.r_suspension_ohm
         wheel_m_per_s = velocity_m_per_s * parts.r_w_v2_ohm / parts.r_w_v1_ohm
@@ -135,8 +135,14 @@ class TwoMassProgram(Program):
         return "U2", "U5", "U8", "U9"
 
     def netlist(self, models: Sequence[OpAmpModel]) -> list[Element]:
-        panel = _Panel(self.parts, models)
-        return [VoltageSource(SOURCE, "in"), *panel.sprung_mass(), *panel.suspension(), *panel.wheel(), *panel.output()]
+        diagram = _Diagram(self.parts, models)
+        return [
+            VoltageSource(SOURCE, "in"),
+            *diagram.sprung_mass(),
+            *diagram.suspension(),
+            *diagram.wheel(),
+            *diagram.output(),
+        ]
 
 
 TWO_MASS = TwoMassProgram()
@@ -144,12 +150,12 @@ TWO_MASS = TwoMassProgram()
 
 
 _Input = tuple[str, str, float]
-"""A resistor into a summing junction: its name, the node it comes from, and its ohms."""
+"""Resistor into a summing junction: name, source node, ohms."""
 
 
 @dataclass(frozen=True)
-class _Panel:
-    """The diagram in four parts; models: of U1 to U11."""
+class _Diagram:
+    """Diagram in four parts; models: op-amp models of U1 to U11."""
 
     parts: TwoMassParts
     models: Sequence[OpAmpModel]
@@ -202,7 +208,7 @@ class _Panel:
         yield Capacitor(name, f"s{number}", f"u{number}", farad)
 
     def _stage(self, number: int, inputs: Sequence[_Input]) -> Iterator[Element]:
-        """An amplifier but for what feeds its output back."""
+        """Amplifier with its inputs, without feedback."""
         for name, node, ohm in inputs:
             yield Resistor(name, node, f"s{number}", ohm)
         yield OpAmp(f"U{number}", GROUND, f"s{number}", f"u{number}", self.models[number - 1])

@@ -217,8 +217,8 @@ def _at_edges(run: Run, samples: int) -> NDArray[np.bool_]:
     volts = _force_v(run)
     jump = np.flatnonzero(np.abs(np.diff(volts[:samples])) > _EDGE_PART * np.ptp(volts))
     near = np.zeros(samples, np.bool_)
-    for beside in (-1, 0, 1, 2):
-        near[np.clip(jump + beside, 0, samples - 1)] = True
+    for away in (-1, 0, 1, 2):
+        near[np.clip(jump + away, 0, samples - 1)] = True
     return near
 
 

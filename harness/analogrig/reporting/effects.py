@@ -9,7 +9,7 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 from analogrig.storage import replacing
-from analogrig_emulator.effects import SAMPLES, Effect, measured_effects
+from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 
 __all__ = ["as_json", "measure", "text", "write_picture"]
 
@@ -22,7 +22,7 @@ _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
 def measure(sets: Sequence[str]) -> Table:
     """The table for these parameter sets, the largest effect first."""
-    found = {name: list(measured_effects(name)) for name in sets}
+    found = {name: list(measure_effects(name)) for name in sets}
     largest = [max(row.median_lsb for row in rows) for rows in zip(*found.values(), strict=True)]
     order = sorted(range(len(largest)), key=lambda i: -largest[i])
     return {name: [rows[i] for i in order] for name, rows in found.items()}

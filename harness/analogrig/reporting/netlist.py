@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analogrig.errors import ConfigurationError
-from analogrig.rigs.emulator import EmulatorRig, SetUp
+from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotChange
@@ -14,7 +14,7 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
 
     :raises ConfigurationError: the scenario cannot be played on this rig, or the rig has no circuit.
     """
-    if not isinstance(rig, EmulatorRig):
+    if not is_emulated(rig):
         raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
     setup = rig.set_up(scenario, seed)
     rate_hz = setup.computer.sample_rate_hz
@@ -32,7 +32,7 @@ def _turns(setup: SetUp, samples: int) -> list[PotChange]:
     """The dials after each sample at which one moves; a ramp is a step a sample, to the dial of the period's middle."""
     dials = setup.computer.dials
     turns: list[PotChange] = []
-    for sample, goals, ramp_n in setup.computer.planned(setup.changes, samples):
+    for sample, goals, ramp_n in setup.computer.plan(setup.changes, samples):
         for k in range(min(ramp_n, samples - sample)):
             part = (k + 0.5) / ramp_n
             between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}

@@ -9,7 +9,7 @@ import functools
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Plant
-from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
+from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Channel, Segment
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
     COMPONENTS,
-    IDEAL,
     OP_AMP_GRADES,
     PROGRAMS,
     Capacitor,
@@ -86,15 +85,18 @@ class MeasuredValues:
     def put_in(self, stock: Components) -> Components:
         """The machine, of components that are otherwise those of the stock."""
         given = {**self.deviation, **self.offset_v}
-        return dataclasses.replace(stock.undrawn(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew)
+        return dataclasses.replace(
+            stock.without_draws(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew
+        )
 
 
 @functools.cache
 def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Of the resistors, capacitors and pots, and of the amplifiers, of all programs, in the order of their diagrams."""
-    elements = [each for program in PROGRAMS.values() for each in program.netlist([IDEAL] * program.amplifiers)]
-    parts = dict.fromkeys(each.name for each in elements if isinstance(each, Resistor | Capacitor | Pot))
-    return tuple(parts), tuple(dict.fromkeys(each.name for each in elements if isinstance(each, OpAmp)))
+    programs = PROGRAMS.values()
+    parts = [name for program in programs for name in program.element_names(Resistor, Capacitor, Pot)]
+    amplifiers = [name for program in programs for name in program.element_names(OpAmp)]
+    return tuple(dict.fromkeys(parts)), tuple(dict.fromkeys(amplifiers))
 
 
 @dataclass(frozen=True)
@@ -417,6 +419,11 @@ class EmulatorRig:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+
+def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
+    """True for the emulated rig, the only one with a circuit, exact components and block sizes."""
+    return isinstance(rig, EmulatorRig)
 
 
 def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:

@@ -137,7 +137,7 @@ def date_jump(
         return objection
     cost = profile.cost / overdispersion(guess, profile.unexplained)
     if _falls_outwards(cost):
-        return NoInstant(f"the plant seems to have changed before or after the samples {problem.searched}")
+        return NoInstant(f"the plant seems to have changed before or after the samples {problem.span}")
     return interval(cost, np.arange(search.start, search.stop), confidence)
 
 
@@ -199,7 +199,7 @@ class Guess:
     def edges(self) -> EdgePlace:
         return ANYWHERE if self.half_width == ANYWHERE.half_width else EdgePlace(self.place, self.half_width)
 
-    def moved(self, unknowns: Array, sample: int) -> Self:
+    def add(self, unknowns: Array, sample: int) -> Self:
         """Guess with ``unknowns`` (10,: offset, place, old, new) added, each within its largest step."""
         limits = np.array([np.inf, *[_LARGEST_STEP] * len(PARAMETERS)])
         (offset, place), old, new = np.split(unknowns, [COMMON, COMMON + OWN])
@@ -271,7 +271,7 @@ class Problem:
         )
 
     @property
-    def searched(self) -> str:
+    def span(self) -> str:
         """First and last sample of the search range, for messages."""
         return f"{self.search.start} to {self.search.stop - 1}"
 
@@ -341,7 +341,7 @@ class Problem:
         """Iterate ``profile`` from ``guess`` until M, B, K have converged."""
         for _ in range(_ROUNDS):
             profile = self.profile(guess)
-            last, guess = guess, guess.moved(profile.unknowns, profile.sample)
+            last, guess = guess, guess.add(profile.unknowns, profile.sample)
             if guess.near(last):
                 break
         return guess, profile
@@ -354,7 +354,7 @@ class Problem:
         unchanged = _fit_plant(self.signals, self.before, guess, _PRIOR, rounds=1).cost
         chance = _CHANCE + 2.0 * math.log(len(self.search))
         if unchanged - cost < chance * overdispersion(guess, unexplained):
-            reason = f"nothing in the samples {self.searched} shows that the plant has changed"
+            reason = f"nothing in the samples {self.span} shows that the plant has changed"
             return NoInstant(reason, unchanged=True)
         return None
 
@@ -424,12 +424,12 @@ def _fit_plant(signals: Signals, plant: Plant, first: Guess, prior: Array, round
         transitions = np.broadcast_to(model.transition, (len(signals), 2, 2))
         course = _course(transitions, model.inputs(signals, last.old[0]), signals, last.offset)
         filtered = ForwardFilter.of(model, signals, course, (last.offset, last.old[0]))
-        gone = [last.offset - first.offset, last.edges.mean - first.edges.mean, *(last.old - first.old)]
-        rows = _deviations(gone, prior)
+        distance = [last.offset - first.offset, last.edges.mean - first.edges.mean, *(last.old - first.old)]
+        rows = _deviations(distance, prior)
         form = filtered.misfit[-1] + rows.T @ rows
         unknowns, least = _minimum(form[None])
         fit = _PlantFit(
-            last.moved(np.append(unknowns[0], np.zeros(OWN)), last.sample),
+            last.add(np.append(unknowns[0], np.zeros(OWN)), last.sample),
             float(np.linalg.inv(form[1:, 1:])[1, 1] ** 0.5),
             float(least[0] + filtered.log[-1]),
             filtered.innovation @ np.append(1.0, unknowns[0]),

@@ -1,6 +1,6 @@
 """Dates of a pot change that takes time: the instants at which the pot began and ceased to turn.
 
-Between the two instants the plant is on a path from the old values to the new ones. The course of a hand is unknown: it
+Between the two instants the plant is on a path from the old values to the new ones. The speed of a hand is unknown: it
 may turn evenly, or begin and end gently (least jerk; Flash and Hogan 1985). Both shapes are tried, and the intervals
 cover each shape that the samples do not reject. Two pots that jump in succession are such a turn as well, with a known
 plant in between. The plants at both ends are fitted to the samples before and after the search range.
@@ -85,7 +85,7 @@ def date_turn(
     if objection := problem.objection(float(best.cost[at]), unexplained, guess):
         return objection
     if best.begin[at] == problem.candidates.start or best.end[at] == problem.candidates.stop - 1:
-        return NoInstant(f"the turn seems to go on beyond the samples {problem.searched}")
+        return NoInstant(f"the turn seems to go on beyond the samples {problem.span}")
     divisor = overdispersion(guess, max(unexplained, float(best.path_misfit[at])))
     likely = [pairs for pairs in every if pairs.cost.min() - best.cost[at] <= _LIKELY * divisor]
     begins = [_estimate(pairs.begin, pairs.cost / divisor, confidence) for pairs in likely]

@@ -111,23 +111,23 @@ class PlantModel:
     @classmethod
     def of(cls, plant: Plant, edges: EdgePlace, signals: Signals) -> Self:
         """Model for the period and the noise of ``signals``."""
-        transition, response = _sampled(plant, 1.0, signals)
+        transition, response = _discretise(plant, 1.0, signals)
         places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0)
-        late = np.array([_sampled(plant, 1.0 - place, signals)[1] for place in places.tolist()])
-        beside = np.clip([edges.mean - 100.0 * _STEP, edges.mean + 100.0 * _STEP], 0.0, 1.0)
-        ends = [_sampled(plant, 1.0 - place, signals)[1] for place in beside.tolist()]
+        late = np.array([_discretise(plant, 1.0 - place, signals)[1] for place in places.tolist()])
+        near = np.clip([edges.mean - 100.0 * _STEP, edges.mean + 100.0 * _STEP], 0.0, 1.0)
+        ends = [_discretise(plant, 1.0 - place, signals)[1] for place in near.tolist()]
         moved = [plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS]
-        sampled = [_sampled(each, 1.0, signals) for each in moved]
-        middle = _sampled(plant, 1.0 - edges.mean, signals)[1]
+        sampled = [_discretise(each, 1.0, signals) for each in moved]
+        middle = _discretise(plant, 1.0 - edges.mean, signals)[1]
         return cls(
             transition=transition,
             response=response,
             edge=late.mean(axis=0),
             edge_covariance=np.cov(late.T, bias=True),
-            edge_by_place=(ends[1] - ends[0]) / (beside[1] - beside[0]),
+            edge_by_place=(ends[1] - ends[0]) / (near[1] - near[0]),
             transition_by=np.array([each[0] - transition for each in sampled]) / _STEP,
             response_by=np.array([each[1] - response for each in sampled]) / _STEP,
-            edge_by=np.array([_sampled(each, 1.0 - edges.mean, signals)[1] - middle for each in moved]) / _STEP,
+            edge_by=np.array([_discretise(each, 1.0 - edges.mean, signals)[1] - middle for each in moved]) / _STEP,
         )
 
     def inputs(self, signals: Signals, offset: float) -> Array:
@@ -144,7 +144,7 @@ class PlantModel:
         return np.asarray(noise + signals.edges_n[:, None, None] ** 2 * self.edge_covariance)
 
 
-def _sampled(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]:
+def _discretise(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]:
     """Transition (2, 2) and response (2,) over ``part`` (0..1) of a sample period."""
     if part <= 0.0:
         return np.eye(2), np.zeros(2)

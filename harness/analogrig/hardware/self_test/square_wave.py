@@ -1,8 +1,8 @@
 """Square wave as a card samples it: levels, edges, timing, and the noise of force and displacement.
 
-An edge between two samples shows only that it lies between them. Since edges fall on ever other parts of a sample
-period, each gives an interval for the unknown delay, and the truth lies in all of them (set-membership estimation:
-Milanese and Vicino, Automatica 27, 1991, 997).
+An edge between two samples shows only that it lies between them. Each edge gives an interval for the unknown delay, and
+the truth lies in all of them. Edges fall on many parts of a sample period, so the intersection is narrow
+(set-membership estimation: Milanese and Vicino, Automatica 27, 1991, 997).
 
 An instrument that averages over a part of each sample period shows some edges between the levels; the value there is
 linear in the instant.
@@ -116,7 +116,7 @@ class SeenEdges:
         period, rising, falling = np.linalg.lstsq(design, middles, rcond=None)[0]
         return EdgeTimes(float(period), float(rising), float(falling))
 
-    def between(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def samples_between(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Samples between the levels, and the index of each one's edge."""
         counts = self.after - self.before - 1
         edge = np.repeat(np.arange(len(counts)), counts)
@@ -125,7 +125,7 @@ class SeenEdges:
 
     def averaging_n(self) -> float:
         """Time over which the instrument averages, in samples: the share of edges between levels; 0 if it does not."""
-        seen = len(self.between()[0])
+        seen = len(self.samples_between()[0])
         return seen / len(self.rising) / (1.0 - 2.0 * SETTLED_PART) if seen >= _AVERAGES_FROM else 0.0
 
 
@@ -147,7 +147,7 @@ def delay(codes: NDArray[np.uint16], levels: Levels, edges: SeenEdges, times: Ed
 
     :param drift_n: largest error of ``times`` at the ends of the record.
     """
-    samples, edge = edges.between()
+    samples, edge = edges.samples_between()
     instants, averaging_n = times.instants(edges), edges.averaging_n()
     if averaging_n:
         upper = (codes[samples] - levels.low) / (levels.high - levels.low)
