@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from analogrig.bench import Bench
     from analogrig.devices.dut import Dut, open_dut
-    from analogrig.devices.estimator_config import EstimatorConfig
     from analogrig.errors import (
         AnalogrigError,
         ConfigurationError,
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
         RecordingError,
         RigError,
     )
+    from analogrig.estimator_config import EstimatorConfig
     from analogrig.judging.information import detectable
     from analogrig.judging.verdict import TweakVerdict, Verdict, judge
     from analogrig.plant import Plant
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 else:
     _MODULES = {
         "analogrig.bench": "Bench",
-        "analogrig.devices.estimator_config": "EstimatorConfig",
+        "analogrig.estimator_config": "EstimatorConfig",
         "analogrig.errors": (
             "AnalogrigError ConfigurationError DeviceError LinkError LinkTimeout RecordingError RigError"
         ),

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analogrig import config
-from analogrig.devices.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.scenario import Expectations
 from analogrig_emulator import Excitation
 

@@ -28,7 +28,7 @@ from analogrig.plant import Plant
 from analogrig.storage import replacing
 
 if TYPE_CHECKING:
-    from analogrig.devices.estimator_config import EstimatorConfig
+    from analogrig.estimator_config import EstimatorConfig
 
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.reference import ReferenceEstimator
+from analogrig.estimator_config import EstimatorConfig
 from analogrig_thesis.document import Drawing, Facts, Mark, ReproducedChapter, Signal
 from analogrig_thesis.plants import square
 from analogrig_thesis.schemes import PLAIN, schemes

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.reference import ReferenceEstimator
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import Plant
 from analogrig.run import Segment
 from analogrig_thesis.document import Drawing, Facts, ReproducedChapter, Signal

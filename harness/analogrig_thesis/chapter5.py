@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import AT_REST, Plant, SampledPlant
 from analogrig.run import Run, Segment
 from analogrig_thesis.circuit_runs import (

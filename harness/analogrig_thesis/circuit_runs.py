@@ -10,8 +10,8 @@ import numpy as np
 
 from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.devices.dut import connect
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.host import HostDevice
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run, Segment

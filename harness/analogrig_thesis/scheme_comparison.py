@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig_thesis.chapter4 import Simulation
 from analogrig_thesis.circuit_runs import (

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 
 HOLD_N = 4
 """Section 4.4.3: "After four samples, calculate the mean as normal". The C counts four innovations: it restarts its

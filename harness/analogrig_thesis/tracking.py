@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.devices.estimator import Estimator
-from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
 from analogrig.plant import Plant, physical_parameters
 from analogrig.run import Run, Segment

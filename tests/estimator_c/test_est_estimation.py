@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular, toeplitz
 from scipy.signal import lfilter
 
-from analogrig.devices.estimator_config import EstimatorConfig
+from analogrig.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import GATHERING, MISSING, NONE, REFUSED, UPDATED, Estimator
 
 # y(k) = -0.5 y(k-1) - 0.8 y(k-2) - 0.9 u(k-1): the example of thesis section 3.5.

@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import analogrig.devices.estimator
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.reference import ReferenceEstimator
+from analogrig.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import (
     ANYWHERE,
     CUSUM,

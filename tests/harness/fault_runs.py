@@ -28,10 +28,10 @@ from analogrig.bench import Bench
 from analogrig.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
 from analogrig.devices.can_nodes import MemoryBus
 from analogrig.devices.dut import Dut
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
 from analogrig.errors import AnalogrigError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_link import CanLink

@@ -21,8 +21,8 @@ from analogrig.bench import Bench
 from analogrig.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
 from analogrig.cli import main
 from analogrig.devices.dut import open_dut
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
 from analogrig.recordings import WRITTEN, CanLog, CapturedFrames, import_run, replace_scenario
 from analogrig.reporting.summary import summary

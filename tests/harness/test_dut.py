@@ -44,7 +44,6 @@ from analogrig.devices.child import ChildWire
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.dut import Dut, connect, open_dut, reopen_dut
 from analogrig.devices.estimator import Estimator
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.host import HostDevice, host_wire
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
@@ -59,6 +58,7 @@ from analogrig.errors import (
     LinkError,
     LinkTimeout,
 )
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links import frame
 from analogrig.links.can_link import CanLink
 from analogrig.links.link import CanListener, FramedLink, Link

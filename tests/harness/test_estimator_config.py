@@ -10,9 +10,9 @@ import pytest
 
 from analogrig import config
 from analogrig.catalogue import Configure, Configured, Identify, Key, Trigger
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.library import MemoryWire
 from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.link import FramedLink
 
 

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.devices.estimator import Estimator, StepStatus
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.reference import ReferenceEstimator
 from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import EstimatorConfig
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900

@@ -11,8 +11,8 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.devices.dut import connect
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.inproc import InprocDevice
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from analogrig.testing.experiment import Play

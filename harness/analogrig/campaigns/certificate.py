@@ -35,7 +35,7 @@ from analogrig.judging.statistics import (
     poisson_mean,
     upper_rate,
 )
-from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.emulator import is_emulated
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
@@ -227,7 +227,7 @@ def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
     """One estimate of a rare rate, as plain numbers."""
     asked = Question.from_json(question)
     with open_table(asked.rig) as rig:
-        if not isinstance(rig, EmulatorRig):
+        if not is_emulated(rig):
             raise ConfigurationError("certify: a rare rate is estimated on an emulated rig")
         scenario = Scenario.from_table(asked.scenario, "the scenario")
         rate, alarms, samples = false_alarm_rate(rig, device_of(asked.device), scenario, seed)

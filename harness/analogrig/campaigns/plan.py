@@ -26,7 +26,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import open_rig
-from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
+from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, is_emulated
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario, Tweak
@@ -206,7 +206,7 @@ class Plan:
         try:
             case = self.case(cell, self.spec.first_seed, drawn)
             rig = open_table(case.rig) if "card" in case.rig else None
-            if isinstance(rig, EmulatorRig):
+            if rig is not None and is_emulated(rig):
                 rig.set_up(case.scenario, case.seed)
         except ConfigurationError as error:
             return str(error)
@@ -279,7 +279,7 @@ def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
             )
         described = _given(rig.description())
-        return described if isinstance(rig, EmulatorRig) else {"name": name, "kind": "real", "described": described}
+        return described if is_emulated(rig) else {"name": name, "kind": "real", "described": described}
 
 
 def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:

@@ -16,7 +16,7 @@ from analogrig.campaigns.trials import Trials, are_possible
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.dut import Dut, connect
 from analogrig.errors import AnalogrigError, RigError
-from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.emulator import is_emulated
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 
@@ -79,7 +79,7 @@ def _open_rig(table: Table) -> Iterator[_OpenRig]:
 
 
 def _trials(rig: Rig, device: DeviceDescription) -> Trials | None:
-    return Trials(rig, device) if isinstance(rig, EmulatorRig) and are_possible(rig, device) else None
+    return Trials(rig, device) if is_emulated(rig) and are_possible(rig, device) else None
 
 
 def _open_device(table: Table) -> Dut:

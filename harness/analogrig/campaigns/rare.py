@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from analogrig.campaigns.trials import entered, flags_of
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.errors import ConfigurationError, DeviceError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.exposure import ObservedRecord, record_exposure
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.rig import Block, Performance

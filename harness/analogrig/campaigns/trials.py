@@ -18,7 +18,7 @@ from analogrig.catalogue import SteppedFlag, Trigger
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator, EstimatorOutput, StepStatus
 from analogrig.judging.exposure import Exposure, ObservedRecord, record_exposure
-from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Performance, Rig
 from analogrig.run import CHANNELS, Conditions, Run, missing_samples
 from analogrig.scenario import Scenario
@@ -36,7 +36,7 @@ _FLAGS[StepStatus.GATHERING] = SteppedFlag.GATHERING
 
 def are_possible(rig: Rig, device: DeviceDescription) -> bool:
     """Whether trials give what Bench gives: an emulated rig, and a device whose line does nothing to the samples."""
-    return isinstance(rig, EmulatorRig) and device.can_run_in_blocks
+    return is_emulated(rig) and device.can_run_in_blocks
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,10 @@ import ctypes
 import threading
 from collections import deque
 from collections.abc import Iterable
-from pathlib import Path
 
-from analogrig.catalogue import CATALOGUE_HASH, FirmwareId
+from analogrig.catalogue import CATALOGUE_HASH
 from analogrig.devices.child import Child
-from analogrig.devices.library import ALWAYS_ROOM, LIBRARY, IdentityStruct, ProgressStruct, load_library
+from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
 from analogrig.errors import LinkClosed
 from analogrig.links.can_bus import CanBus, WrappedBus
 from analogrig.links.line import CanLine
@@ -64,29 +63,13 @@ def _from_c(frame: _Frame) -> can.Message:
     )
 
 
-class LibraryCanDevice:
-    """The CAN port of the device in the shared library."""
+class LibraryCanDevice(LibraryDevice):
+    """The device in the shared library, behind its CAN port."""
 
-    def __init__(
-        self, *, is_fd: bool, input_blocks: int, catalogue_hash: int = CATALOGUE_HASH, library: Path = LIBRARY
-    ) -> None:
-        """Load a device with or without CAN FD; ``boot`` must follow.
-
-        :param catalogue_hash: another one stands for a device built from another catalogue.
-        :raises LinkError: the project's library was not built.
-        """
-        c = load_library(library, ("can_device_size", "can_device_init", "can_device_run"))
-        c.can_device_run.restype = ProgressStruct
-        c.can_device_size.restype = ctypes.c_size_t
-        self._run, self._init = c.can_device_run, c.can_device_init
-        self._is_fd, self._input_blocks, self._catalogue_hash = is_fd, input_blocks, catalogue_hash
-        self._device = ctypes.create_string_buffer(c.can_device_size())
+    def __init__(self, *, is_fd: bool, catalogue_hash: int = CATALOGUE_HASH, input_blocks: int = ALWAYS_ROOM) -> None:
+        """Load a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
+        super().__init__("can", ctypes.c_bool(is_fd), catalogue_hash=catalogue_hash, input_blocks=input_blocks)
         self._output = (_Frame * _OUTPUT_N)()
-
-    def boot(self, boot_nonce: int) -> None:
-        """Power-cycle the device."""
-        identity = IdentityStruct(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
-        self._init(self._device, ctypes.byref(identity), ctypes.c_bool(self._is_fd))
 
     def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
         """Answers of the device to these frames."""
@@ -94,9 +77,7 @@ class LibraryCanDevice:
         out: list[can.Message] = []
         while True:
             array = (_Frame * len(waiting))(*waiting)
-            progress = self._run(
-                self._device, array, ctypes.c_size_t(len(waiting)), self._output, ctypes.c_size_t(_OUTPUT_N)
-            )
+            progress = self.run(self.state, array, len(waiting), self._output, _OUTPUT_N)
             out += [_from_c(self._output[i]) for i in range(progress.given)]
             waiting = waiting[progress.taken :]
             if not progress.given and not waiting:
@@ -126,7 +107,7 @@ class MemoryBus:
         self.is_fd = is_fd
         self.line = line
         self.clock = VirtualClock() if clock is None else clock
-        self._device = LibraryCanDevice(is_fd=is_fd, input_blocks=ALWAYS_ROOM, catalogue_hash=catalogue_hash)
+        self._device = LibraryCanDevice(is_fd=is_fd, catalogue_hash=catalogue_hash)
         self._answers: deque[can.Message] = deque()
         self._device.boot(boot_nonce)
 

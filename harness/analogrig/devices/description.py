@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 from urllib.parse import unquote
 
 from analogrig import config
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.line import CanLine, SerialLine
 from analogrig.links.link import FramedLink, Link

@@ -37,7 +37,6 @@ from analogrig.catalogue import (
     Status,
 )
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.registry import recorded, trusted
 from analogrig.errors import (
     CatalogueMismatch,
@@ -49,6 +48,7 @@ from analogrig.errors import (
     LinkTimeout,
     TimeLimitReached,
 )
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation

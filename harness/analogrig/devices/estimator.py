@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.library import LIBRARY, load_library
 from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import EstimatorConfig
 
 
 class StepStatus(enum.IntEnum):

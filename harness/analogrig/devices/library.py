@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Literal
 
 from analogrig.catalogue import CATALOGUE_HASH, FirmwareId
 from analogrig.errors import ConfigurationError, LinkError
@@ -58,6 +59,39 @@ def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
     return c
 
 
+class LibraryDevice:
+    """The device in a shared library, behind its serial port or its CAN port."""
+
+    def __init__(
+        self,
+        port: Literal["serial", "can"],
+        *arguments: object,
+        catalogue_hash: int = CATALOGUE_HASH,
+        input_blocks: int = ALWAYS_ROOM,
+        library: Path = LIBRARY,
+    ) -> None:
+        """Load a device; ``boot`` must follow, and passes ``arguments`` on to the port.
+
+        :param catalogue_hash: another one stands for a device built from another catalogue.
+        :raises LinkError: the project's library was not built.
+        :raises ConfigurationError: the user's library is not one of a device.
+        """
+        names = [f"{port}_device_{name}" for name in ("size", "init", "run")]
+        c = load_library(library, names)
+        size, self._init, self.run = (getattr(c, name) for name in names)
+        size.restype = ctypes.c_size_t
+        self.run.restype = ProgressStruct
+        self.run.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t]
+        self.state = ctypes.create_string_buffer(size())
+        self._arguments = arguments
+        self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
+
+    def boot(self, boot_nonce: int) -> None:
+        """Power-cycle the device."""
+        identity = IdentityStruct(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
+        self._init(self.state, ctypes.byref(identity), *self._arguments)
+
+
 class MemoryWire:
     """Wire to a device in this process: the same C code and frames as elsewhere, on a virtual clock."""
 
@@ -72,34 +106,22 @@ class MemoryWire:
         input_blocks: int = ALWAYS_ROOM,
         library: Path = LIBRARY,
     ) -> None:
-        """Boot a device. Another ``catalogue_hash`` stands for a device built from another catalogue.
-
-        :raises LinkError: the project's library was not built.
-        :raises ConfigurationError: the user's library is not one of a device.
-        """
-        c = load_library(library, ("serial_device_size", "serial_device_init", "serial_device_run"))
-        c.serial_device_run.restype = ProgressStruct
-        c.serial_device_size.restype = ctypes.c_size_t
-        self._run = c.serial_device_run
-        self._init = c.serial_device_init
-        self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
-        self._device = ctypes.create_string_buffer(c.serial_device_size())
+        """Boot a device; parameters and errors as ``LibraryDevice``."""
+        self._device = LibraryDevice(
+            "serial", catalogue_hash=catalogue_hash, input_blocks=input_blocks, library=library
+        )
         self._output = ctypes.create_string_buffer(_OUTPUT_BYTES)
-        self._answers = b""
         self.clock = VirtualClock() if clock is None else clock
         self.boot(boot_nonce)
 
     def boot(self, boot_nonce: int) -> None:
         """Power-cycle the device. Unread answers are lost."""
         self._answers = b""
-        identity = IdentityStruct(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
-        self._init(self._device, ctypes.byref(identity))
+        self._device.boot(boot_nonce)
 
     def write(self, sent: bytes) -> None:
         while True:
-            progress = self._run(
-                self._device, sent, ctypes.c_size_t(len(sent)), self._output, ctypes.c_size_t(_OUTPUT_BYTES)
-            )
+            progress = self._device.run(self._device.state, sent, len(sent), self._output, _OUTPUT_BYTES)
             self._answers += ctypes.string_at(self._output, progress.given)
             sent = sent[progress.taken :]
             if not progress.given and not sent:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analogrig import catalogue
-from analogrig.devices.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.recordings.decoder import CaptureDecoder, CapturedRun, FrameDecoder
 from analogrig.recordings.files import CapturedFrames
 from analogrig.run import CHANNELS, LOST, UNREPORTED, Conditions, Run

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from analogrig.errors import ConfigurationError
-from analogrig.rigs.emulator import EmulatorRig, SetUp
+from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotChange
@@ -14,7 +14,7 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
 
     :raises ConfigurationError: the scenario cannot be played on this rig, or the rig is not emulated.
     """
-    if not isinstance(rig, EmulatorRig):
+    if not is_emulated(rig):
         raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
     setup = rig.set_up(scenario, seed)
     rate_hz = setup.computer.sample_rate_hz

@@ -9,7 +9,7 @@ import functools
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Plant
-from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance
+from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Channel, Segment
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
@@ -419,6 +419,11 @@ class EmulatorRig:
 
     def __exit__(self, *_: object) -> None:
         pass
+
+
+def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
+    """True for the emulated rig, the only one with a circuit, exact components and block sizes."""
+    return isinstance(rig, EmulatorRig)
 
 
 def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:

@@ -27,7 +27,7 @@ from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
 from analogrig.judging.verdict import judge
-from analogrig.rigs.emulator import EmulatorRig
+from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -155,7 +155,7 @@ def _trials(play: Play, otherwise: str) -> Trials:
 def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
     """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
     rig, device = play.bench.rig, described(play.bench.dut)
-    if not isinstance(rig, EmulatorRig) or not are_possible(rig, device):
+    if not is_emulated(rig) or not are_possible(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
     return rig, device
 
