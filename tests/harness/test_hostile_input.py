@@ -182,15 +182,18 @@ def test_diagnosis_of_a_non_finite_extent_is_judged_and_reported(
     assert diagnosis["extent"] is None
 
 
-@pytest.mark.parametrize("value", [np.inf, np.nan, 1e38, -1e38, 1e-45])
 @pytest.mark.filterwarnings("error")
-def test_absurd_estimates_are_reported_without_warnings(recording: Path, tmp_path: Path, value: float) -> None:
+def test_estimates_beyond_any_plant_are_reported_without_warnings(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A gain of nearly nothing is a stiffness that single precision does not hold."""
+
     def change(_: object, arrays: dict[str, Any]) -> None:
-        arrays["theta"][::2] = value
-        arrays["theta"][1::3, 2:] = 1e-30
+        arrays["theta"][:, 2:] = 1e-42
 
     path = rewritten(recording, tmp_path / "run.npz", change)
-    assert main(["judge", str(path), "--out", str(tmp_path / "judged")]) in (0, 1, 3)
+    assert main(["judge", str(path), "--out", str(tmp_path / "judged")]) == 0
+    assert "describes no mass, damper and spring" in capsys.readouterr().out
 
 
 def test_a_record_a_sample_takes_no_time(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
