@@ -60,6 +60,7 @@ def write_reference(folder: Path) -> None:
         "errors": _errors,
         **{page: functools.partial(_file, *described) for page, described in FILES.items()},
     }
+    folder.mkdir(exist_ok=True)
     for name, lines in pages.items():
         path, text = folder / f"{name}.md", "\n".join(lines()) + "\n"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
