@@ -19,7 +19,7 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.devices.registry import from_table
 from analogrig.hardware.simulator.rig import ServedDescription
 from analogrig.hardware.wiring import RealDescription
-from analogrig.protocol.estimator_config import EstimatorConfig
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.rigs.description import described
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario

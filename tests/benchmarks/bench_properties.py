@@ -1,4 +1,4 @@
-"""How often chance fails a sound device in the shipped properties: the figures behind the table of harness/README.md.
+"""How often chance fails a sound device in the shipped properties: the figures behind the table of harness/docs/background/properties.md.
 
 python -m tests.benchmarks properties
 
