@@ -111,7 +111,7 @@ def sources_of_tests() -> str:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_every_named_test_exists(page: Path) -> None:
     named = set(re.findall(r"`(test_\w+)(?:\.\.\.)?`", without_blocks(read(page))))
-    assert sorted(each for each in named if f"def {each}" not in tests()) == []
+    assert sorted(each for each in named if f"def {each}" not in sources_of_tests()) == []
 
 
 @pytest.mark.parametrize(("page", "most"), [("README.md", 120), ("estimator_c/README.md", 100), ("harness/README.md", 100)])
