@@ -200,7 +200,8 @@ def _default(field: dataclasses.Field[Any]) -> str:
     value = field.default if field.default is not dataclasses.MISSING else None
     if value is None or value == "":
         return ""
-    return f"`{str(value).lower() if isinstance(value, bool) else value!r}`".replace("'", '"')
+    shown = str(value).lower() if isinstance(value, bool) else repr(value)
+    return f"`{shown}`".replace("'", '"')
 
 
 # --------------------------------------------------------------------------------------------------------------- Python
