@@ -16,10 +16,10 @@ import pytest
 
 from analogrig import cli, config
 from analogrig.campaigns.spec import CampaignSpec
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.registry import from_table
 from analogrig.hardware.simulator.rig import ServedDescription
 from analogrig.hardware.wiring import RealDescription
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.rigs.description import described
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
@@ -80,11 +80,11 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
         if "instrument" in table:
             rig = config.locate("rigs", "emulator-ideal").read_text(encoding="utf-8")
             path.write_text(f"{rig}\n{text}", encoding="utf-8")
-            assert ServedDescription.load(str(path))
+            ServedDescription.load(str(path))
         elif isinstance(table.get("rig"), dict):
             for rig in table["rig"].values():  # a page may show the pots alone
                 rest = {key: value for key, value in red_pitaya().items() if key not in rig}
-                assert config.build(RealDescription, {**rest, **rig}, "rig")
+                config.build(RealDescription, {**rest, **rig}, "rig")
         elif table.get("kind") == "emulator":
             assert described(str(path))
         elif "trials" in table:

@@ -39,7 +39,9 @@ def run(command: str, folder: Path, status: int = 0) -> str:
 def example(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of the example that the parameter names."""
     ignored = shutil.ignore_patterns("my_device*", "est.h", "build", "__pycache__")
-    return shutil.copytree(EXAMPLES / request.param, tmp_path / request.param, ignore=ignored)
+    copy = tmp_path / str(request.param)
+    shutil.copytree(EXAMPLES / request.param, copy, ignore=ignored)
+    return copy
 
 
 @pytest.mark.parametrize("example", ["first_test"], indirect=True)

@@ -53,7 +53,7 @@ _CHOICES_MAX = 8
 
 
 def write_reference(folder: Path) -> None:
-    """Write every reference page into ``folder``; pages that did not change keep their time stamp."""
+    """Write every reference page into ``folder`` and remove others. Unchanged pages keep their time stamp."""
     pages: dict[str, Callable[[], Iterable[str]]] = {
         "commands": _commands,
         "python": _python,
@@ -64,6 +64,9 @@ def write_reference(folder: Path) -> None:
         **{page: functools.partial(_file, *described) for page, described in FILES.items()},
     }
     folder.mkdir(exist_ok=True)
+    for path in folder.glob("*.md"):
+        if path.stem not in pages:  # written by another version
+            path.unlink(missing_ok=True)
     for name, lines in pages.items():
         path, text = folder / f"{name}.md", "\n".join(lines()) + "\n"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
