@@ -122,7 +122,7 @@ tools: ## install what the tests need from the operating system (apt, sudo if yo
 fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
-fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/README.md
+fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/docs/evidence/hostile-clients.md
 	@$(BIN)/python -m tests.served.hostile $(FUZZ_S) 0
 
 faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs with faults by chance, from FAULTS_SEED

@@ -6,7 +6,8 @@
 ///
 /// The parameters are theta = (a1 .. a_na, b_0 .. b_(nb-1) [, c_1 .. c_nc] [, d]). They are estimated by Bierman's U-D
 /// factorised least squares on the equation whitened by 1/C. A trigger watches the innovation and raises an alarm when
-/// theta has jumped. Missing samples are tolerated. estimator_c/README.md derives the algorithm.
+/// theta has jumped. Missing samples are tolerated. harness/docs/background/estimator.md derives
+/// the algorithm.
 ///
 /// The library is freestanding C99 in float32: no heap, no libm, no globals, no recursion. The caller owns the state;
 /// any number of instances may coexist. It is not thread-safe: one instance belongs to one context, which may be an

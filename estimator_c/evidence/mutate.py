@@ -532,7 +532,7 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
 
 
 def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
-    """Of each file how many mutants there are, were tried, and what became of them; as the README has it."""
+    """Of each file how many mutants there are, were tried, and what became of them; as evidence/README.md has it."""
     rows = ["| | mutants | tried | noticed | the same machine code | do not compile | not noticed |", f"|{'---|' * 7}"]
     for name, count in [*Counter(mutant.file for mutant in every).most_common(), ("all", len(every))]:
         fates = [outcome.fate for outcome in outcomes if name in ("all", outcome.mutant.file)]

@@ -2,7 +2,7 @@
 /// extent and its onset. Thesis 6.2.1.2 leaves this open.
 ///
 /// The plant is M x'' + B x' + K x = F. Any estimator with na = 2 and nb + nk <= 3 will do, with or without offset;
-/// T, M, B and K need not be known. estimator_c/README.md derives the algorithm.
+/// T, M, B and K need not be known. harness/docs/background/estimator.md derives the algorithm.
 ///
 /// The module is optional: est.c does not depend on it. No heap, no libm, no globals. The caller owns the state, which
 /// belongs to one context: an interrupt must not enter a sample while another context works on it.

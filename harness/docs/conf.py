@@ -19,7 +19,9 @@ smartquotes = False  # or --rig is typeset as an en dash
 exclude_patterns = ["_build", "generated.py"]
 html_theme = "furo"
 html_title = f"analogrig {release}"
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_copyright = False
 html_copy_source = False
 pygments_style = "default"
 

@@ -20,6 +20,7 @@ import cantools
 import analogrig
 from analogrig import cli, errors
 from analogrig.campaigns.spec import CampaignSpec
+from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.registry import KINDS
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.emulator import EmulatorDescription
@@ -35,7 +36,6 @@ FILES: Mapping[str, tuple[str, type]] = {
     "emulated-rig-files": ("Emulated rig files", EmulatorDescription),
     "real-rig-files": ("Real rig files", RealDescription),
     "campaign-files": ("Campaign files", CampaignSpec),
-    **{f"device-files-{kind}": (f"Device files of kind {kind}", described) for kind, described in KINDS.items()},
 }
 """Page name to title and to the dataclass that the TOML file fills."""
 
@@ -47,19 +47,26 @@ EXIT_STATUSES = (
     (130, "interrupted"),
 )
 
+OPTION = re.compile(r"(?<![\w`-])(--[a-z][a-z-]*)")
+
 _CHOICES_MAX = 8
 
 
 def write_reference(folder: Path) -> None:
-    """Write every reference page into ``folder``; pages that did not change keep their time stamp."""
+    """Write every reference page into ``folder`` and remove others. Unchanged pages keep their time stamp."""
     pages: dict[str, Callable[[], Iterable[str]]] = {
         "commands": _commands,
         "python": _python,
         "c": _c_interface,
         "messages": _messages,
         "errors": _errors,
+        "device-files": _device_files,
         **{page: functools.partial(_file, *described) for page, described in FILES.items()},
     }
+    folder.mkdir(exist_ok=True)
+    for path in folder.glob("*.md"):
+        if path.stem not in pages:  # written by another version
+            path.unlink(missing_ok=True)
     for name, lines in pages.items():
         path, text = folder / f"{name}.md", "\n".join(lines()) + "\n"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
@@ -96,7 +103,8 @@ def _options(command: argparse.ArgumentParser) -> Iterator[str]:
         if isinstance(action, argparse._HelpAction) or action.help == argparse.SUPPRESS:  # noqa: SLF001
             continue
         names = ", ".join(f"`{option}`" for option in action.option_strings) or f"`{action.metavar or action.dest}`"
-        yield f"| {names} | {_cell(formatter._expand_help(action) if action.help else '')} |"  # noqa: SLF001
+        text = _cell(formatter._expand_help(action) if action.help else "")  # noqa: SLF001
+        yield "| {} | {} |".format(names, OPTION.sub(r"`\1`", text))
 
 
 # ----------------------------------------------------------------------------------------------------------- TOML files
@@ -110,24 +118,40 @@ def _file(title: str, described: type) -> Iterator[str]:
 
 
 def _tables(described: type, path: str) -> Iterator[str]:
-    hints, texts = typing.get_type_hints(described), _field_texts(described)
     yield from ("", f"## {f'[{path}]' if path else 'Top level'}", "")
     if (text := inspect.getdoc(described)) and not text.startswith(f"{described.__name__}("):
         yield from (_first_paragraph(text), "")
-    rows, nested = [], []
-    for field in dataclasses.fields(described):
-        if not field.init or field.name == "name":
-            continue
-        inner = _dataclasses_in(hints[field.name])
-        nested += [(each, f"{path}.{field.name}" if path else field.name) for each in inner]
-        rows.append((field.name, _type_name(hints[field.name]), _default(field), texts.get(field.name, "")))
+    yield from _keys(described, _fields(described))
+    hints = typing.get_type_hints(described)
+    for field in _fields(described):
+        for each in _dataclasses_in(hints[field.name]):
+            yield from _tables(each, f"{path}.{field.name}" if path else field.name)
+
+
+def _keys(described: type, fields: Iterable[dataclasses.Field[Any]]) -> Iterator[str]:
+    hints, texts = typing.get_type_hints(described), _field_texts(described)
     yield "| key | type | default | meaning |"
     yield "|---|---|---|---|"
-    yield from (
-        f"| `{name}` | {_cell(kind)} | {_cell(default)} | {_cell(text)} |" for name, kind, default, text in rows
-    )
-    for each, where in nested:
-        yield from _tables(each, where)
+    for field in fields:
+        cells = (_type_name(hints[field.name]), _default(field), texts.get(field.name, ""))
+        yield f"| `{field.name}` | {' | '.join(map(_cell, cells))} |"
+
+
+def _fields(described: type) -> list[dataclasses.Field[Any]]:
+    return [field for field in dataclasses.fields(described) if field.init and field.name != "name"]
+
+
+def _device_files() -> Iterator[str]:
+    yield from ("# Device files", "", "Generated from the typed descriptions that read the file. `kind` chooses one.")
+    common = set.intersection(*({field.name for field in _fields(described)} for described in KINDS.values()))
+    first = next(iter(KINDS.values()))
+    yield from ("", "## Keys of every kind", "")
+    yield from _keys(first, (field for field in _fields(first) if field.name in common))
+    for kind, described in KINDS.items():
+        own = [field for field in _fields(described) if field.name not in common]
+        yield from ("", f"## Kind {kind}", "")
+        yield from _keys(described, own) if own else ("No further keys.",)
+    yield from _tables(EstimatorConfig, "estimator")
 
 
 def _field_texts(described: type) -> dict[str, str]:
@@ -179,7 +203,8 @@ def _default(field: dataclasses.Field[Any]) -> str:
     value = field.default if field.default is not dataclasses.MISSING else None
     if value is None or value == "":
         return ""
-    return f"`{str(value).lower() if isinstance(value, bool) else value!r}`".replace("'", '"')
+    shown = str(value).lower() if isinstance(value, bool) else repr(value)
+    return f"`{shown}`".replace("'", '"')
 
 
 # --------------------------------------------------------------------------------------------------------------- Python

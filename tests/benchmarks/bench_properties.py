@@ -1,4 +1,4 @@
-"""How often chance fails a sound device in the shipped properties: the figures behind the table of harness/README.md.
+"""False-failure rates of the shipped properties for a sound device: the table of background/properties.md.
 
 python -m tests.benchmarks properties
 

@@ -63,7 +63,7 @@ ESTIMATOR = EstimatorConfig(forgetting=0.97, p0=1000.0, refresh_n=10, warm_up_n=
 STEPS = ("handshake", "configuration", "start", "samples", "stop")
 
 ExchangeKind = Literal["sample", "block", "stream"]
-README = Path(__file__).parents[2] / "harness" / "README.md"
+PAGE = Path(__file__).parents[2] / "harness/docs/background/link-faults.md"
 TABLES = {"serial": "fault of a serial line", "can": "fault of a CAN bus", "can-fd": "fault of a CAN bus"}
 """Heading of the first column of its table."""
 DOCUMENTED_AS = {"same": "as without", "LOST": "lost", "INCONCLUSIVE": "inconclusive"}
@@ -317,10 +317,10 @@ def everywhere(
 
 @functools.cache
 def documented(link: LinkKind) -> dict[tuple[str, Direction], dict[str, set[str]]]:
-    """The table of harness/README.md: by kind and direction, for each of STEPS, what may come of it."""
+    """Documented outcomes of the page link-faults.md, by kind and direction and by step."""
     table: dict[tuple[str, Direction], dict[str, set[str]]] = {}
     heading = TABLES[link]
-    text = README.read_text().partition(f"\n| {heading} |")[2].partition("\n\n")[0]
+    text = PAGE.read_text().partition(f"\n| {heading} |")[2].partition("\n\n")[0]
     for kinds, way, cells in re.findall(r"^\| (`[a-z`, -]+`) (to|from|both) \|(.*)\|$", text, re.MULTILINE):
         outcomes = [{DOCUMENTED_AS.get(word, word) for word in re.findall(r"\w+", cell)} for cell in cells.split("|")]
         for kind in re.findall(r"[a-z-]+", kinds):

@@ -47,7 +47,7 @@ LSB_V = 20.0 / 4096
     ids=["front, polyester", "front, polypropylene", "shock, polyester"],
 )
 def test_twin_of_a_random_rig_follows_it_and_its_errors_cover_the_truth(number: int, stocks: tuple[Stock, ...]) -> None:
-    """The limit is 1 LSB; twenty rigs stay below half of it (README).
+    """The limit is 1 LSB; twenty rigs stay below half of it (calibration.md).
 
     One of 17 Gaussian errors exceeds 4.5 standard errors with a probability of 1e-4; chi-square 3 x 17 with 3e-5.
     """

@@ -143,11 +143,11 @@ def test_rig_without_a_channel_is_refused(tmp_path: Path) -> None:
         open_rig(str(path))
 
 
-def test_readme_has_every_key_of_a_scenario_file() -> None:
-    readme = (Path(__file__).parents[2] / "harness" / "README.md").read_text(encoding="utf-8")
-    shown = re.search(r"^## Scenario files\n\n```toml\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
+def test_page_has_every_key_of_a_scenario_file() -> None:
+    page = (Path(__file__).parents[2] / "harness/docs/howto/write-a-scenario.md").read_text(encoding="utf-8")
+    shown = re.search(r"^```toml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert shown is not None
-    Scenario.from_table(tomllib.loads(shown[1]), "README")
+    Scenario.from_table(tomllib.loads(shown[1]), "page")
     tables = (Scenario, Excitation, PlantChoice, Tweak, Expectations, Statement)
     keys = {(table.__name__, each.name) for table in tables for each in dataclasses.fields(table)}
     assert [key for key in sorted(keys) if not re.search(rf"\b{key[1]}\b", shown[1])] == []

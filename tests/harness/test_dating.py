@@ -285,8 +285,8 @@ def test_range_that_leaves_the_record_raises(search: range) -> None:
 
 
 def test_begin_and_end_of_an_even_turn_are_within_their_intervals() -> None:
-    """Machines of real components. The mean width of a hundred begins is 21 to 22 samples (README); ten instants stay
-    below twice that."""
+    """Machines of real components. The mean width of a hundred begins is 21 to 22 samples (dating.md); ten instants
+    stay below twice that."""
     misses, widths = 0, []
     for seed in range(5):
         trial = Trial.ramp(seed, "free" if seed % 2 else "card")

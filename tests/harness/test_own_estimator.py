@@ -1,7 +1,8 @@
-"""An estimator of one's own, as harness/README.md says it is brought: copied and pasted into an empty folder."""
+"""The tutorial on an estimator of one's own, pasted into an empty folder."""
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -11,21 +12,21 @@ import pytest
 
 from analogrig.cli import main
 
-CHECKOUT = Path(__file__).parents[2]
-README = CHECKOUT / "harness" / "README.md"
+PAGE = Path(__file__).parents[2] / "harness/docs/tutorials/your-estimator.md"
 
 
-def pasted(section: str) -> list[str]:
-    """The shell commands of the section, block by block."""
-    text = README.read_text(encoding="utf-8").partition(f"\n## {section}\n")[2].partition("\n## ")[0]
-    commands = re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    return [each.replace("CLONE", str(CHECKOUT)).replace(".venv/bin/python", sys.executable) for each in commands]
+def pasted() -> str:
+    """The shell blocks of the page, in order."""
+    return "".join(re.findall(r"^```sh\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL))
 
 
-def test_own_estimator_is_judged_as_the_readme_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sources, state, estimator, build, *_ = pasted("Your own estimator")
-    script = f"set -e\n{sources}\n{state}\n{estimator}\n{build}"
-    subprocess.run(["sh", "-c", script], cwd=tmp_path, check=True, capture_output=True)
+def test_own_estimator_is_judged_as_the_page_states(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    script = f"set -e\n{pasted()}"
+    done = subprocess.run(
+        ["sh", "-c", script], cwd=tmp_path, env=os.environ | {"PATH": path}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "my_device").is_file()
     device = f"inproc:{tmp_path / 'my_device.so'}"
     assert main(["run", "--dut", device, "--out", str(tmp_path / "mine")]) == 1

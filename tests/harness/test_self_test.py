@@ -167,7 +167,7 @@ def ranges(**changed: tuple[float, float]) -> dict[str, tuple[float, float]]:
 
 FORCE_LSB_V, LSB_V = 12.0 / 4096, 10.0 / 4096
 SWING_LSB = 9.0 / FORCE_LSB_V, 5.43 / LSB_V
-# Faults are twice and half of the limits of harness/README.md, section Self-test: gain of 1 % of the force and 5 % of
+# Faults are twice and half of the limits of harness/docs/background/self-test.md: gain of 1 % of the force and 5 % of
 # the displacement, offset of 60 mV, noise of 0.2 % of the swing, skew of 0.1 sample (5 us), 50 ppm, mass of 30 %,
 # damping of 15 %.
 

@@ -1,7 +1,8 @@
 /// device_loop: the loop of every port (receive, run the device, transmit, sleep), and the functions that a port
 /// provides.
 ///
-/// A port is four functions and a main() that calls device_loop(). estimator_c/README.md has an example.
+/// A port is four functions and a main() that calls device_loop(). Example:
+/// harness/docs/howto/port-to-a-board.md.
 /// Distributed under the terms of the MIT License.
 
 #ifndef DEVICE_LOOP_H_INCLUDED

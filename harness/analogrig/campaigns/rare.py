@@ -13,7 +13,7 @@ weights from being large (the balance heuristic of Veach and Guibas, SIGGRAPH 19
 good the mean is, plays of other seeds tell: ``statistics.mean_bounds``.
 
 Splitting by levels of the statistic is unbiased too, and was given up: one reading far off lifts the statistic by many
-levels at once, which a play of some thousand samples hardly ever sees (see harness/README.md).
+levels at once, which a play of some thousand samples hardly ever sees (harness/docs/background/campaigns.md).
 """
 
 from __future__ import annotations

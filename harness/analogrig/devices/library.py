@@ -54,7 +54,7 @@ def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
     if lacking:
         raise ConfigurationError(
             f"{library}: is no library of a device: it lacks {', '.join(lacking)}"
-            ' (harness/README.md, "Your own estimator", says what to compile)'
+            " (sources to compile: harness/docs/tutorials/your-estimator.md)"
         )
     return c
 

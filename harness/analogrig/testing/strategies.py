@@ -28,7 +28,7 @@ FIELDS = {"M": "mass_kg", "B": "damping_n_s_per_m", "K": "stiffness_n_per_m"}
 REACH = {"M": (35.0, 150.0), "K": (17_000.0, 29_000.0)}
 DAMPING_RATIO = (0.4, 1.2)
 """The plants that the default device is held to, all of which the pots can show. It raises false alarms on slower ones
-(estimator_c/README.md)."""
+(harness/docs/background/properties.md)."""
 
 WIDE_RANGES_V = {
     "force": (-1.0, 11.0),

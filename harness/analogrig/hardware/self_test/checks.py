@@ -1,7 +1,7 @@
 """Checks of the self-test: each quantity with its standard error, its limits and advice.
 
 The limits admit every machine of 1 % resistors, 5 % capacitors and amplifiers with 3 mV of offset, and nothing within
-them affects a verdict. harness/README.md, section Self-test, gives the reason for each.
+them affects a verdict. harness/docs/background/self-test.md gives the reasons.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     pytest --pyargs analogrig.testing.properties --hil-dut serial:/dev/ttyACM0 --hil-profile nightly
 
 What fails is shrunk to the simplest scenario that still fails, and left as files (see --hil-runs-dir). How seldom a
-sound device fails one is derived in harness/README.md.
+sound device fails one is derived in harness/docs/background/properties.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What can be seen is seen in time; where nothing happens nothing is seen; what is said to have changed has, mostly.
 
 How late is in time, how often chance may spoil it, and how often a name may be wrong is said beside each number here,
-and derived in harness/README.md.
+and derived in harness/docs/background/properties.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The ports in estimator_c/README.md are whole: they compile and link with what the page says, and do what it says."""
+"""The ports of the how-to pages and the example of estimator_c/README.md compile, link and work as documented."""
 
 from __future__ import annotations
 
@@ -20,15 +20,22 @@ REGISTERS = {
     "a UART": "volatile uint32_t UART_STATUS, UART_DATA, RANDOM;",
     "a CAN controller": "uint32_t CAN1[0x400 / 4]; volatile uint32_t RANDOM;",
 }
-EXAMPLES = dict(
-    zip(REGISTERS, re.findall(r"```c\n(.*?)```", (ESTIMATOR / "README.md").read_text(), re.DOTALL), strict=True)
-)
+PAGES = {
+    "a UART": ROOT / "harness/docs/howto/port-to-a-board.md",
+    "a CAN controller": ROOT / "harness/docs/howto/port-to-a-can-controller.md",
+}
 
 
-def compiled(example: str, product: Path, *flags: str) -> Path:
+def example(page: Path) -> str:
+    """The one C program of a page."""
+    (program,) = re.findall(r"```c\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    return str(program)
+
+
+def compiled(port: str, product: Path, *flags: str) -> Path:
     folder = product.parent
-    (folder / "port.c").write_text(EXAMPLES[example])
-    (folder / "registers.c").write_text(f"#include <stdint.h>\n{REGISTERS[example]}\n")
+    (folder / "port.c").write_text(example(PAGES[port]))
+    (folder / "registers.c").write_text(f"#include <stdint.h>\n{REGISTERS[port]}\n")
     sources = [*folder.glob("*.c"), *(path for part in (*FOLDERS, CODECS) for path in part.glob("*.c"))]
     command = ["gcc", "-std=c99", "-ffp-contract=off", "-DNDEBUG", "-Wall", "-Wextra", "-Werror", *flags]
     command += [f"-I{part}" for part in (*FOLDERS, CODECS)]
@@ -37,6 +44,16 @@ def compiled(example: str, product: Path, *flags: str) -> Path:
     )
     assert done.returncode == 0, done.stderr
     return product
+
+
+def test_example_of_the_readme_compiles_and_runs(tmp_path: Path) -> None:
+    (tmp_path / "example.c").write_text(example(ESTIMATOR / "README.md"))
+    product = tmp_path / "example"
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", f"-I{ESTIMATOR / 'core'}"]
+    sources = [str(tmp_path / "example.c"), str(ESTIMATOR / "core" / "est.c")]
+    subprocess.run(["gcc", *flags, *sources, "-o", str(product)], check=True)
+    quiet = "".join(f"{2000.0 if k // 50 % 2 else 100.0} 1000\n" for k in range(400))
+    assert subprocess.run([product], input=quiet, capture_output=True, text=True, check=True).stderr == ""
 
 
 def test_port_to_a_uart_compiles_and_links(tmp_path: Path) -> None:

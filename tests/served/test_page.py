@@ -1,4 +1,4 @@
-"""What harness/README.md says of the served instrument."""
+"""The page on the served instrument: its example, its commands and its table of faults."""
 
 from __future__ import annotations
 
@@ -15,21 +15,16 @@ from tests.harness.processes import LONG_S
 from tests.served.serving import serving
 from tests.served.talk import interpreter
 
-SECTION = (
-    (Path(__file__).parents[2] / "harness" / "README.md")
-    .read_text()
-    .partition("## The emulator as an instrument\n")[2]
-    .partition("\n## ")[0]
-)
+PAGE = (Path(__file__).parents[2] / "harness/docs/howto/serve-the-emulator.md").read_text(encoding="utf-8")
 
 
 def block(language: str) -> str:
-    return str(re.findall(rf"```{language}\n(.*?)```", SECTION, re.DOTALL)[0])
+    return str(re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[0])
 
 
 def test_the_table_of_what_can_be_wrong_has_every_key_with_its_default() -> None:
     table = tomllib.loads(block("toml"))["instrument"]
-    assert config.build(InstrumentDescription, table, "README") == InstrumentDescription()
+    assert config.build(InstrumentDescription, table, "page") == InstrumentDescription()
     known = dataclasses.asdict(InstrumentDescription())
     assert {name: set(part) for name, part in table.items()} == {name: set(part) for name, part in known.items()}
 
@@ -43,7 +38,7 @@ def test_the_example_runs_as_it_stands(tmp_path: Path) -> None:
 
 def test_every_command_of_the_instrument_is_in_the_table() -> None:
     """Each of its words, but those that are optional."""
-    rows = SECTION.partition("| commands | |")[2].partition("\n\n")[0]
+    rows = PAGE.partition("| commands | effect |")[2].partition("\n\n")[0]
     words = {word for code in re.findall(r"`([^`]+)`", rows) for word in re.findall(r"[A-Za-z]+", code)}
     for expression, *_ in interpreter()._commands:
         long = re.findall(r"\(\?:(\w+)\|", expression.pattern)

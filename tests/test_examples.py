@@ -1,0 +1,106 @@
+"""Every example of harness/examples, run in a copy of its folder as its README states."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from analogrig import cli
+from tests.harness.processes import LONG_S
+
+CHECKOUT = Path(__file__).parents[1]
+EXAMPLES = CHECKOUT / "harness" / "examples"
+TUTORIAL = CHECKOUT / "harness/docs/tutorials/your-estimator.md"
+BIN = Path(sys.executable).parent
+PORT_OF_THE_EXAMPLES = "5000"
+
+
+def run(command: str, folder: Path, status: int = 0) -> str:
+    """Run a shell command with this environment's Python first; return its output."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("ANALOGRIG", "PYTEST"))}
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, env=environment | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False, timeout=LONG_S,
+    )  # fmt: skip
+    assert done.returncode == status, done.stdout
+    return done.stdout
+
+
+@pytest.fixture
+def example(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A copy of the example that the parameter names."""
+    ignored = shutil.ignore_patterns("my_device*", "est.h", "build", "__pycache__")
+    copy = tmp_path / str(request.param)
+    shutil.copytree(EXAMPLES / request.param, copy, ignore=ignored)
+    return copy
+
+
+@pytest.mark.parametrize("example", ["first_test"], indirect=True)
+def test_first_test_passes_with_the_projects_estimator(example: Path) -> None:
+    assert "3 passed" in run("pytest -q --hil-dut inproc", example)
+
+
+@pytest.mark.parametrize("example", ["estimator"], indirect=True)
+def test_estimator_compiles_and_its_tests_run(example: Path) -> None:
+    assert "1 passed, 1 xfailed" in run("make && pytest -q", example)
+    for line in scripts():
+        if line.startswith("pytest"):
+            assert "1 passed" in run(line, example)
+        elif line.startswith("analogrig"):
+            assert "PASSED" in run(line, example)
+
+
+def test_estimator_is_that_of_the_tutorial() -> None:
+    pasted: dict[str, str] = {}
+    pattern = r"^cat (>>?) (\S+) <<'EOF'\n(.*?)^EOF$"
+    for redirection, path, text in re.findall(pattern, TUTORIAL.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
+        pasted[path] = (pasted[path] if redirection == ">>" else "") + text
+    assert set(pasted) == {"src/my_state.h", "src/my_estimator.c", "Makefile"}
+    for path, text in pasted.items():
+        assert (EXAMPLES / "estimator" / path).read_text(encoding="utf-8") == text, path
+
+
+@pytest.mark.parametrize("example", ["rig"], indirect=True)
+def test_rig_is_played_behind_the_served_instrument(example: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    file = example / "rigs.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace(PORT_OF_THE_EXAMPLES, port), encoding="utf-8")
+    played = f"analogrig run --rig bench --dut inproc --allow 127.0.0.1:{port}"
+    assert "PASSED" in run(f"analogrig serve --port {port} -- {played}", example)
+    assert "--allow" in run("analogrig run --rig bench --dut inproc", example, status=2)
+
+
+@pytest.mark.parametrize("example", ["campaign"], indirect=True)
+def test_campaign_is_played(example: Path) -> None:
+    run("analogrig campaign campaign.toml --workers 1", example)
+    assert list((example / "build" / "campaign").glob("*.json"))
+
+
+def scripts() -> list[str]:
+    """Shell lines of the CI examples."""
+    github = yaml.safe_load((EXAMPLES / "ci/github.yml").read_text(encoding="utf-8"))
+    gitlab = yaml.safe_load((EXAMPLES / "ci/gitlab.yml").read_text(encoding="utf-8"))
+    steps = github["jobs"]["test"]["steps"]
+    lines = [step["run"] for step in steps if "run" in step]
+    assert lines == gitlab["estimator"]["script"]
+    return lines
+
+
+def test_ci_files_run_the_same_lines_and_each_is_understood() -> None:
+    for line in scripts():
+        words = shlex.split(line)
+        if words[0] == "analogrig":
+            cli._parser().parse_args(words[1:])
+        else:
+            assert words[0] in {"pip", "make", "pytest"}
