@@ -151,7 +151,7 @@ def test_device_that_is_not_excited_is_not_certified_by_its_silence(
     still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
     options = ["--far", "0.03", "--confidence", "0.9", "--allowed", "0", "--scenario", str(still), "--workers", "1"]
     assert main(["certify", "--dut", "inproc", *options, *way]) == 3
-    assert "INCONCLUSIVE\n  seed 0: no alarm could come in any of" in capsys.readouterr().out
+    assert "INCONCLUSIVE\n  seed 0: the trigger was armed in none of" in capsys.readouterr().out
 
 
 def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_elsewhere() -> None:

@@ -68,7 +68,7 @@ def test_run_of_another_program_is_played_and_not_judged(program: str) -> None:
     verdict = judge(run)
     assert run.samples == scenario.samples
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons[0].startswith(f"the program {program} is not one mass, damper and spring")
+    assert verdict.reasons[0].startswith(f"the program {program} is not a single mass, damper and spring")
 
 
 def test_two_masses_sit_where_their_springs_in_series_say() -> None:
