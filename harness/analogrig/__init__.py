@@ -19,8 +19,8 @@ The names in ``__all__`` are the public interface, and so are their documented m
 
 =============  =========================================================================================
 play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Dut``, ``EstimatorConfig``
-describe       ``Scenario``, ``Excitation``, ``Plant``, ``PlantChoice``, ``Tweak``, ``Expectations``
-judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``TweakVerdict``, ``detectable``, ``write_report``
+describe       ``Scenario``, ``Excitation``, ``Plant``, ``PlantChoice``, ``PotChange``, ``Expectations``
+judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``ChangeVerdict``, ``detectable``, ``write_report``
 test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_seed``, ``strategies``
 errors         ``AnalogrigError`` and its kinds; ``EmulatorError``
 =============  =========================================================================================
@@ -47,13 +47,13 @@ if TYPE_CHECKING:
     )
     from analogrig.estimator_config import EstimatorConfig
     from analogrig.judging.information import detectable
-    from analogrig.judging.verdict import TweakVerdict, Verdict, judge
+    from analogrig.judging.verdict import ChangeVerdict, Verdict, judge
     from analogrig.plant import Plant
     from analogrig.reporting.page import write_report
     from analogrig.rigs.description import open_rig
     from analogrig.rigs.rig import Rig
     from analogrig.run import Conditions, Run
-    from analogrig.scenario import Expectations, PlantChoice, Scenario, Tweak
+    from analogrig.scenario import Expectations, PlantChoice, PotChange, Scenario
     from analogrig.testing import strategies
     from analogrig.testing.experiment import Play
     from analogrig.testing.played import Played, rate_below
@@ -71,14 +71,14 @@ else:
             "AnalogrigError ConfigurationError DeviceError LinkError LinkTimeout RecordingError RigError"
         ),
         "analogrig.judging.information": "detectable",
-        "analogrig.judging.verdict": "TweakVerdict Verdict judge",
+        "analogrig.judging.verdict": "ChangeVerdict Verdict judge",
         "analogrig.plant": "Plant",
         "analogrig.devices.dut": "Dut open_dut",
         "analogrig.reporting.page": "write_report",
         "analogrig.rigs.description": "open_rig",
         "analogrig.rigs.rig": "Rig",
         "analogrig.run": "Conditions Run",
-        "analogrig.scenario": "Expectations PlantChoice Scenario Tweak",
+        "analogrig.scenario": "Expectations PlantChoice Scenario PotChange",
         "analogrig.testing.experiment": "Play",
         "analogrig.testing.played": "Played rate_below",
         "analogrig.testing.properties": "with_some_seed",
@@ -111,6 +111,7 @@ else:
 __all__ = [
     "AnalogrigError",
     "Bench",
+    "ChangeVerdict",
     "Conditions",
     "ConfigurationError",
     "DeviceError",
@@ -126,13 +127,12 @@ __all__ = [
     "PlantChoice",
     "Play",
     "Played",
+    "PotChange",
     "RecordingError",
     "Rig",
     "RigError",
     "Run",
     "Scenario",
-    "Tweak",
-    "TweakVerdict",
     "Verdict",
     "__version__",
     "detectable",

@@ -62,7 +62,7 @@ class PlantChoice:
 
 
 @dataclass(frozen=True)
-class Tweak:
+class PotChange:
     """Change of pots at the instant of a sample: mass in kg, damping in N s/m, stiffness in N/m; None: unchanged.
 
     The next sample is the first one affected. With ``ramp_n`` the pots turn linearly from that instant and arrive
@@ -82,7 +82,7 @@ class Tweak:
         if not 0 <= self.ramp_n <= MAX_RAMP_N:
             raise ValueError(f"ramp_n must be in 0 .. {MAX_RAMP_N}, not {self.ramp_n}")
         if not _overrides(self):
-            raise ValueError("a tweak must change mass_kg, damping_n_s_per_m or stiffness_n_per_m")
+            raise ValueError("a pot change must set mass_kg, damping_n_s_per_m or stiffness_n_per_m")
 
     def overrides(self) -> dict[str, float]:
         """Changed parameters, by their names in Plant."""
@@ -154,7 +154,7 @@ class Scenario:
     samples: int
     excitation: Excitation
     plant: PlantChoice = field(default_factory=PlantChoice)
-    tweaks: tuple[Tweak, ...] = ()
+    tweaks: tuple[PotChange, ...] = ()
     expect: Expectations = field(default_factory=Expectations)
     random_phase: bool = False
     """The excitation's phase is drawn from the seed instead of taken from ``excitation.phase``."""
@@ -238,16 +238,16 @@ class Scenario:
         return tuple(out)
 
 
-def _overrides(change: PlantChoice | Tweak) -> dict[str, float]:
+def _overrides(change: PlantChoice | PotChange) -> dict[str, float]:
     values = {item.name: getattr(change, item.name) for item in dataclasses.fields(Plant)}
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _apply_overrides(plant: Plant, change: PlantChoice | Tweak) -> Plant:
+def _apply_overrides(plant: Plant, change: PlantChoice | PotChange) -> Plant:
     return dataclasses.replace(plant, **_overrides(change))
 
 
-def _check_parameters(change: PlantChoice | Tweak) -> None:
+def _check_parameters(change: PlantChoice | PotChange) -> None:
     for name, value in _overrides(change).items():
         if not LEAST_PARAMETER < value < MOST_PARAMETER:
             limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"

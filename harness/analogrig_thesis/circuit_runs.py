@@ -15,7 +15,7 @@ from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import Plant
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run, Segment
-from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import Excitation
 from analogrig_thesis.document import Signal
 from analogrig_thesis.plants import PERIOD_S, PROFILE
@@ -58,7 +58,8 @@ TRACKING = Scenario(
     excitation=Excitation(frequency_hz=100.0, phase=0.25),
     # Each change sets all pots, also those that stay.
     tweaks=tuple(
-        Tweak(start, **vars(segment.plant)) for start, segment in zip((200, 400, 600, 800), PROFILE[1:], strict=True)
+        PotChange(start, **vars(segment.plant))
+        for start, segment in zip((200, 400, 600, 800), PROFILE[1:], strict=True)
     ),
     description="the four changes of section 4.4.1, each while the force is on",
 )

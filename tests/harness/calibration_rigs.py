@@ -22,7 +22,7 @@ from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibra
 from analogrig.hardware.calibration.plan import Program, scenarios
 from analogrig.hardware.calibration.recordings import DISPLACEMENT, noise_free_lsb, record
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer
 
 _LOADS = {"M": "R1", "B": "RB", "K": "RK"}
@@ -131,9 +131,9 @@ def thesis_profile(program: Program) -> Scenario:
         excitation=thesis.excitation,
         plant=PlantChoice("shock"),
         tweaks=(
-            Tweak(1200, stiffness_n_per_m=18000.0 * k),
-            Tweak(1400, damping_n_s_per_m=3453.0 * b),
-            Tweak(1500, damping_n_s_per_m=2123.0 * b, stiffness_n_per_m=20000.0 * k),
+            PotChange(1200, stiffness_n_per_m=18000.0 * k),
+            PotChange(1400, damping_n_s_per_m=3453.0 * b),
+            PotChange(1500, damping_n_s_per_m=2123.0 * b, stiffness_n_per_m=20000.0 * k),
         ),
         name="thesis, shock",
     )

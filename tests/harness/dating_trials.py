@@ -21,7 +21,7 @@ from analogrig.judging import information
 from analogrig.plant import PARAMETERS, Plant, SampledPlant
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
-from analogrig.scenario import PLANTS, Scenario, Tweak
+from analogrig.scenario import PLANTS, PotChange, Scenario
 from analogrig_emulator import Excitation
 
 FRONT = PLANTS["front"]
@@ -67,8 +67,10 @@ def square(clock: Clock, frequency_hz: float, high_v: float) -> Excitation:
     return Excitation(low_v=0.1, high_v=high_v, frequency_hz=frequency_hz, clock=clock, drift_ppm=drift_ppm)
 
 
-def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> Tweak:
-    return Tweak(sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()})
+def tweak_of(sample: int, before: Plant, after: Plant, ramp_n: int = 0) -> PotChange:
+    return PotChange(
+        sample, ramp_n=ramp_n, **{FIELDS[name]: new for name, (_, new) in before.changes_to(after).items()}
+    )
 
 
 def change_front(rng: np.random.Generator, least: float, most: float, together: int) -> Plant:

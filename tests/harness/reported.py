@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict
+from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict
 from analogrig.plant import Plant
 from analogrig.run import Run
 from tests.harness.runs import M_PER_CODE, N_PER_CODE, made_run
@@ -54,14 +54,14 @@ def reported_verdict(run: Run) -> Verdict:
         outcome="failed",
         reasons=("missed 1 of 2 changes",),
         tweaks=(
-            TweakVerdict(
+            ChangeVerdict(
                 *(1200, "K", {"K": 24500.0}, {"K": 18000.0}),
                 latency_n=3,
                 bound_n=2,
                 deadline_n=20,
                 diagnosis=SAID,
             ),
-            TweakVerdict(1500, "M", {"M": 115.0}, {"M": 30.0}, latency_n=None, bound_n=4, deadline_n=20),
+            ChangeVerdict(1500, "M", {"M": 115.0}, {"M": 30.0}, latency_n=None, bound_n=4, deadline_n=20),
         ),
         false_alarms=(FALSE_ALARM,),
         estimates=(

@@ -12,7 +12,7 @@ from analogrig.hardware.by_hand import ByHand, Tweak, doubts
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
-from analogrig.scenario import Tweak as PlayedTweak
+from analogrig.scenario import PotChange as PlayedTweak
 from tests.harness.dating_trials import FRONT, Clock, Several, play, scenario_of
 
 RATE_HZ = 20e3

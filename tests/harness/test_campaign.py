@@ -38,7 +38,7 @@ from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 from tests.harness.processes import LONG_S
 
 SPEC = """
@@ -77,7 +77,7 @@ def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
     assert 2500.0 < damping < 3021.0
     base = dataclasses.replace(Scenario.load("healthy"), samples=1300)
     plant = dataclasses.replace(base.plant, damping_n_s_per_m=damping)
-    scenario = dataclasses.replace(base, plant=plant, tweaks=(Tweak(1200, stiffness_n_per_m=0.9 * 24500.0),))
+    scenario = dataclasses.replace(base, plant=plant, tweaks=(PotChange(1200, stiffness_n_per_m=0.9 * 24500.0),))
     rig_file = tmp_path / "emulator.toml"
     rig_file.write_text((Path("fixtures/rigs/emulator.toml")).read_text().replace("noise_lsb = 1.0", "noise_lsb = 0.5"))
     with open_rig(str(rig_file)) as rig, open_dut("inproc", exchange="block") as dut:

@@ -27,7 +27,7 @@ from analogrig.devices.dut import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.rigs.description import open_rig
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 
 # -------------------------------------------------------------------------------------------------------- certificates
 
@@ -151,7 +151,7 @@ def test_device_that_is_not_excited_is_not_certified_by_its_silence(
     still.write_text("samples = 2000\n[excitation]\nlow_v = 1.0\nhigh_v = 1.0001\n")
     options = ["--far", "0.03", "--confidence", "0.9", "--allowed", "0", "--scenario", str(still), "--workers", "1"]
     assert main(["certify", "--dut", "inproc", *options, *way]) == 3
-    assert "INCONCLUSIVE\n  seed 0: no alarm could come in any of" in capsys.readouterr().out
+    assert "INCONCLUSIVE\n  seed 0: the trigger was armed in none of" in capsys.readouterr().out
 
 
 def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_elsewhere() -> None:
@@ -307,7 +307,7 @@ def test_recordings_of_one_name_that_played_something_else_are_not_paired(tmp_pa
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=700, name="drawn")
     with open_rig("emulator") as rig, open_dut("inproc", exchange="block") as dut:
         for factor in (0.7, 0.9):
-            drawn = dataclasses.replace(scenario, tweaks=(Tweak(400, stiffness_n_per_m=24500.0 * factor),))
+            drawn = dataclasses.replace(scenario, tweaks=(PotChange(400, stiffness_n_per_m=24500.0 * factor),))
             Bench(rig, dut).play(drawn, 0).save(tmp_path / "both" / str(factor) / "run.npz")
     assert len(dict(load(tmp_path / "both").trials)) == 2
     found = compare(load(tmp_path / "both" / "0.7").trials, load(tmp_path / "both" / "0.9").trials)
@@ -432,7 +432,7 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
 
 def test_too_few_seeds_to_show_anything_are_inconclusive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     healthy = Scenario.load("healthy")
-    scenario = dataclasses.replace(healthy, samples=700, tweaks=(Tweak(400, stiffness_n_per_m=20000.0),))
+    scenario = dataclasses.replace(healthy, samples=700, tweaks=(PotChange(400, stiffness_n_per_m=20000.0),))
     with open_rig("emulator") as rig:
         for name, dut in (("a", "inproc"), ("b", "mean-between-faults")):
             with open_dut(dut, exchange="block") as device:

@@ -68,7 +68,7 @@ def test_constant_force_gives_no_exposure_even_without_the_idle_flag(idle_n: int
     run = made_run(200.0 + 0.01 * SQUARE_N, [(0, FRONT)], estimator=estimator)
     found = exposure(run)
     assert (found.armed, found.unexcited) == (0, 600)
-    assert "no alarm could come in any of 600 samples: in 600 it was not excited" in found.lack_of_evidence
+    assert "the trigger was armed in none of 600 samples: in 600 it was not excited" in found.lack_of_evidence
     assert not rate_below(0.5, [Played(run)], confidence=0.9)
 
 
@@ -101,7 +101,7 @@ def test_idle_samples_of_a_device_in_this_process_are_not_exposed() -> None:
 def test_run_in_which_no_alarm_could_come_is_inconclusive(estimator: dict[str, object], why: str) -> None:
     verdict = judge(made(**estimator))
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons == (f"no alarm could come in any of 600 samples: {why}",)
+    assert verdict.reasons == (f"the trigger was armed in none of 600 samples: {why}",)
     assert judge(made()).outcome == "passed"
 
 

@@ -15,7 +15,7 @@ import analogrig
 PUBLIC = """
     AnalogrigError Bench Conditions ConfigurationError DeviceError Dut EmulatorError EstimatorConfig Excitation
     Expectations Finding LinkError LinkTimeout Plant PlantChoice Play Played RecordingError Rig RigError Run Scenario
-    Tweak TweakVerdict Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
+    PotChange ChangeVerdict Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
     write_report
 """.split()
 

@@ -20,8 +20,8 @@ from analogrig.hardware.real import RealRig
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
+from analogrig.scenario import PotChange as Asked
 from analogrig.scenario import Scenario
-from analogrig.scenario import Tweak as Asked
 from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 
 SAMPLES, ASKED_AT = 10_000, 3000

@@ -13,7 +13,7 @@ from analogrig.bench import Bench
 from analogrig.devices.dut import open_dut
 from analogrig.judging.verdict import judge
 from analogrig.run import Run
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 from tests.harness.allowed import open_allowed
 from tests.harness.served import Served, served
 
@@ -33,7 +33,7 @@ with socket.create_connection((host, int(port))) as connection:
 SCENARIO = dataclasses.replace(
     Scenario.load("thesis"),
     samples=16_000,
-    tweaks=(Tweak(4000, stiffness_n_per_m=18000.0), Tweak(11_000, damping_n_s_per_m=2200.0)),
+    tweaks=(PotChange(4000, stiffness_n_per_m=18000.0), PotChange(11_000, damping_n_s_per_m=2200.0)),
 )
 
 

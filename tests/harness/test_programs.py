@@ -23,7 +23,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.run import Run, Segment
-from analogrig.scenario import PlantChoice, Scenario, Tweak
+from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import PROGRAMS, SuspensionComputer
 from tests.harness.runs import made_run
 
@@ -68,7 +68,7 @@ def test_run_of_another_program_is_played_and_not_judged(program: str) -> None:
     verdict = judge(run)
     assert run.samples == scenario.samples
     assert verdict.outcome == "inconclusive"
-    assert verdict.reasons[0].startswith(f"the program {program} is not one mass, damper and spring")
+    assert verdict.reasons[0].startswith(f"the program {program} is not a single mass, damper and spring")
 
 
 def test_two_masses_sit_where_their_springs_in_series_say() -> None:
@@ -119,7 +119,7 @@ def test_latency_of_a_ramp_counts_from_its_start(ramped: Path) -> None:
     assert tweak.bound_n is not None
     assert tweak.latency_n is not None
     assert 0.5 * tweak.bound_n < tweak.latency_n < 60
-    jump = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(Tweak(300, stiffness_n_per_m=18000.0),))
+    jump = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(300, stiffness_n_per_m=18000.0),))
     assert as_json(judge(played(jump)))["tweaks"][0]["bound"] < tweak.bound_n
 
 
@@ -196,7 +196,7 @@ def test_plant_of_the_truth_follows_the_emulated_machine_through_a_ramp(
     ramped: Path, given: dict[str, float], limit_lsb: float
 ) -> None:
     """1/M, B and K change evenly in the harness, dials in the machine, which the load of the pots tells apart."""
-    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(Tweak(300, ramp_n=60, **given),))
+    scenario = dataclasses.replace(Scenario.load(str(ramped)), tweaks=(PotChange(300, ramp_n=60, **given),))
     after = dataclasses.replace(FRONT, **given)
     with open_rig("emulator-ideal") as rig:
         volts = np.concatenate([block.volts for block in rig.perform(scenario, 1).blocks])
@@ -225,11 +225,14 @@ def test_deck_of_a_ramp_plays_what_the_rig_plays(ramped: Path) -> None:
 @pytest.mark.parametrize(
     ("tweaks", "message"),
     [
-        ((Tweak(300, mass_kg=60.0, ramp_n=60), Tweak(350, mass_kg=70.0)), "at sample 300 lasts 60 samples, beyond"),
-        ((Tweak(699, mass_kg=60.0), Tweak(700, mass_kg=70.0)), "beyond the last of 700 samples"),
+        (
+            (PotChange(300, mass_kg=60.0, ramp_n=60), PotChange(350, mass_kg=70.0)),
+            "at sample 300 lasts 60 samples, beyond",
+        ),
+        ((PotChange(699, mass_kg=60.0), PotChange(700, mass_kg=70.0)), "beyond the last of 700 samples"),
     ],
 )
-def test_ramps_that_cannot_be_are_refused(ramped: Path, tweaks: tuple[Tweak, ...], message: str) -> None:
+def test_ramps_that_cannot_be_are_refused(ramped: Path, tweaks: tuple[PotChange, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(Scenario.load(str(ramped)), tweaks=tweaks)
 

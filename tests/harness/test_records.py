@@ -16,7 +16,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import Run, Segment
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 
 RECORD_N = 700
 
@@ -56,7 +56,7 @@ class Recorder:
 
 
 SCENARIO = dataclasses.replace(
-    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(Tweak(sample=400, stiffness_n_per_m=16000.0),)
+    Scenario.load("thesis"), samples=2 * RECORD_N, tweaks=(PotChange(sample=400, stiffness_n_per_m=16000.0),)
 )
 
 

@@ -14,7 +14,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Rig
 from analogrig.run import CHANNELS
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 
 
 def blocks(rig: Rig, scenario: Scenario, seed: int) -> list[Block]:
@@ -78,12 +78,12 @@ def test_segments_tell_the_truth_after_each_tweak() -> None:
 
 
 def test_tweak_to_the_same_value_is_no_change() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(Tweak(sample=50, mass_kg=115.0),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, mass_kg=115.0),))
     assert len(scenario.segments()) == 1
 
 
 def test_pot_beyond_its_track_is_refused_before_the_run() -> None:
-    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(Tweak(sample=50, mass_kg=20.0),))
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(sample=50, mass_kg=20.0),))
     with (
         open_rig("emulator") as rig,
         pytest.raises(ConfigurationError, match=r"healthy: tweaks\[0\] at sample 50: pot M: .*M_kg = 20"),

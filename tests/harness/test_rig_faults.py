@@ -13,7 +13,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import CHANNELS
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 from analogrig_emulator import Capacitor, OpAmp, Resistor
 
 NEEDED = "[card.range_v]"
@@ -157,7 +157,7 @@ def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
     """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
     into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
     rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
-    scenario = replace(Scenario.load("healthy"), tweaks=(Tweak(100, stiffness_n_per_m=18000.0),))
+    scenario = replace(Scenario.load("healthy"), tweaks=(PotChange(100, stiffness_n_per_m=18000.0),))
     with open_rig(rig) as opened:
         assert isinstance(opened, EmulatorRig)
         computer, _, tweaks = opened.set_up(scenario, 1)

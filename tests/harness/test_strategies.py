@@ -18,7 +18,7 @@ from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
-from analogrig.scenario import PLANTS, PlantChoice, Scenario, Tweak
+from analogrig.scenario import PLANTS, PlantChoice, PotChange, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.strategies import DAMPING_RATIO, REACH, link_faults, random_suspensions, rigs, scenarios, seeds
 from analogrig_emulator import Excitation
@@ -91,7 +91,7 @@ def test_failing_scenario_shrinks_to_the_usual_in_all_that_does_not_matter(
 
 
 HALF = Excitation(low_v=0.1, high_v=9.9)
-FALLS = Scenario(1000, HALF, tweaks=(Tweak(600, stiffness_n_per_m=18000.0),))
+FALLS = Scenario(1000, HALF, tweaks=(PotChange(600, stiffness_n_per_m=18000.0),))
 
 
 def test_change_of_nothing_that_shows_is_not_detectable() -> None:

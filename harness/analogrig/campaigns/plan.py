@@ -29,7 +29,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, is_emulated
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
-from analogrig.scenario import Scenario, Tweak
+from analogrig.scenario import PotChange, Scenario
 from analogrig.trust import Trust
 from analogrig.wording import number_of
 
@@ -287,7 +287,7 @@ def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -
     plant = dataclasses.replace(base.plant, **start)
     before = vars(plant.plant())
     changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
-    tweaks = (*base.tweaks, Tweak(spec.change_at, **changed)) if changed else base.tweaks
+    tweaks = (*base.tweaks, PotChange(spec.change_at, **changed)) if changed else base.tweaks
     return dataclasses.replace(base, plant=plant, tweaks=tweaks)
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import ConfidenceSequence
-from analogrig.judging.verdict import TweakVerdict, Verdict
+from analogrig.judging.verdict import ChangeVerdict, Verdict
 from analogrig.plant import PARAMETERS
 from analogrig.run import MAX_SAMPLES, Run
 
@@ -27,7 +27,7 @@ class Change(NamedTuple):
     late: bool
 
     @classmethod
-    def of(cls, tweak: TweakVerdict) -> Change:
+    def of(cls, tweak: ChangeVerdict) -> Change:
         """At its likeliest instant; one that was not found in the samples is as one that nobody could see."""
         if tweak.unseen:
             return cls(None, None, missed=False, late=False)

@@ -49,7 +49,7 @@ class Exposure:
         of = number_of(self.samples, "sample")
         if self.non_finite:
             return f"the device reported non-finite estimates in {self.non_finite} of {of}"
-        return "" if self.armed else f"no alarm could come in any of {of}: {self._unarmed_reason()}"
+        return "" if self.armed else f"the trigger was armed in none of {of}: {self._unarmed_reason()}"
 
     def _unarmed_reason(self) -> str:
         """Main reason that the trigger was never armed."""

@@ -63,7 +63,7 @@ class DiagnosisVerdict:
 
 
 @dataclass(frozen=True)
-class TweakVerdict:
+class ChangeVerdict:
     """Verdict on one change of the plant. Latencies and bounds are in samples after the change."""
 
     sample: int
@@ -79,13 +79,13 @@ class TweakVerdict:
     """Latest alarm that is not late; None: no alarm is late."""
     diagnosis: DiagnosisVerdict | None = None
     """None: the device reported no diagnosis."""
-    alternatives: tuple[TweakVerdict, ...] = ()
+    alternatives: tuple[ChangeVerdict, ...] = ()
     """Verdicts for the earliest and the latest possible instant; empty if the instant is exact."""
     unseen: str = ""
     """Reason that the change was not found in the samples and is not judged; empty otherwise."""
 
     @property
-    def hypotheses(self) -> tuple[TweakVerdict, ...]:
+    def hypotheses(self) -> tuple[ChangeVerdict, ...]:
         """Verdicts under all hypotheses, in order of time."""
         return tuple(sorted((self, *self.alternatives), key=lambda each: each.sample))
 
@@ -119,7 +119,7 @@ class TweakVerdict:
         return self.latency_n is not None and self.deadline_n is not None and self.latency_n > self.deadline_n
 
 
-def _result_at_instant(tweak: TweakVerdict) -> Result:
+def _result_at_instant(tweak: ChangeVerdict) -> Result:
     """Result of the change if ``tweak.sample`` is its true instant."""
     if tweak.missed:
         return "missed"
@@ -156,7 +156,7 @@ class Verdict:
     outcome: Outcome
     reasons: tuple[str, ...]
     """Reasons for any outcome but ``passed``; empty if passed."""
-    tweaks: tuple[TweakVerdict, ...]
+    tweaks: tuple[ChangeVerdict, ...]
     false_alarms: tuple[int, ...]
     """Sample indices of the alarms that are false under all hypotheses."""
     estimates: tuple[SegmentEstimate, ...]
@@ -273,7 +273,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 class _HypothesisResult:
     """Result of a run under one hypothesis about the instants of its changes."""
 
-    tweaks: tuple[TweakVerdict, ...]
+    tweaks: tuple[ChangeVerdict, ...]
     false_alarms: tuple[int, ...]
     failures: tuple[str, ...]
 
@@ -319,14 +319,14 @@ def _fails_under_all_hypotheses(results: Sequence[_HypothesisResult], expect: Ex
     return late or missed > expect.missed or min(len(each.false_alarms) for each in results) > expect.false_alarms
 
 
-def _undecided_reason(tweak: TweakVerdict) -> str:
+def _undecided_reason(tweak: ChangeVerdict) -> str:
     """Message that the result of a change depends on its instant."""
     low, high = tweak.between
     results = " or ".join(dict.fromkeys(_result_at_instant(each) for each in tweak.hypotheses))
     return f"{tweak.what} between {low} and {high} was {results}, depending on its instant"
 
 
-def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[TweakVerdict, ...]:
+def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[ChangeVerdict, ...]:
     """Verdicts at the likeliest instants, each with the differing verdicts of the other hypotheses."""
     likeliest, *others = (each.tweaks for each in results)
     return tuple(
@@ -335,7 +335,9 @@ def _merge_hypotheses(results: Sequence[_HypothesisResult]) -> tuple[TweakVerdic
     )
 
 
-def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tuple[TweakVerdict, ...], tuple[int, ...]]:
+def _attribute_alarms(
+    run: Run, expect: Expectations, level: float
+) -> tuple[tuple[ChangeVerdict, ...], tuple[int, ...]]:
     """Verdict on each change, and the samples of the false alarms."""
     alarms = run.alarm_index.tolist()
     by_start = {segment.start: segment for segment in run.conditions.segments}
@@ -354,7 +356,7 @@ def _attribute_alarms(run: Run, expect: Expectations, level: float) -> tuple[tup
         changed = before.changes_to(after)
         late = information.first_reaching(gathered, expect.late_information_ratio * level)
         tweaks.append(
-            TweakVerdict(
+            ChangeVerdict(
                 unseen=by_start[start].unseen,
                 sample=start,
                 what=", ".join(changed),
@@ -445,7 +447,7 @@ def _loss_reasons(run: Run) -> list[str]:
 
 
 def _failure_reasons(
-    tweaks: tuple[TweakVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
+    tweaks: tuple[ChangeVerdict, ...], false_alarms: tuple[int, ...], expect: Expectations
 ) -> list[str]:
     """Violated expectations under one hypothesis; empty if there are none."""
     reasons = []

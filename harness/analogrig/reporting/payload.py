@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.judging.verdict import TweakVerdict, Verdict, trajectory
+from analogrig.judging.verdict import ChangeVerdict, Verdict, trajectory
 from analogrig.plant import PARAMETERS, Plant
 from analogrig.run import CHANNELS, CHUNK_SAMPLES, Run, missing_samples
 
@@ -226,7 +226,7 @@ def finite_or_none(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
 
 
-def direction(tweak: TweakVerdict) -> str:
+def direction(tweak: ChangeVerdict) -> str:
     """Label of a change in a plot: ``B ↓, K ↑``."""
     return ", ".join(f"{name} {'↑' if tweak.after[name] > old else '↓'}" for name, old in tweak.before.items())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
+from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
 from analogrig.plant import UNITS
 from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.run import Run
@@ -79,7 +79,7 @@ def _false_alarms(verdict: Verdict) -> str:
     return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
 
 
-def _change_lines(tweak: TweakVerdict) -> list[str]:
+def _change_lines(tweak: ChangeVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
     change = _change(tweak.before, tweak.after)
     out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]
@@ -89,7 +89,7 @@ def _change_lines(tweak: TweakVerdict) -> list[str]:
     return out
 
 
-def latency_text(tweak: TweakVerdict) -> str:
+def latency_text(tweak: ChangeVerdict) -> str:
     """Latency as text: ``4``, ``1-9`` if the instant is an interval, ``missed``, ``unknown``, or ``-``."""
     if tweak.result in {"missed", "not judged"}:
         return {"missed": "missed", "not judged": "unknown"}[tweak.result]

@@ -8,7 +8,7 @@ from typing import Any
 
 from analogrig.identity import Identity
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import DiagnosisVerdict, SegmentEstimate, TweakVerdict, Verdict, missing_text
+from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
 from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.payload import is_thinned, marked_alarms
@@ -199,7 +199,7 @@ def _samples(run: Run, verdict: Verdict) -> str:
     return f"{played}; {verdict.missing_n:,} {missing_text(run)}"
 
 
-def _change_row(tweak: TweakVerdict) -> str:
+def _change_row(tweak: ChangeVerdict) -> str:
     change = ", ".join(
         f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
     )
@@ -212,7 +212,7 @@ def _change_row(tweak: TweakVerdict) -> str:
     return _row([*cells, _number(ratio, ".2f"), _cell(word, f"text {kind}")])
 
 
-def _diagnosis_row(tweak: TweakVerdict, diagnosis: DiagnosisVerdict) -> str:
+def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
     word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
     cells = [f'<th scope="row">{tweak.sample}</th>', _cell(tweak.what, "text"), _cell(diagnosis.named, "text")]
     cells += [_number(diagnosis.extent, ".3f"), _number(diagnosis.extent_error, "+.1%")]
@@ -220,11 +220,11 @@ def _diagnosis_row(tweak: TweakVerdict, diagnosis: DiagnosisVerdict) -> str:
     return _row([*cells, _cell(word, f"text {kind}")])
 
 
-def _latency(tweak: TweakVerdict) -> str:
+def _latency(tweak: ChangeVerdict) -> str:
     return "–" if tweak.latencies_n is None else _text(latency_text(tweak)).replace("-", "–")
 
 
-def _result(tweak: TweakVerdict) -> tuple[str, str]:
+def _result(tweak: ChangeVerdict) -> tuple[str, str]:
     """Result in words, and its style class."""
     return {
         "missed": ("✗ MISSED", "bad"),

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import Design, upper_rate
-from analogrig.judging.verdict import TweakVerdict, Verdict, judge
+from analogrig.judging.verdict import ChangeVerdict, Verdict, judge
 from analogrig.reporting.summary import latency_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
@@ -165,7 +165,7 @@ class Played:
 _UNKNOWN = "it depends on when the change came, which is not known better"
 
 
-def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
+def _not_detected(tweak: ChangeVerdict, within: float | None) -> str:
     """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
     reasons = [_too_late(each, within) for each in tweak.hypotheses]
     if all(reasons):
@@ -174,7 +174,7 @@ def _not_detected(tweak: TweakVerdict, within: float | None) -> str:
     return f"INCONCLUSIVE: {tweak.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
 
 
-def _too_late(tweak: TweakVerdict, within: float | None) -> str:
+def _too_late(tweak: ChangeVerdict, within: float | None) -> str:
     """As ``_not_detected``, for the very instant that it has."""
     if tweak.latency_n is None and tweak.bound_n is None:
         return ""

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from analogrig.plant import PARAMETERS, Plant
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription
-from analogrig.scenario import PLANTS, Expectations, PlantChoice, Scenario, Tweak
+from analogrig.scenario import PLANTS, Expectations, PlantChoice, PotChange, Scenario
 from analogrig.testing import profiles
 from analogrig_emulator import PROGRAMS, Excitation
 
@@ -136,7 +136,7 @@ def changes(
     at: st.SearchStrategy[int] | None = None,
     together: int = 1,
     longest_ramp_n: int = 0,
-) -> st.SearchStrategy[Tweak]:
+) -> st.SearchStrategy[PotChange]:
     """Pots that are turned.
 
     :param plant: the plant that changes; None: the front suspension.
@@ -158,7 +158,7 @@ def _changes(
     at: st.SearchStrategy[int],
     together: int,
     longest_ramp_n: int,
-) -> Tweak:
+) -> PotChange:
     count = draw(st.integers(1, together))
     names = draw(st.lists(st.sampled_from(parameters), min_size=count, max_size=count, unique=True))
     changed = truth
@@ -170,7 +170,7 @@ def _changes(
         changed = draw(st.sampled_from(able))
     values = changed.parameters()
     turned = {FIELDS[name]: _rounded(values[name]) for name in names}
-    return Tweak(sample=draw(at), ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
+    return PotChange(sample=draw(at), ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
 
 
 def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:
@@ -305,7 +305,7 @@ def scenarios(
     """
     plant = draw(suspensions())
     excitation = draw(excitations(free=free))
-    tweaks: list[Tweak] = []
+    tweaks: list[PotChange] = []
     sample, now, passed = WARM_UP_N, plant, [plant]
     for _ in range(draw(st.integers(min(1, most_changes), most_changes))):
         sample += draw(st.integers(0, 60))
@@ -325,6 +325,6 @@ def scenarios(
     )
 
 
-def _after(plant: PlantChoice, tweak: Tweak) -> dict[str, float]:
+def _after(plant: PlantChoice, tweak: PotChange) -> dict[str, float]:
     before = plant.plant().parameters()
     return {FIELDS[name]: tweak.overrides().get(FIELDS[name], before[name]) for name in PARAMETERS}

@@ -20,7 +20,7 @@ from analogrig.testing.plugin.options import DUT, RIG, RUNS_DIR, SCENARIO_DIR, t
 if TYPE_CHECKING:
     from analogrig.bench import Bench
     from analogrig.devices.dut import Dut
-    from analogrig.judging.verdict import TweakVerdict
+    from analogrig.judging.verdict import ChangeVerdict
     from analogrig.rigs.rig import Rig
     from analogrig.scenario import Scenario
     from analogrig.testing.counterexample import Counterexample
@@ -261,7 +261,7 @@ def _properties(played: Played) -> Mapping[str, Any]:
     }
 
 
-def _latency(tweak: TweakVerdict) -> str:
+def _latency(tweak: ChangeVerdict) -> str:
     """``4``, or ``1..9`` where the instant of the change is not known better; ``None`` without an alarm."""
     if tweak.latencies_n is None or not tweak.alternatives:
         return str(tweak.latency_n)

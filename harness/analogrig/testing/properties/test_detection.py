@@ -13,7 +13,7 @@ from hypothesis import assume, given
 
 from analogrig.judging.information import detectable
 from analogrig.rigs.rig import Rig
-from analogrig.scenario import Expectations, Scenario, Tweak
+from analogrig.scenario import Expectations, PotChange, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties import Play, is_playable, with_some_seed
 from analogrig.testing.properties.experiments import (
@@ -54,7 +54,7 @@ SINGLY = Scenario(
     samples=WARM_UP_N + _EACH_N * len(_SETTINGS),
     excitation=Excitation(low_v=0.1, high_v=9.0),
     random_phase=True,
-    tweaks=tuple(Tweak(WARM_UP_N + _EACH_N * i, **setting) for i, setting in enumerate(_SETTINGS)),
+    tweaks=tuple(PotChange(WARM_UP_N + _EACH_N * i, **setting) for i, setting in enumerate(_SETTINGS)),
     name="singly",
     description="front suspension: one parameter at a time, by 20 % and back; K does not rise, for want of pot",
 )
