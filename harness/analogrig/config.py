@@ -283,3 +283,14 @@ def _shown(value: Any) -> str:
 
 def _brief(text: str) -> str:
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
+def check_range(table: object, name: str, low: float, high: float) -> None:
+    """Check a number, or a tuple of numbers, in a field of a dataclass.
+
+    :raises ValueError: one is NaN or outside ``low`` to ``high``; the message names the field.
+    """
+    value = getattr(table, name)
+    for each in value if isinstance(value, tuple) else (value,):
+        if not low <= each <= high:
+            raise ValueError(f"{name} must be {low:g} to {high:g}, not {each:g}")

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from analogrig.hardware.by_hand import Tweak, doubts
+from analogrig.hardware.by_hand import PlannedChange, contradictions
 from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
 from analogrig.hardware.dating.turn import TurnInstants
 from analogrig.judging.statistics import lower_rate
@@ -144,17 +144,17 @@ def _wrong(name: str, every: Sequence[Several]) -> Iterator[Figure]:
         yield Figure(f"{name}: doubted if wrong by {error_n} samples", share, by_size)
 
 
-def _size(tweak: Tweak) -> str:
+def _size(tweak: PlannedChange) -> str:
     (old, new), *_ = tweak.before.changes_to(tweak.after).values()
     part = 1.0 - min(old, new) / max(old, new)
     return next(size for size, most in SIZES.items() if part < most)
 
 
-def _doubted(record: Several, tweak: Tweak, alone: range, error_n: int) -> bool:
+def _doubted(record: Several, tweak: PlannedChange, alone: range, error_n: int) -> bool:
     """The turn by itself, told so many samples beside where it was."""
     first = alone.start - 1
     told = dataclasses.replace(tweak, sample=tweak.sample - first + error_n)
-    return bool(doubts(record.signals.part(first, alone.stop), [told], first))
+    return bool(contradictions(record.signals.part(first, alone.stop), [told], first))
 
 
 def _coverage(name: str, held: list[bool], trials: int) -> Figure:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig import config
-from analogrig.hardware.by_hand import Tweak as Told
+from analogrig.hardware.by_hand import PlannedChange
 from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
 from analogrig.hardware.dating.turn import TurnInstants, date_turn
 from analogrig.hardware.dating.two_filter import Signals
@@ -154,7 +154,7 @@ class Several:
     """Several changes of one record at known samples."""
 
     signals: Signals
-    tweaks: tuple[Told, ...]
+    tweaks: tuple[PlannedChange, ...]
 
     @classmethod
     def of(cls, seed: int, clock: Clock, rig: Rig | None = None) -> Several:
@@ -175,9 +175,9 @@ class Several:
             tweaks=tuple(tweak_of(*pair) for pair in pairs),
             name="several",
         )
-        return cls(play(scenario, seed, rig), tuple(Told(sample, {}, *both) for sample, *both in pairs))
+        return cls(play(scenario, seed, rig), tuple(PlannedChange(sample, {}, *both) for sample, *both in pairs))
 
-    def stretches(self) -> Iterator[tuple[Told, range]]:
+    def stretches(self) -> Iterator[tuple[PlannedChange, range]]:
         """Each change with the samples between its neighbours."""
         starts = [tweak.sample for tweak in self.tweaks]
         for tweak, before, after in zip(self.tweaks, [0, *starts], [*starts[1:], len(self.signals)], strict=False):

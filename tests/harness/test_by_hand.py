@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from analogrig.hardware.by_hand import ByHand, Tweak, doubts
+from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
-from analogrig.scenario import PotChange as PlayedTweak
+from analogrig.scenario import PotChange
 from tests.harness.dating_trials import FRONT, Clock, Several, play, scenario_of
 
 RATE_HZ = 20e3
@@ -25,39 +25,36 @@ class Hand:
     clock: VirtualClock
     takes_s: float
     slow: bool = False
-    exact: bool = False
 
-    def settle(self, dials: Mapping[str, float], words: str) -> None:
-        raise NotImplementedError
-
-    def turn(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - it is told what to turn, and does
+    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - dials, words
+        assert recording
         self.clock.advance(self.takes_s)
 
     def close(self) -> None:
         pass
 
 
-def turned(tweaks: Sequence[Tweak], takes_s: float, *, slow: bool = False) -> ByHand:
+def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = False) -> HandChanges:
     """By a hand in virtual time: each asked for when it was to be."""
     clock = VirtualClock()
-    by_hand = ByHand(Hand(clock, takes_s, slow), tweaks, RATE_HZ, clock, clock.advance)
-    by_hand.turn_all()
+    by_hand = HandChanges(Hand(clock, takes_s, slow), tweaks, RATE_HZ, clock, clock.advance)
+    by_hand.make_all()
     return by_hand
 
 
-def taken(samples: int, *changes: PlayedTweak) -> Signals:
+def taken(samples: int, *changes: Tweak) -> Signals:
     """By the card of a machine of real components."""
     return play(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
 
 
-def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) -> Tweak:
-    return Tweak(sample, dials, before, after)
+def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) -> PlannedChange:
+    return PlannedChange(sample, dials, before, after)
 
 
 def test_jump_is_dated_wherever_the_pot_was_between_question_and_answer() -> None:
     soft = FRONT.scaled("K", 0.7)
-    signals = taken(4000, PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
-    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(signals, first=5000)
+    signals = taken(4000, PotChange(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(signals, first=5000)
     assert segment.plant == soft and not segment.unseen
     assert segment.start_low is not None and segment.start_high is not None
     assert segment.start_low <= 6630 <= segment.start_high
@@ -69,10 +66,10 @@ def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_
     dials = {"K": 0.6, "B": 0.5}  # in this order
     signals = taken(
         4000,
-        PlayedTweak(1630, stiffness_n_per_m=after.stiffness_n_per_m),
-        PlayedTweak(1700, damping_n_s_per_m=after.damping_n_s_per_m),
+        PotChange(1630, stiffness_n_per_m=after.stiffness_n_per_m),
+        PotChange(1700, damping_n_s_per_m=after.damping_n_s_per_m),
     )
-    (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).dated(signals, first=0)
+    (segment,) = turned([asked(1500, dials, FRONT, after)], takes_s=0.02).date(signals, first=0)
     assert not segment.unseen, segment.unseen
     earliest, latest = segment.earliest(), segment.latest()
     assert earliest.start <= 1630 <= latest.start
@@ -81,8 +78,8 @@ def test_two_pots_that_are_set_one_after_the_other_are_a_turn_from_the_first_to_
 
 def test_slow_hand_is_dated_from_begin_to_end() -> None:
     soft = FRONT.scaled("K", 0.6)
-    change = PlayedTweak(1700, stiffness_n_per_m=soft.stiffness_n_per_m, ramp_n=400)
-    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.04, slow=True).dated(taken(5000, change), 0)
+    change = PotChange(1700, stiffness_n_per_m=soft.stiffness_n_per_m, ramp_n=400)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.04, slow=True).date(taken(5000, change), 0)
     assert not segment.unseen, segment.unseen
     earliest, latest = segment.earliest(), segment.latest()
     assert earliest.start <= 1700 <= latest.start
@@ -96,11 +93,11 @@ def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
     light = soft.scaled("M", 0.6)
     signals = taken(
         6000,
-        PlayedTweak(1630, stiffness_n_per_m=soft.stiffness_n_per_m),
-        PlayedTweak(3250, mass_kg=light.mass_kg),
+        PotChange(1630, stiffness_n_per_m=soft.stiffness_n_per_m),
+        PotChange(3250, mass_kg=light.mass_kg),
     )
     tweaks = [asked(1500, {"K": 0.6}, FRONT, soft), asked(3200, {"M": 0.5}, soft, light)]
-    first, second = turned(tweaks, takes_s=0.01).dated(signals, first=0)
+    first, second = turned(tweaks, takes_s=0.01).date(signals, first=0)
     for segment, sample in ((first, 1630), (second, 3250)):
         assert not segment.unseen, segment.unseen
         assert segment.earliest().start <= sample <= segment.latest().start
@@ -108,14 +105,14 @@ def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
 
 def test_pot_that_did_not_move_is_a_change_that_nobody_has_seen() -> None:
     soft = FRONT.scaled("K", 0.7)
-    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(taken(4000), first=0)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(taken(4000), first=0)
     assert "shows that the plant has changed" in segment.unseen
     assert segment.start <= 1500 and segment.start + segment.ramp_n >= 1700
 
 
 def test_pot_that_is_turned_when_the_record_is_over_is_one_too() -> None:
     soft = FRONT.scaled("K", 0.7)
-    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).dated(taken(1100), first=0)
+    (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(taken(1100), first=0)
     assert "when the record was over" in segment.unseen
     assert segment.start < 1100
 
@@ -131,7 +128,7 @@ def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
 def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> None:
     soft, light = FRONT.scaled("K", 0.7), FRONT.scaled("K", 0.7).scaled("M", 0.5)
     tweaks = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
-    (segment,) = turned(tweaks, takes_s=0.01).dated(taken(1100), first=0)
+    (segment,) = turned(tweaks, takes_s=0.01).date(taken(1100), first=0)
     assert (segment.plant, bool(segment.unseen)) == (light, True)
 
 
@@ -143,7 +140,7 @@ def test_turns_at_the_very_instants_that_are_told_are_not_doubted(clock: Clock) 
     """24 turns each. ``make bench ARGS=onset`` has 400."""
     for seed in range(3):
         several = Several.of(seed, clock)
-        assert doubts(several.signals, several.tweaks, first=0) == []
+        assert contradictions(several.signals, several.tweaks, first=0) == []
 
 
 @pytest.mark.parametrize("error_n", [-900, -250, -30, -2, 2, 30, 250, 900])
@@ -152,9 +149,9 @@ def test_instant_that_is_wrong_is_doubted_wherever_the_pot_was_turned(error_n: i
     stiff = FRONT.scaled("K", 0.8)
     quiet = taken(4000)
     moving = 2004 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[2000:])) > 1000.0)[0])
-    signals = taken(4000, PlayedTweak(moving, stiffness_n_per_m=stiff.stiffness_n_per_m))
-    (said,) = doubts(signals, [asked(moving + error_n, {}, FRONT, stiff)], first=5000)
+    signals = taken(4000, PotChange(moving, stiffness_n_per_m=stiff.stiffness_n_per_m))
+    (said,) = contradictions(signals, [asked(moving + error_n, {}, FRONT, stiff)], first=5000)
     assert said == (
-        f"the pot that was to be turned at sample {5000 + moving + error_n} (K 19600) was turned at {5000 + moving}"
+        f"the pot scheduled for sample {5000 + moving + error_n} (K 19600) moved at {5000 + moving}"
         f" ({5000 + moving} to {5000 + moving}) by the samples"
     )

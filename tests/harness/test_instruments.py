@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 
 from analogrig.errors import ConfigurationError, RecordStale, RigRefused
-from analogrig.hardware.instrument import DRIVERS, Instrument, Record, Turn, located
+from analogrig.hardware.instrument import DRIVERS, DialChange, InputRecord, Instrument, find_driver
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.scpi_connection import ScpiConnection
 from analogrig.hardware.simulator.acquisition import AcquisitionFaults
-from analogrig.hardware.simulator.description import InstrumentDescription
+from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
 from analogrig.hardware.simulator.inputs import InputFaults
-from analogrig.hardware.simulator.red_pitaya import ServedRedPitaya
+from analogrig.hardware.simulator.red_pitaya import InstrumentDescription, ServedRedPitaya
 from analogrig.hardware.simulator.scpi import Interpreter
-from analogrig.hardware.simulator.table import Amplifier, Booster, Wiring
 from analogrig_emulator import Excitation, SuspensionComputer, preset
 from tests.harness.ni_stand_in import Card, library
 
@@ -151,7 +150,7 @@ def exact(samples: int = SAMPLES) -> np.ndarray:
 )
 def test_address_is_what_the_driver_of_the_scheme_takes(url: str, address: str) -> None:
     kinds = {"redpitaya": RedPitaya, "nidaqmx": NiDaqmx}
-    assert located(url) == (kinds[url.partition(":")[0].lower()], address)
+    assert find_driver(url) == (kinds[url.partition(":")[0].lower()], address)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +171,7 @@ def test_address_is_what_the_driver_of_the_scheme_takes(url: str, address: str) 
 )
 def test_address_that_is_none_is_refused_with_the_form_of_one(url: str, form: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        located(url)
+        find_driver(url)
     assert str(caught.value) == f"instrument {url!r}: give it as {form}"
 
 
@@ -188,7 +187,7 @@ def test_addresses_of_other_kinds_of_instruments_are_left_to_their_drivers(
             return address.startswith(("ip:", "usb:"))
 
     monkeypatch.setattr("analogrig.hardware.ni_daqmx.NiDaqmx", Adalm2000)
-    assert located(f"nidaqmx://{address}") == (Adalm2000, address)
+    assert find_driver(f"nidaqmx://{address}") == (Adalm2000, address)
 
 
 # ---- what it has
@@ -248,7 +247,7 @@ def test_sample_is_clipped_where_the_converter_ends_whatever_its_volts_say(reach
 # ---- an old record
 
 
-def differs(record: Record, other: Record) -> bool:
+def differs(record: InputRecord, other: InputRecord) -> bool:
     return not np.array_equal(record.codes, other.codes)
 
 
@@ -276,7 +275,7 @@ def test_what_a_red_pitaya_has_taken_at_rest_is_no_record() -> None:
 
 def test_red_pitaya_that_has_a_record_before_it_could_is_found_out() -> None:
     early = AcquisitionFaults(triggered_early=True)
-    with pytest.raises(RecordStale, match=r"instrument here: the record is an old one: ACQ:TRig:STAT\? says 'TD'"):
+    with pytest.raises(RecordStale, match=r"instrument here: stale record: ACQ:TRig:STAT\? answered 'TD'"):
         RedPitayaBench().ready(faults=early).record(SAMPLES)
 
 
@@ -288,7 +287,7 @@ def test_pots_are_turned_at_once_or_at_instants_of_the_next_record_alone() -> No
     assert instrument.pots is not None
     still = instrument.record(SAMPLES)
     instrument.rest(0.0)
-    instrument.pots.schedule([Turn(200.5 / instrument.datasheet.rate_hz, "K", 0.5)])
+    instrument.pots.schedule([DialChange(200.5 / instrument.datasheet.rate_hz, "K", 0.5)])
     turned = instrument.record(SAMPLES)
     np.testing.assert_array_equal(turned.codes[:201], still.codes[:201])
     assert differs(turned, still)
@@ -302,5 +301,5 @@ def test_pot_that_cannot_stand_there_is_refused_by_name() -> None:
     instrument = RedPitayaBench().ready()
     assert instrument.pots is not None
     assert instrument.pots.names == ("M", "B", "K")
-    with pytest.raises(RigRefused, match="instrument here: turning K to 1.5: it says -222"):
+    with pytest.raises(RigRefused, match="instrument here: set K to 1.5: error -222"):
         instrument.pots.turn("K", 1.5)

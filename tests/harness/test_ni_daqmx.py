@@ -121,7 +121,7 @@ def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypat
     instrument.set_inputs([(0, "10V"), (1, "10V")])
     instrument.set_excitation(SCENARIO.excitation)
     monkeypatch.setattr("analogrig.hardware.ni_daqmx._bits", lambda _: 12)
-    with pytest.raises(RigError, match=r"instrument Dev1: gave the code \d+, which its 12 bits do not have"):
+    with pytest.raises(RigError, match=r"instrument Dev1: returned the code \d+, which exceeds its 12 bits"):
         instrument.record(100)
 
 

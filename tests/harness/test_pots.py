@@ -18,10 +18,11 @@ import pytest
 
 from analogrig import config
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.pots import NoPots, OperatorPots, Pots, PotsDescription
+from analogrig.hardware.pots import OperatorPots, Pots, PotsDescription
 from tests.harness.processes import LONG_S, ends
 
 DIALS = {"K": 0.6380, "B": 0.8152}
+KINDS = "kind: must be one of 'instrument', 'command', 'serial', 'operator', 'none', not "
 WORDS = "K 18000 N/m, B 3453 N s/m"
 
 
@@ -45,8 +46,8 @@ def opened(**table: Any) -> Pots:
     ("table", "message"),
     [
         ({}, "the key 'kind' is lacking"),
-        ({"kind": "comand"}, "kind: must be one of 'command', 'serial', 'operator', 'none', not 'comand'"),
-        ({"kind": ["command"]}, "kind: must be one of 'command', 'serial', 'operator', 'none', not ['command']"),
+        ({"kind": "comand"}, KINDS + "'comand'"),
+        ({"kind": ["command"]}, KINDS + "['command']"),
         ({"kind": "command"}, "the key 'arguments' is lacking"),
         ({"kind": "command", "arguments": []}, "arguments must begin with the program"),
         ({"kind": "command", "arguments": ["set", "{pot}"]}, "arguments must have {pot}, and {dial} or {step}, in it"),
@@ -99,8 +100,8 @@ def test_command_is_given_each_pot_and_its_dial(tmp_path: Path) -> None:
     pots = opened(
         kind="command", arguments=[*script(tmp_path, ""), "--pot={pot}", "{dial}", "{step}"], names={"K": "2"}
     )
-    pots.settle(DIALS, WORDS)
-    pots.turn({"K": 1.0}, WORDS)
+    pots.set(DIALS, WORDS, recording=False)
+    pots.set({"K": 1.0}, WORDS, recording=True)
     assert calls(tmp_path) == [
         "['--pot=2', '0.6380', '163']",
         "['--pot=B', '0.8152', '208']",
@@ -110,7 +111,7 @@ def test_command_is_given_each_pot_and_its_dial(tmp_path: Path) -> None:
 
 def test_no_shell_reads_the_arguments(tmp_path: Path) -> None:
     pots = opened(kind="command", arguments=[*script(tmp_path, ""), "{pot}", "{dial}; touch $HOME/x && `id` {oops"])
-    pots.turn({"K": 0.5}, WORDS)
+    pots.set({"K": 0.5}, WORDS, recording=True)
     assert calls(tmp_path) == ["['K', '0.5000; touch $HOME/x && `id` {oops']"]
 
 
@@ -118,9 +119,9 @@ def test_command_that_fails_is_an_error_with_its_status_and_what_it_said(tmp_pat
     body = "print('no such pot'); sys.stderr.write('try 1 to 4\\n'); sys.exit(7)"
     pots = opened(kind="command", arguments=[*script(tmp_path, body), "{pot}", "{dial}"])
     with pytest.raises(RigError) as raised:
-        pots.turn(DIALS, WORDS)
+        pots.set(DIALS, WORDS, recording=True)
     assert str(raised.value).startswith("pot K to 0.6380: ")
-    assert "ended with status 7, and said: " in str(raised.value)
+    assert "ended with status 7, output: " in str(raised.value)
     assert "no such pot" in str(raised.value) and "try 1 to 4" in str(raised.value)
     assert "\n" not in str(raised.value)
     assert len(calls(tmp_path)) == 1, "the pot after one that failed was not to be touched"
@@ -128,21 +129,23 @@ def test_command_that_fails_is_an_error_with_its_status_and_what_it_said(tmp_pat
 
 def test_command_that_is_killed_names_the_signal(tmp_path: Path) -> None:
     body = f"os.kill(os.getpid(), {int(signal.SIGKILL)})"
+    pots = opened(kind="command", arguments=[*script(tmp_path, body), "{pot}", "{dial}"])
     with pytest.raises(RigError, match="ended with signal 9"):
-        opened(kind="command", arguments=[*script(tmp_path, body), "{pot}", "{dial}"]).turn({"K": 0.5}, WORDS)
+        pots.set({"K": 0.5}, WORDS, recording=True)
 
 
 def test_command_that_hangs_is_killed_with_all_it_has_started(tmp_path: Path) -> None:
     hanging = f"sleep 600 & echo $$ $! > {shlex.quote(str(tmp_path / 'pids'))}; wait"  # a shell is up at once
     pots = opened(kind="command", arguments=["sh", "-c", hanging, "{pot}", "{dial}"], timeout_s=5.0)
     with pytest.raises(RigError, match=r"pot K to 0\.5000: .*: not done within 5 s, killed"):
-        pots.turn({"K": 0.5}, WORDS)
+        pots.set({"K": 0.5}, WORDS, recording=True)
     assert all(ends(int(pid)) for pid in (tmp_path / "pids").read_text().split())
 
 
 def test_command_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> None:
+    pots = opened(kind="command", arguments=[str(tmp_path / "no-such-program"), "{pot}", "{dial}"])
     with pytest.raises(RigError, match=r"no-such-program K 0\.5000: cannot be started: No such file or directory"):
-        opened(kind="command", arguments=[str(tmp_path / "no-such-program"), "{pot}", "{dial}"]).turn({"K": 0.5}, WORDS)
+        pots.set({"K": 0.5}, WORDS, recording=True)
 
 
 # ---- a box at a serial line
@@ -196,7 +199,7 @@ def test_box_gets_a_line_for_each_pot_and_its_answers_are_checked(boxes: list[Bo
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="W {pot} {step}\n", reply="OK {pot}", steps=1024)
     box.greet(b"pot box 1.2\r\n")
-    pots.settle(DIALS, WORDS)
+    pots.set(DIALS, WORDS, recording=False)
     pots.close()
     assert box.heard == [b"W K 653\n", b"W B 834\n"]
 
@@ -205,7 +208,7 @@ def test_box_that_says_nothing_is_not_waited_for(boxes: list[Box]) -> None:
     box = Box()
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot}={dial};")
-    pots.turn(DIALS, WORDS)
+    pots.set(DIALS, WORDS, recording=True)
     assert box.read(len(b"K=0.6380;B=0.8152;")) == b"K=0.6380;B=0.8152;"
     pots.close()
 
@@ -215,7 +218,7 @@ def test_box_that_refuses_is_an_error_with_its_words(boxes: list[Box]) -> None:
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK")
     with pytest.raises(RigError) as raised:
-        pots.turn(DIALS, WORDS)
+        pots.set(DIALS, WORDS, recording=True)
     assert str(raised.value) == f"pot K to 0.6380: {box.url}: answered 'ERR locked', not 'OK'"
     assert box.heard == [b"K 0.6380\n"], "the pot after one that failed was not to be touched"
     pots.close()
@@ -225,8 +228,8 @@ def test_box_that_stops_in_the_middle_of_an_answer_is_not_waited_for_for_ever(bo
     box = Box(b"O")
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK", timeout_s=2.0)
-    with pytest.raises(RigError, match=r"no answer 'OK' within 2 s, and said: O"):
-        pots.turn({"K": 0.5}, WORDS)
+    with pytest.raises(RigError, match=r"no answer 'OK' within 2 s, output: O"):
+        pots.set({"K": 0.5}, WORDS, recording=True)
     pots.close()
 
 
@@ -235,7 +238,7 @@ def test_box_that_chatters_without_end_of_line_is_cut_off(boxes: list[Box]) -> N
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK")
     with pytest.raises(RigError, match=r"answered 'x{300}\.\.\.', not 'OK'"):
-        pots.turn({"K": 0.5}, WORDS)
+        pots.set({"K": 0.5}, WORDS, recording=True)
     pots.close()
 
 
@@ -280,7 +283,7 @@ def asked(terminal: Terminal, typed: bytes, *, turn: bool) -> tuple[str, list[Ba
 
     def wait() -> None:
         try:
-            (pots.turn if turn else pots.settle)(DIALS, WORDS)
+            pots.set(DIALS, WORDS, recording=turn)
         except RigError as error:
             failed.append(error)
 
@@ -323,15 +326,5 @@ def test_operator_who_leaves_is_an_error(terminal: Terminal) -> None:
     ("path", "reason"), [("/dev/null", "is no terminal"), ("/nowhere/tty", "No such file or directory")]
 )
 def test_operator_without_a_terminal_is_refused_with_the_reason(path: str, reason: str) -> None:
-    with pytest.raises(ConfigurationError, match=f"an operator turns them, and .*{reason}"):
+    with pytest.raises(ConfigurationError, match=f'kind "operator" needs a terminal.*{reason}'):
         OperatorPots(kind="operator").open(Path(path))
-
-
-# ---- nobody
-
-
-def test_rig_without_pots_plays_what_stands_and_refuses_a_turn() -> None:
-    pots = NoPots(kind="none").open()
-    pots.settle(DIALS, WORDS)
-    with pytest.raises(RigError, match=r"nobody turns them on this rig, and K 0\.6380, B 0\.8152 .* was asked for"):
-        pots.turn(DIALS, WORDS)

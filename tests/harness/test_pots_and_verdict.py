@@ -13,8 +13,7 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
-from analogrig.hardware.instrument import Instrument, Taken
+from analogrig.hardware.instrument import InputRecord, Instrument
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.wiring import RealDescription
@@ -50,7 +49,7 @@ class CardAndComputer(NiDaqmx):
     def set_excitation(self, excitation: Excitation) -> None:
         self._excitation = excitation
 
-    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> InputRecord:
         assert while_recording is not None
         standing = len(self._heard())
         while_recording()
@@ -64,7 +63,7 @@ class CardAndComputer(NiDaqmx):
         volts = np.concatenate(taken)[:, :2]
         lsb_v = 20.0 / (1 << self.datasheet.bits)
         codes = np.rint(volts / lsb_v + self._noise.normal(size=volts.shape)).astype(np.int64)
-        return Taken(np.asarray(codes * lsb_v, np.float64), codes, self.datasheet.bits)
+        return InputRecord(np.asarray(codes * lsb_v, np.float64), codes, self.datasheet.bits)
 
     def _heard(self) -> list[tuple[str, float]]:
         """What the command was told, in order."""

@@ -20,8 +20,8 @@ from analogrig import config
 from analogrig.bench import Bench
 from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
-from analogrig.hardware.instrument import PotBox, Turn
-from analogrig.hardware.plan import LEAD_N, records
+from analogrig.hardware.instrument import DialChange, PotBox
+from analogrig.hardware.plan import LEAD_N, split_records
 from analogrig.hardware.real import RealRig
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.wiring import RealDescription
@@ -108,10 +108,10 @@ def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
 
 
 def test_records_keep_their_distance_from_tweaks() -> None:
-    assert records(1000, 16_384, [500]) == [(0, 1000)]
-    assert records(20_000, 16_384, []) == [(0, 16_384), (16_384, 20_000)]
-    assert records(20_000, 16_384, [16_380]) == [(0, 16_380 - LEAD_N), (16_380 - LEAD_N, 20_000)]
-    assert records(20_000, 16_384, [16_384 + LEAD_N + 1]) == [(0, 16_384), (16_384, 20_000)]
+    assert split_records(1000, 16_384, [500]) == [(0, 1000)]
+    assert split_records(20_000, 16_384, []) == [(0, 16_384), (16_384, 20_000)]
+    assert split_records(20_000, 16_384, [16_380]) == [(0, 16_380 - LEAD_N), (16_380 - LEAD_N, 20_000)]
+    assert split_records(20_000, 16_384, [16_384 + LEAD_N + 1]) == [(0, 16_384), (16_384, 20_000)]
 
 
 WAVEFORMS = [
@@ -191,7 +191,7 @@ def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
 def test_instrument_belongs_to_one_who_plays(bench: str) -> None:
     with open_allowed(bench) as first, open_allowed(bench) as second:
         next(first.perform(SHORT, 1).blocks)
-        with pytest.raises(RigClosed, match="somebody else on this machine plays on it"):
+        with pytest.raises(RigClosed, match="in use by another process or rig on this machine"):
             next(second.perform(SHORT, 1).blocks)
     with open_allowed(bench) as third:
         next(third.perform(SHORT, 1).blocks)
@@ -217,7 +217,7 @@ def test_record_of_the_play_before_is_found_out(tmp_path: Path) -> None:
     ):
         first, second, third = (judge(Bench(rig, dut).play(SHORT, 1)) for _ in range(3))
     assert [first.outcome, second.outcome, third.outcome] == ["passed", "inconclusive", "passed"]
-    assert "the record is an old one: to the bit it has been given before" in second.reasons[0]
+    assert "stale record: it repeats an earlier one to the bit" in second.reasons[0]
 
 
 class Disobedient:
@@ -228,12 +228,12 @@ class Disobedient:
         self.turn = box.turn
         self._box, self._late_s = box, late_s
 
-    def schedule(self, turns: Sequence[Turn]) -> None:
-        late = [Turn(delay_s + self._late_s, pot, dial) for delay_s, pot, dial in turns]
+    def schedule(self, turns: Sequence[DialChange]) -> None:
+        late = [DialChange(delay_s + self._late_s, pot, dial) for delay_s, pot, dial in turns]
         self._box.schedule(late if self._late_s else [])
 
 
-@pytest.mark.parametrize(("late_s", "said"), [(0.0, "nothing in the samples"), (60 / 20e3, "was turned at 1260")])
+@pytest.mark.parametrize(("late_s", "said"), [(0.0, "nothing in the samples"), (60 / 20e3, "moved at 1260")])
 def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
     late_s: float, said: str, bench: str
 ) -> None:
@@ -248,7 +248,7 @@ def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
     with RealRig(description, connected) as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, 1))
     assert verdict.outcome == "inconclusive"
-    assert "the pot that was to be turned at sample 1200 (K 18000)" in verdict.reasons[0]
+    assert "the pot scheduled for sample 1200 (K 18000)" in verdict.reasons[0]
     assert said in verdict.reasons[0]
 
 
@@ -368,7 +368,10 @@ WRONG = {
     'pots.kind = "instrument"': ('pots.kind = "magic"', "pots"),
     "timeout_s = 60.0": ("timeout_s = 60.0\nlimits.dials.MASS = [0.1, 0.9]", "limits.dials: there is no pot 'MASS'"),
     "10.0": ("10.0\ngenerator.offset_v = 15.0", "when it is off, the force input stands at offset_v, 15 V"),
-    '2, range = "HV"': ('2, range = "HV", least_v = 900.0', "inputs.displacement: 0 V at the computer must be within"),
+    '2, range = "HV"': (
+        '2, range = "HV", least_v = 900.0',
+        "inputs.displacement: 0 V at the computer must be within the measured",
+    ),
     "127.0.0.1:1": ("127.0.0.1:1/?timeout=1", "give it as redpitaya://HOST[:PORT]"),
     "[rig.bench]": ("[rig.bench]\nlimits.dials.M = [0.5, 2.0]", "dials.M must be"),
 }
@@ -497,7 +500,9 @@ def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Pat
     name = described(tmp_path, lambda text: text.replace('pots.kind = "instrument"', 'pots.kind = "none"'))
     with open_allowed(name) as rig:
         assert "tweak" not in rig.capabilities
-        with pytest.raises(ConfigurationError, match=r"tweaks\[0\] at sample 1200: nobody turns the pots"):
+        with pytest.raises(
+            ConfigurationError, match=r"tweaks\[0\] at sample 1200: the pots of this rig cannot be changed"
+        ):
             rig.perform(THESIS, 1)
 
 

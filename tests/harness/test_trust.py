@@ -37,7 +37,8 @@ from analogrig.devices.dut import open_dut, reopen_dut
 from analogrig.devices.registry import KINDS, describe, from_table, named_things
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import DRIVERS
-from analogrig.hardware.wiring import InstrumentPots, RealDescription
+from analogrig.hardware.pots import InstrumentPots, PotsDescription
+from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
@@ -776,9 +777,7 @@ def vars_of(cls: type) -> set[str]:
 def pots_classes() -> list[type]:
     from typing import get_args
 
-    from analogrig.hardware.pots import PotsDescription
-
-    return [*get_args(PotsDescription), InstrumentPots]
+    return list(get_args(PotsDescription))
 
 
 def thing_of(url: str) -> str:

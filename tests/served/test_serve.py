@@ -82,16 +82,16 @@ def test_the_served_computer_has_the_components_that_the_rig_draws_from_the_seed
         assert isinstance(opened, EmulatorRig)
         emulated = [opened.set_up(scenario, seed).computer.circuit for seed in (1, 2)]
     described = ServedDescription.load(rig)
-    laid = [described.laid(plant, seed)._table._computer.circuit for seed in (1, 2)]
-    assert [circuit.elements for circuit in laid] == [circuit.elements for circuit in emulated]
-    assert laid[0].elements != laid[1].elements
+    served = [described.set_up(plant, seed)._computer._computer.circuit for seed in (1, 2)]
+    assert [circuit.elements for circuit in served] == [circuit.elements for circuit in emulated]
+    assert served[0].elements != served[1].elements
 
 
 def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> None:
     description = ServedDescription.load("emulator-ideal", ["inputs.noise_v=[0.01,0.01]"])
 
     def noisy(seed: int) -> np.ndarray:
-        ask = asking(Interpreter(description.laid("front", seed).commands))
+        ask = asking(Interpreter(description.set_up("front", seed).commands))
         say(ask, SEQUENCE)
         return record(ask)
 
@@ -102,7 +102,7 @@ def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> No
 def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named() -> None:
     """Of emulator-skewed: displacement 10 us after force; 1 LSB rms of 12 V and of 10 V on 12 bits."""
     description = ServedDescription.load("emulator-skewed", ["inputs.skew_s=2e-6", "inputs.noise_v=[0.0,0.004]"])
-    inputs = description.instrument.beside(description.card.card()).inputs
+    inputs = description.combined_instrument().inputs
     assert inputs.skew_s == pytest.approx(12e-6)
     assert inputs.noise_v == pytest.approx((12 / 4096, np.hypot(10 / 4096, 0.004)))
     assert description.left_out == ()

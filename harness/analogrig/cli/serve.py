@@ -78,7 +78,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)
-    server = Server(described.laid(arguments.plant, drawn_from, time.monotonic if arguments.real_time else None))
+    server = Server(described.set_up(arguments.plant, drawn_from, time.monotonic if arguments.real_time else None))
     if described.left_out:
         complain(f"{described.name}: the instrument has no {', '.join(described.left_out)}", PASSED)
     names = {"rig": described.name, "plant": arguments.plant, "seed": drawn_from}

@@ -1,8 +1,7 @@
-"""What a bench instrument is to a rig: a generator with one output, and inputs that are sampled at the same instant.
+"""Interface of the bench instruments: a generator with one output, and inputs sampled at the same instant.
 
-A driver for another instrument is a subclass of ``Instrument`` and a line in ``DRIVERS``; what all of them have to do
-is in tests/harness/test_instruments.py. Volts here are those at the instrument's own connectors; the rig knows what is
-between them and the computer.
+A driver is a subclass of ``Instrument`` and a line in ``DRIVERS``. tests/harness/test_instruments.py tests all drivers.
+Volts are those at the instrument's connectors. ``analogrig.hardware.wiring`` describes the stages to the computer.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import importlib
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -23,29 +22,29 @@ from analogrig_emulator import Excitation
 
 _ROUNDING_V = 1e-9
 _REMEMBERED = 64
-"""So many records back an old one is known again."""
+"""Number of records among which a repetition is recognised."""
 
 
 @dataclass(frozen=True)
 class Datasheet:
-    """What every instrument of a kind has: known before one is spoken to."""
+    """Properties that all instruments of a kind share, known without a connection."""
 
     rate_hz: float
     """Samples per second of each input."""
     record_n: int
-    """The most samples without a gap."""
+    """Largest number of samples without a gap."""
     bits: int
-    """Of its converters."""
+    """Resolution of the converters."""
     inputs: tuple[int, ...]
-    """Numbers of its inputs, as printed on it."""
+    """Numbers of the inputs, as printed on the instrument."""
     output_v: tuple[float, float]
-    """What its generator can give."""
+    """Lowest and highest voltage of the generator."""
     ranges_v: Mapping[str, tuple[float, float]]
-    """Ranges of its inputs, by the instrument's own words."""
+    """Input ranges by the instrument's own names."""
 
 
-class Turn(NamedTuple):
-    """A pot that is to stand at ``dial`` (0 to 1) so long after a record's first sample."""
+class DialChange(NamedTuple):
+    """Set one pot to ``dial`` (0 to 1), ``delay_s`` seconds after the first sample of a record."""
 
     delay_s: float
     pot: str
@@ -53,81 +52,96 @@ class Turn(NamedTuple):
 
 
 class PotBox(Protocol):
-    """Pots that an instrument turns itself. All may raise RigError."""
+    """Pots that an instrument sets itself. All methods may raise RigError."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
 
     def turn(self, pot: str, dial: float) -> None:
-        """At once."""
+        """Set a pot at once."""
 
-    def schedule(self, turns: Sequence[Turn]) -> None:
-        """These and no others, at exact instants within the next record and no further one."""
+    def schedule(self, changes: Sequence[DialChange]) -> None:
+        """Replace the changes that the box makes at exact instants within the next record, and in no later one."""
 
 
 @dataclass(frozen=True)
-class Taken:
-    """What a driver has got out of its instrument: m samples of the inputs that were asked for."""
+class InputRecord:
+    """n consecutive samples of the requested inputs, without a gap."""
 
     volts: NDArray[np.float64]
-    """(m, inputs): at the instrument, by its own calibration."""
+    """(n, inputs): at the instrument, by its own calibration."""
     codes: NDArray[np.signedinteger]
-    """(m, inputs): as the converters gave them, 0 in the middle of their range."""
+    """(n, inputs): as the converters gave them, 0 in the middle of their range."""
     bits: int
-    """Of those converters."""
+    """Resolution of those converters."""
+    repeats: bool = False
+    """True if all codes equal those of an earlier record to the bit: a stale record, since noise never repeats."""
 
+    @property
+    def _ends(self) -> tuple[int, int]:
+        return -(1 << (self.bits - 1)), (1 << (self.bits - 1)) - 1
 
-@dataclass(frozen=True)
-class Record:
-    """n samples of the inputs that were asked for, without a gap."""
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """(n, inputs): the converter was at its end, and the volts are no measurement.
 
-    volts: NDArray[np.float64]
-    """(n, inputs): at the instrument."""
-    codes: NDArray[np.signedinteger]
-    """(n, inputs): as the converters gave them."""
-    clipped: NDArray[np.bool_]
-    """(n, inputs): the converter was at its end, and the volts are no measurement."""
-    repeats: bool
-    """All codes that were taken have been taken before, to the bit. No noise makes such: it is an old record."""
+        Judged by codes: the volts of the ends depend on the calibration.
+        """
+        least, most = self._ends
+        return np.asarray((self.codes == least) | (self.codes == most))
+
+    def check(self, name: str) -> None:
+        """Check the samples of the instrument ``name``.
+
+        :raises RecordIncomplete: some volts are non-finite.
+        :raises RigError: some codes exceed the resolution.
+        """
+        if not np.isfinite(self.volts).all():
+            raise RecordIncomplete(f"{name}: returned non-finite samples")
+        least, most = self._ends
+        if (beyond := (self.codes < least) | (self.codes > most)).any():
+            raise RigError(f"{name}: returned the code {self.codes[beyond][0]}, which exceeds its {self.bits} bits")
 
 
 class Instrument(ABC):
-    """Every method may raise RigError, which names the instrument and what it did not do."""
+    """Base class of the drivers. All methods may raise RigError, which names the instrument and what failed."""
 
     datasheet: ClassVar[Datasheet]
     name: str
-    """As a user would call it, for errors."""
+    """Name for error messages."""
     pots: PotBox | None = None
-    """None: it has none."""
+    """Pots of the instrument; None if it has none."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._taken: deque[bytes] = deque(maxlen=_REMEMBERED)
-        """Digests of the codes that were taken."""
+        self._ranges: tuple[tuple[int, str], ...] = ()
+        self._excitation = Excitation()
+        self._digests: deque[bytes] = deque(maxlen=_REMEMBERED)
+        """Digests of the codes of earlier records."""
 
     @classmethod
     @abstractmethod
     def is_address(cls, address: str) -> bool:
-        """Whether one could be found at what stands behind ``scheme://``."""
+        """True if ``address``, which follows ``scheme://``, is well formed."""
 
     @classmethod
     def place(cls, address: str) -> str:
-        """Name of what ``open`` connects to, for the option ``--allow``."""
+        """Value of the option ``--allow`` that permits ``open`` to connect to an address."""
         return address
 
     @classmethod
     @abstractmethod
     def open(cls, address: str, timeout_s: float) -> Instrument:
-        """The one at an address that is one, in a known state, the generator off.
+        """Connect to the instrument at a valid address; leave it in a known state, the generator off.
 
-        :raises ConfigurationError: what it needs is not installed.
+        :raises ConfigurationError: a package that the driver needs is not installed.
         """
 
     @classmethod
     def check(cls, excitation: Excitation) -> None:
-        """That its generator has such a waveform, in volts at its output.
+        """Check that the generator can play a waveform, in volts at its output.
 
-        :raises ConfigurationError: it has not; says why.
+        :raises ConfigurationError: it cannot; the message says why.
         """
         least_v, most_v = cls.datasheet.output_v
         if excitation.low_v < least_v - _ROUNDING_V or excitation.high_v > most_v + _ROUNDING_V:
@@ -136,82 +150,74 @@ class Instrument(ABC):
                 f" {least_v:g} V to {most_v:g} V"
             )
 
-    @abstractmethod
     def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
-        """Which inputs are wanted, in this order, each with the word for its range."""
+        """Choose the inputs of the next records, in this order, each with the name of its range."""
+        self._ranges = tuple(ranges)
 
-    @abstractmethod
     def set_excitation(self, excitation: Excitation) -> None:
-        """What the generator gives from the first sample of each record on, checked before; it stays off."""
+        """Choose the checked waveform that starts with the first sample of each record. The generator stays off."""
+        self._excitation = excitation
 
-    def record(self, samples: int, while_recording: Callable[[], None] | None = None) -> Record:
-        """Switch the generator on, and at that instant begin a record of so many samples, at most ``record_n``.
+    def record(self, samples: int, while_recording: Callable[[], None] | None = None) -> InputRecord:
+        """Switch the generator on, and start a record of ``samples`` samples, at most ``record_n``, at that instant.
 
-        ``while_recording`` is called when it has begun, and may take as long as it lasts.
+        :param while_recording: called once the record has started; may take as long as the record.
         """
         taken = self._take(samples, while_recording)
         if len(taken.codes) < samples:
-            raise RecordIncomplete(f"{self.name}: gave {len(taken.codes)} of {samples} samples")
-        if not np.isfinite(taken.volts).all():
-            raise RecordIncomplete(f"{self.name}: gave samples that are no numbers")
+            raise RecordIncomplete(f"{self.name}: returned {len(taken.codes)} of {samples} samples")
+        taken.check(self.name)
         repeats = self._repeats(taken.codes)
-        clipped = self._clipped(taken)
-        return Record(taken.volts[:samples], taken.codes[:samples], clipped[:samples], repeats)
+        return replace(taken, volts=taken.volts[:samples], codes=taken.codes[:samples], repeats=repeats)
 
     @abstractmethod
-    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:
-        """As ``record``; more samples may be taken than were asked for."""
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> InputRecord:
+        """Take a record as ``record`` describes; the result may have more samples than requested."""
 
     def _repeats(self, codes: NDArray[np.signedinteger]) -> bool:
-        """Whether they have been taken before; from now on they have."""
+        """Remember codes. Return True if they were remembered before."""
         digest = hashlib.blake2b(codes.tobytes(), digest_size=16).digest()
-        known = digest in self._taken
-        self._taken.append(digest)
+        known = digest in self._digests
+        self._digests.append(digest)
         return known
-
-    def _clipped(self, taken: Taken) -> NDArray[np.bool_]:
-        """At the first and the last code: where those are in volts is a matter of calibration."""
-        least, most = -(1 << (taken.bits - 1)), (1 << (taken.bits - 1)) - 1
-        if (beyond := (taken.codes < least) | (taken.codes > most)).any():
-            code = taken.codes[beyond][0]
-            raise RigError(f"{self.name}: gave the code {code}, which its {taken.bits} bits do not have")
-        return np.asarray((taken.codes == least) | (taken.codes == most))
 
     @abstractmethod
     def rest(self, settle_s: float) -> None:
-        """The generator off, for so long of the computer's time."""
+        """Switch the generator off, and wait for ``settle_s`` seconds of machine time."""
 
     @abstractmethod
     def make_safe(self) -> None:
-        """The generator off. Called whatever happened before; does what it can.
+        """Switch the generator off, in any state of the instrument.
 
-        :raises RigError: it cannot be made safe; the message says what to do by hand.
+        :raises RigError: it may still be on.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of it; raises nothing."""
+        """Close the connection. Raises nothing."""
 
 
 class Driver(NamedTuple):
+    """Location of a driver class."""
+
     module: str
     kind: str
-    """A class in it."""
+    """Name of the class."""
     address: str
-    """How one is written."""
+    """Form of its addresses, for error messages."""
 
 
 DRIVERS = {
     "redpitaya": Driver("analogrig.hardware.red_pitaya", "RedPitaya", "HOST[:PORT]"),
     "nidaqmx": Driver("analogrig.hardware.ni_daqmx", "NiDaqmx", "CARD"),
 }
-"""By the scheme of an instrument's URL."""
+"""Drivers by the scheme of an instrument's URL."""
 
 
-def located(url: str) -> tuple[type[Instrument], str]:
-    """The kind of instrument that a URL ``scheme://address`` names, and its address, which the driver understands.
+def find_driver(url: str) -> tuple[type[Instrument], str]:
+    """The driver class and the address that a URL ``scheme://address`` names.
 
-    :raises ConfigurationError: there is no driver for it, or it is no address.
+    :raises ConfigurationError: no driver has this scheme, or the address is malformed.
     """
     scheme, _, rest = url.partition(":")
     known = DRIVERS.get(scheme.lower())

@@ -1,4 +1,4 @@
-"""Whoever plays on an instrument has it alone on this machine; and a process that is ended lets go of it."""
+"""Per-machine instrument lock; a process that is ended by a signal still leaves the instrument safe."""
 
 from __future__ import annotations
 
@@ -9,49 +9,53 @@ import os
 import signal
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
 from analogrig.errors import RigClosed
 
-_ENDED_BY = (signal.SIGTERM, signal.SIGHUP)
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
-class Lock:
-    """On the instrument of a URL. While it is held, a signal that would end the process ends it in good order."""
+@contextlib.contextmanager
+def lock_instrument(url: str) -> Iterator[None]:
+    """Hold the lock of the instrument at a URL; the kernel releases it with the process, also after SIGKILL.
 
-    def __init__(self, url: str) -> None:
-        """:raises RigClosed: somebody else on this machine has it."""
-        place = hashlib.sha256(url.lower().encode()).hexdigest()[:16]
-        path = Path(tempfile.gettempdir()) / f"analogrig-{os.getuid()}-{place}.lock"
+    Meanwhile SIGTERM and SIGHUP raise SystemExit unless the process handles them, so that generators are switched off.
+
+    :raises RigClosed: another process, or another rig of this one, holds it.
+    """
+    digest = hashlib.sha256(url.lower().encode()).hexdigest()[:16]
+    path = Path(tempfile.gettempdir()) / f"analogrig-{os.getuid()}-{digest}.lock"
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except OSError as error:
+        raise RigClosed(f"instrument {url}: cannot be locked: {path}: {error.strerror or error}") from error
+    with os.fdopen(fd, "wb"):
         try:
-            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise RigClosed(f"instrument {url}: cannot be locked: {path}: {error.strerror or error}") from error
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(self._fd)
-            raise RigClosed(f"instrument {url}: somebody else on this machine plays on it") from error
-        self._handled = _handle_ends()
-
-    def release(self) -> None:
-        for number in self._handled:
-            with contextlib.suppress(ValueError):
-                signal.signal(number, signal.SIG_DFL)
-        os.close(self._fd)
+            raise RigClosed(f"instrument {url}: in use by another process or rig on this machine") from error
+        with _handled_signals():
+            yield
 
 
-def _handle_ends() -> tuple[signal.Signals, ...]:
-    """Those that nobody handles yet; only the main thread may."""
-    if threading.current_thread() is not threading.main_thread():
-        return ()
-    free = tuple(number for number in _ENDED_BY if signal.getsignal(number) is signal.SIG_DFL)
+@contextlib.contextmanager
+def _handled_signals() -> Iterator[None]:
+    """Exit in good order at signals that have no handler yet; in the main thread only, as Python requires."""
+    is_main = threading.current_thread() is threading.main_thread()
+    free = [number for number in _ENDING if is_main and signal.getsignal(number) is signal.SIG_DFL]
     for number in free:
-        signal.signal(number, _end)
-    return free
+        signal.signal(number, _exit)
+    try:
+        yield
+    finally:
+        for number in free:
+            with contextlib.suppress(ValueError):  # released in another thread
+                signal.signal(number, signal.SIG_DFL)
 
 
-def _end(number: int, _: FrameType | None) -> None:
-    """As the system's own way of ending, but that what is open is closed before."""
+def _exit(number: int, _: FrameType | None) -> None:
+    """Exit with the status of a process that the signal has ended, after closing what is open."""
     raise SystemExit(128 + number)

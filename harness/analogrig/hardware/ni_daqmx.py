@@ -1,10 +1,10 @@
-"""A multifunction card of National Instruments through NI-DAQmx: generator at ao0, inputs at ai0 to ai7.
+"""Driver of multifunction cards of National Instruments through NI-DAQmx: generator at ao0, inputs at ai0 to ai7.
 
-``nidaqmx://Dev1``, the card's name in NI MAX; simulated cards too. Needs the extra ``analogrig[nidaqmx]`` and NI's
-driver. Output and inputs begin together and have one timebase; the output is written LEVELS_PER_SAMPLE times a sample,
-so that edges of a generator on a clock of its own come to within 1/32 of one. Few cards sample their inputs at the same
-instant: the self-test says by how much they do not. Task, timing and triggers after NI's Python documentation
-(https://nidaqmx-python.readthedocs.io).
+The URL ``nidaqmx://Dev1`` has the card's name in NI MAX; simulated cards work too. The driver needs the extra
+``analogrig[nidaqmx]`` and NI's own driver. Output and inputs start together on one timebase. The output has
+LEVELS_PER_SAMPLE levels a sample, so that edges on the clock "free" are exact to 1/32 sample. Few cards sample their
+inputs at the same instant; the self-test measures the skew. Tasks, timing and triggers follow
+https://nidaqmx-python.readthedocs.io.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigClosed, RigRefused, RigTimeout
-from analogrig.hardware.instrument import Datasheet, Instrument, Taken
+from analogrig.hardware.instrument import Datasheet, InputRecord, Instrument
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
 RATE_HZ = 20e3
@@ -28,12 +28,12 @@ LEVELS_PER_SAMPLE = 32
 
 _TIMED_OUT = (-200284, -200292, -200474, -200560)
 _GONE = (-200220, -201003, -88705)
-"""Error codes of NI-DAQmx (nidaqmx.error_codes): samples not yet there, not yet taken, an operation timed out, a task
-did; no such device, it cannot be reached, it is not present."""
+"""Error codes of nidaqmx.error_codes: samples not yet available, not yet acquired, operation or task timed out; device
+invalid, inaccessible, not present."""
 
 
 class NiDaqmx(Instrument):
-    """One record is one finite task; the card has no pots."""
+    """Card that takes each record as one finite task; it has no pots."""
 
     datasheet = Datasheet(
         rate_hz=RATE_HZ,
@@ -47,15 +47,13 @@ class NiDaqmx(Instrument):
     def __init__(self, library: Any, card: str, timeout_s: float, pause: Callable[[float], None] = time.sleep) -> None:
         """``library`` is the module nidaqmx.
 
-        :raises RigError: the card is not there.
+        :raises RigError: the card is not present.
         """
         super().__init__(f"instrument {card}")
         self._library = library
         self._card = card
         self._timeout_s = timeout_s
         self._pause = pause
-        self._ranges: tuple[tuple[int, str], ...] = ()
-        self._excitation = Excitation()
         self.make_safe()
 
     @classmethod
@@ -68,8 +66,8 @@ class NiDaqmx(Instrument):
 
     @classmethod
     def open(cls, address: str, timeout_s: float) -> NiDaqmx:
-        """:raises ConfigurationError: the package nidaqmx is not installed, or NI's driver is not.
-        :raises RigError: the card is not there.
+        """:raises ConfigurationError: the package nidaqmx or NI's driver is not installed.
+        :raises RigError: the card is not present.
         """
         try:
             library = importlib.import_module("nidaqmx")
@@ -81,17 +79,11 @@ class NiDaqmx(Instrument):
             ) from error
         return cls(library, address, timeout_s)
 
-    def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
-        self._ranges = tuple(ranges)
-
-    def set_excitation(self, excitation: Excitation) -> None:
-        self._excitation = excitation
-
-    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> InputRecord:
         with self._errors("the record"), self._library.Task() as out, self._library.Task() as taken:
-            inputs = self._wire(out, taken, samples)
+            inputs = self._configure(out, taken, samples)
             out.write(levels_v(self._excitation, samples).tolist(), auto_start=False)
-            out.start()  # it waits for the inputs to start
+            out.start()  # waits for the start trigger of the inputs
             taken.start()
             if while_recording is not None:
                 while_recording()
@@ -100,10 +92,10 @@ class NiDaqmx(Instrument):
                 np.polynomial.polynomial.polyval(of_input, each.ai_dev_scaling_coeff)
                 for each, of_input in zip(inputs, codes, strict=True)
             ]
-            return Taken(np.stack(volts, axis=1), codes.T, _bits(inputs))
+            return InputRecord(np.stack(volts, axis=1), codes.T, _bits(inputs))
 
     def _codes(self, taken: Any, inputs: Sequence[Any], samples: int) -> NDArray[np.signedinteger]:
-        """(inputs, m) as the converters gave them, m as many as asked for unless some are lacking."""
+        """Codes of the converters, (inputs, m); m is less than ``samples`` if some were lost."""
         reader = self._library.stream_readers.AnalogUnscaledReader(taken.in_stream)
         is_short = _bits(inputs) <= np.iinfo(np.int16).bits
         codes = np.zeros((len(inputs), samples), np.int16 if is_short else np.int32)
@@ -112,26 +104,25 @@ class NiDaqmx(Instrument):
         return codes[:, :got]
 
     def rest(self, settle_s: float) -> None:
-        """In the card's case the computer's time is that of the clock on the wall."""
         self.make_safe()
         self._pause(settle_s)
 
     def make_safe(self) -> None:
         with self._errors("0 V at ao0"), self._library.Task() as out:
-            self._wire_output(out)
+            self._add_output(out)
             out.write(0.0, auto_start=True, timeout=self._timeout_s)
 
     def close(self) -> None:
-        """Tasks are closed when they are done."""
+        """Do nothing: each task is closed when it is done."""
 
-    def _wire_output(self, out: Any) -> None:
+    def _add_output(self, out: Any) -> None:
         low_v, high_v = self.datasheet.output_v
         out.ao_channels.add_ao_voltage_chan(f"{self._card}/ao0", min_val=low_v, max_val=high_v)
 
-    def _wire(self, out: Any, taken: Any, samples: int) -> list[Any]:
-        """Returns the inputs, as NI's package has them."""
+    def _configure(self, out: Any, taken: Any, samples: int) -> list[Any]:
+        """Configure both tasks. Return the input channels of nidaqmx."""
         finite = self._library.constants.AcquisitionType.FINITE
-        self._wire_output(out)
+        self._add_output(out)
         inputs = []
         for number, word in self._ranges:
             low_v, high_v = self.datasheet.ranges_v[word]
@@ -146,17 +137,16 @@ class NiDaqmx(Instrument):
 
     @contextlib.contextmanager
     def _errors(self, what: str) -> Iterator[None]:
-        """NI's errors have many lines, of which the first says what is the matter, and a number unless its driver is
-        not installed."""
+        """Convert NI's errors. Their first line is the reason; they have a code unless NI's driver is missing."""
         try:
             yield
         except self._library.errors.Error as error:
-            said = f"{self.name}: {what}: {str(error).strip().partition(chr(10))[0]}"
+            message = f"{self.name}: {what}: {str(error).strip().partition(chr(10))[0]}"
             code = getattr(error, "error_code", None)
             if code is None:
-                raise ConfigurationError(said) from error
+                raise ConfigurationError(message) from error
             kind = RigTimeout if code in _TIMED_OUT else RigClosed if code in _GONE else RigRefused
-            raise kind(said) from error
+            raise kind(message) from error
 
 
 def _bits(inputs: Sequence[Any]) -> int:
@@ -164,7 +154,7 @@ def _bits(inputs: Sequence[Any]) -> int:
 
 
 def levels_v(excitation: Excitation, samples: int) -> NDArray[np.float64]:
-    """(samples * LEVELS_PER_SAMPLE,): of the output, evenly in time; the first is that of the first sample."""
+    """Levels of the output at even intervals from the first sample on, (samples * LEVELS_PER_SAMPLE,)."""
     edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
     ticks = np.arange(samples * LEVELS_PER_SAMPLE, dtype=np.int64) * (TICKS_PER_SAMPLE // LEVELS_PER_SAMPLE)
     return np.asarray(edges.levels_v[np.searchsorted(edges.ticks, ticks, side="right") - 1])

@@ -1,4 +1,4 @@
-"""What a real computer can play, as it is wired to its instrument: scenarios become plans, and records codes."""
+"""Plans: scenarios checked and converted for a computer as it is wired to its instrument."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.by_hand import Tweak
-from analogrig.hardware.instrument import Instrument, Record
-from analogrig.hardware.pots import NoPots
-from analogrig.hardware.wiring import InstrumentPots, RealDescription, check_wiring
+from analogrig.hardware.by_hand import PlannedChange
+from analogrig.hardware.instrument import InputRecord, Instrument
+from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.rigs.emulator import Stream, emulator_errors, settings_of
 from analogrig.rigs.rig import CHANNEL_UNITS
 from analogrig.run import CHANNELS, MEASURED, Channel, Segment
@@ -23,72 +22,69 @@ from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation, SuspensionComputer
 
 LEAD_N = 500
-"""A record begins at least so long before a tweak, so that the device knows the plant that changes."""
+"""Least number of samples in a record before a change, in which the device learns the plant."""
 
 _MOST_CODE = 0xFFFF
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What will be played, all of it checked."""
+class PlayPlan:
+    """A checked scenario, and what its play has shown so far."""
 
     scenario: Scenario
     computer: SuspensionComputer
-    """Nominal, as the scenario starts it."""
+    """Nominal computer with the pots of the first sample."""
     excitation: Excitation
-    """At the computer."""
-    start: Mapping[str, float]
-    """Dials."""
-    tweaks: tuple[Tweak, ...]
-    doubts: list[str]
-    """What the samples say against the instants of the instrument's own pots."""
+    """Waveform at the computer."""
+    changes: tuple[PlannedChange, ...]
+    contradictions: list[str]
+    """Evidence of the samples against the instants of the instrument's own pots."""
     dated: list[Segment] | None
-    """The truth as the samples tell it, where nothing else does."""
+    """Segments dated by the samples; None if the instrument's instants are exact."""
 
     def truth(self) -> tuple[Segment, ...]:
         return self.scenario.segments() if self.dated is None else tuple(self.dated)
 
 
-class Wired:
-    """A description, and the kind of instrument that it names; nothing of it has to be there."""
+class Planner:
+    """Plans scenarios and converts records for a description and a kind of instrument; connects to nothing."""
 
     def __init__(self, description: RealDescription, kind: type[Instrument]) -> None:
-        """:raises ConfigurationError: they do not fit, or the description contradicts itself."""
+        """:raises ConfigurationError: the description contradicts itself or the datasheet."""
         check_wiring(description, kind.datasheet)
         self._description = description
         self._kind = kind
         self._datasheet = kind.datasheet
 
-    def plan(self, scenario: Scenario, seed: int) -> Plan:
-        """:raises ConfigurationError: the scenario cannot be played on this rig, or would exceed its limits."""
-        where = f"scenario {scenario.name}: "
-        if scenario.plant.set != self._description.plant:
+    def plan(self, scenario: Scenario, seed: int) -> PlayPlan:
+        """:raises ConfigurationError: the rig cannot play the scenario, or it would exceed the limits."""
+        description, where = self._description, f"scenario {scenario.name}: "
+        if scenario.plant.set != description.plant:
             raise ConfigurationError(
-                f"{where}wants the program {scenario.plant.set!r}; {self._description.name or 'the rig'} has"
-                f" {self._description.plant!r} patched"
+                f"{where}wants the program {scenario.plant.set!r}; {description.name or 'the rig'} has"
+                f" {description.plant!r} patched"
             )
         computer = SuspensionComputer(scenario.plant.set)
         with emulator_errors(where):
             computer.set(**settings_of(computer, scenario.plant.overrides()))
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
         self._check_force(excitation, where)
-        start = dict(computer.dials)
-        self._check_dials(start, where)
-        tweaks: list[Tweak] = []
+        self._check_dials(computer.dials, where)
+        changes: list[PlannedChange] = []
         plant = scenario.plant.plant()
         for i, tweak in enumerate(scenario.tweaks):
             place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
-            if isinstance(self._description.pots, NoPots):
-                raise ConfigurationError(f'{place}nobody turns the pots of this rig: its pots have kind = "none"')
+            if not description.pots.changeable:
+                raise ConfigurationError(f'{place}the pots of this rig cannot be changed: they have kind = "none"')
             if tweak.ramp_n:
                 raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
             with emulator_errors(place):
                 dials = computer.dials_for(**settings_of(computer, tweak.overrides()))
             self._check_dials(dials, place)
             before, plant = plant, dataclasses.replace(plant, **tweak.overrides())
-            tweaks.append(Tweak(tweak.sample, dials, before, plant))
-        truth = None if isinstance(self._description.pots, InstrumentPots) else [Segment(0, scenario.plant.plant())]
-        return Plan(scenario, computer, excitation, start, tuple(tweaks), [], truth)
+            changes.append(PlannedChange(tweak.sample, dials, before, plant))
+        dated = None if description.pots.exact else [Segment(0, scenario.plant.plant())]
+        return PlayPlan(scenario, computer, excitation, tuple(changes), [], dated)
 
     def _check_force(self, excitation: Excitation, where: str) -> None:
         low_v, high_v = self._description.limits.force_v
@@ -103,9 +99,9 @@ class Wired:
             raise ConfigurationError(f"{where}{error}") from error
 
     def at_generator(self, excitation: Excitation) -> Excitation:
-        """The waveform at the instrument that is ``excitation`` at the computer."""
+        """Waveform at the instrument that becomes ``excitation`` at the computer."""
         stage = self._description.generator
-        low_v, high_v = ((volts - stage.offset_v) / stage.gain for volts in (excitation.low_v, excitation.high_v))
+        low_v, high_v = (stage.input_v(volts) for volts in (excitation.low_v, excitation.high_v))
         if low_v <= high_v:
             return dataclasses.replace(excitation, low_v=low_v, high_v=high_v)
         if excitation.shape != "square":
@@ -121,16 +117,16 @@ class Wired:
                 )
 
     def channels(self, computer: SuspensionComputer, noise_lsb: Mapping[str, float]) -> dict[str, Channel]:
-        """Volts at the computer, whatever the stages do to them.
+        """Measured channels, in volts at the computer.
 
-        :param noise_lsb: of the channels of which it was measured.
+        :param noise_lsb: measured noise by channel; for others that of the description is used.
         """
         scaling = self._description.scaling
         full = {"force": scaling.force_n, "displacement": scaling.displacement_m}
         out = {}
         for name in MEASURED:
             wired = self._description.inputs[name]
-            ends_v = sorted((end - wired.offset_v) / wired.gain for end in self._datasheet.ranges_v[wired.range])
+            ends_v = wired.ends_v(self._datasheet)
             low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << self._datasheet.bits)
             out[name] = Channel(
                 low_v=low_v,
@@ -145,10 +141,10 @@ class Wired:
     def time_scale(self, computer: SuspensionComputer) -> float:
         return self._description.scaling.time or computer.scales.time
 
-    def converted(
-        self, taken: Record, channels: Mapping[str, Channel]
+    def convert(
+        self, taken: InputRecord, channels: Mapping[str, Channel]
     ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
-        """Volts at the computer, codes and clipping, (n, 4) each."""
+        """Volts at the computer, codes and clipping of a record, each (n, 4)."""
         n = len(taken.volts)
         volts = np.full((n, len(CHANNELS)), np.nan)
         codes = np.zeros((n, len(CHANNELS)), np.uint16)
@@ -162,14 +158,16 @@ class Wired:
         return volts, codes, clipped
 
 
-def records(samples: int, most_n: int, tweaks: list[int]) -> list[tuple[int, int]]:
-    """The records (start, end) in which so many samples are taken, none longer than ``most_n``, and as few as can be
-    with LEAD_N samples between the beginning of one and a tweak."""
+def split_records(samples: int, most_n: int, changes: list[int]) -> list[tuple[int, int]]:
+    """Divide samples into as few records (start, end) as possible, none longer than ``most_n``.
+
+    Where possible, a record starts LEAD_N samples or more before a change.
+    """
     cuts = [0]
     while samples - cuts[-1] > most_n:
         start, end = cuts[-1], cuts[-1] + most_n
-        for tweak in sorted(tweaks, reverse=True):
-            if start + LEAD_N < tweak - LEAD_N < end <= tweak + LEAD_N:
-                end = tweak - LEAD_N
+        for change in sorted(changes, reverse=True):
+            if start + LEAD_N < change - LEAD_N < end <= change + LEAD_N:
+                end = change - LEAD_N
         cuts.append(end)
     return list(itertools.pairwise([*cuts, samples]))

@@ -1,9 +1,9 @@
-"""A real analogue computer, wired to an instrument: the same scenarios, the same blocks of codes.
+"""Rig of a real analogue computer on an instrument: the same scenarios, the same blocks of codes.
 
     generator -> stage -> force input of the computer        force, displacement -> stages -> inputs of the instrument
 
-The instrument's records are not gap-free: a scenario longer than one is played in several, each from rest, and the
-device begins each afresh.
+The instrument's records are not gap-free. A scenario longer than one record is played in several, each from rest, and
+the device restarts with each.
 """
 
 from __future__ import annotations
@@ -12,250 +12,205 @@ import contextlib
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
-from analogrig.hardware.by_hand import ByHand, Tweak, doubts
+from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import Instrument, PotBox, Record, Turn, located
-from analogrig.hardware.lock import Lock
-from analogrig.hardware.plan import Plan, Wired, records
-from analogrig.hardware.pots import NoPots, Pots
+from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, find_driver
+from analogrig.hardware.lock import lock_instrument
+from analogrig.hardware.plan import Planner, PlayPlan, split_records
+from analogrig.hardware.pots import Pots
 from analogrig.hardware.self_test.conduct import self_test
-from analogrig.hardware.wiring import InstrumentPots, RealDescription
+from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
 from analogrig.run import MEASURED
 from analogrig.scenario import Scenario
-from analogrig_emulator import SuspensionComputer
 
 SELF_TEST_SEED = 0
 
 _AFTER_N = 0.05
-"""A pot that jumps at a sample does so this part of a sample after it."""
+"""Delay of a scheduled pot change after its sample, in samples."""
 
 _log = logging.getLogger(__name__)
 
 
-class _OnInstrument:
-    """Its pots; those that turn within a record are in the record's schedule."""
-
-    slow = False
-
-    def __init__(self, box: PotBox) -> None:
-        self._box = box
-
-    @classmethod
-    def of(cls, instrument: Instrument, pots: Iterable[str]) -> Self:
-        """:raises RigError: it has not those pots."""
-        box = instrument.pots
-        lacking = sorted(set(pots) - set(box.names if box else ()))
-        if box is None or lacking:
-            raise RigError(f"{instrument.name}: has no pots {', '.join(lacking)} that it could turn")
-        return cls(box)
-
-    def settle(self, dials: Mapping[str, float], words: str) -> None:  # noqa: ARG002 - words are for an operator
-        for pot, dial in dials.items():
-            self._box.turn(pot, dial)
-
-    def turn(self, dials: Mapping[str, float], words: str) -> None:
-        self.settle(dials, words)
-
-    def schedule(self, tweaks: Iterable[Tweak], rate_hz: float) -> None:
-        """For the next record."""
-        self._box.schedule(
-            [
-                Turn((tweak.sample + _AFTER_N) / rate_hz, pot, dial)
-                for tweak in tweaks
-                for pot, dial in tweak.dials.items()
-            ]
-        )
-
-    def close(self) -> None:
-        pass
-
-
 class RealRig:
-    """A description and the instrument that it names; nothing is sent before the first block is asked for."""
+    """Rig of a description and the instrument that it names; connects when the first block is requested."""
 
     def __init__(self, description: RealDescription, connect: Callable[[str, float], Instrument] | None = None) -> None:
         """``connect`` opens the instrument at an address with a time-out; by default the driver does.
 
         :raises ConfigurationError: the description contradicts itself, or the instrument.
         """
-        turned = set() if isinstance(description.pots, NoPots) else {"tweak"}
-        self.capabilities = frozenset({"excite", *turned})
-        self._kind, self._address = located(description.instrument)
-        self._wired = Wired(description, self._kind)
-        self._datasheet = self._kind.datasheet
+        self.capabilities = frozenset({"excite", "tweak"} if description.pots.changeable else {"excite"})
+        kind, self._address = find_driver(description.instrument)
+        self._planner = Planner(description, kind)
+        self._datasheet = kind.datasheet
         self._description = description
-        self._connect = connect or self._kind.open
+        self._connect = connect or kind.open
         self._instrument: Instrument | None = None
         self._pots: Pots | None = None
+        self._lock = contextlib.ExitStack()
+        self._is_locked = False
         self._noise_lsb: dict[str, float] = {}
-        """By channel, as the self-test has measured it."""
-        self._lock: Lock | None = None
+        """Noise by channel, measured by the self-test."""
         self._standing: dict[str, float] = {}
-        """Dials, as far as they are known."""
+        """Known positions of the pots."""
         self._caveats: tuple[str, ...] | None = None if description.self_test else ()
+        """Findings of the self-test; None before it."""
 
     def description(self) -> Mapping[str, Any]:
         return dataclasses.asdict(self._description)
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
-        """As Rig.perform; before the first block the rig tests itself, once, and what it finds is a caveat."""
-        return self.performance(scenario, seed, tested=True)
-
-    def bare(self) -> BareRig:
-        """The same rig, for the self-test: without one."""
-        return BareRig(self)
-
-    def performance(self, scenario: Scenario, seed: int, *, tested: bool) -> Performance:
-        """As ``perform``, with or without the rig's test of itself."""
-        plan = self._wired.plan(scenario, seed)
+        """Begin to play, as Rig.perform. The first play begins with the self-test, whose findings are caveats."""
+        plan = self._planner.plan(scenario, seed)
         return Performance(
             sample_period_s=1.0 / self._datasheet.rate_hz,
-            time_scale=self._wired.time_scale(plan.computer),
-            channels=self._wired.channels(plan.computer, self._noise_lsb),
-            blocks=self._blocks(scenario, plan, tested=tested),
-            hindsight=lambda: self._hindsight(plan, tested=tested),
+            time_scale=self._planner.time_scale(plan.computer),
+            channels=self._planner.channels(plan.computer, self._noise_lsb),
+            blocks=self._blocks(scenario, plan),
+            hindsight=lambda: Hindsight(
+                plan.truth(), caveats=(*(self._caveats or ()), *plan.contradictions), noise_lsb=self._noise_lsb
+            ),
         )
-
-    def _hindsight(self, plan: Plan, *, tested: bool) -> Hindsight:
-        caveats = (*(self._caveats or ()), *plan.doubts) if tested else ()
-        return Hindsight(plan.truth(), caveats=caveats, noise_lsb=self._noise_lsb if tested else {})
 
     # ---- while it plays
 
-    def _blocks(self, scenario: Scenario, plan: Plan, *, tested: bool) -> Iterator[Block]:
-        if tested and self._caveats is None:
-            self._caveats = self._tested()
-        instrument, pots = self._opened()
-        wired = [self._description.inputs[name] for name in MEASURED]
-        instrument.set_inputs([(each.input, each.range) for each in wired])
-        instrument.set_excitation(self._wired.at_generator(plan.excitation))
-        channels = self._wired.channels(plan.computer, self._noise_lsb)
-        period_s = self._wired.time_scale(plan.computer) / self._datasheet.rate_hz
-        cuts = records(scenario.samples, self._datasheet.record_n, [tweak.sample for tweak in plan.tweaks])
-        standing, plant = plan.start, scenario.plant.plant()
+    def _blocks(self, scenario: Scenario, plan: PlayPlan) -> Iterator[Block]:
+        if self._caveats is None:
+            self._test()
+        instrument, pots = self._open()
+        inputs = [self._description.inputs[name] for name in MEASURED]
+        instrument.set_inputs([(each.input, each.range) for each in inputs])
+        instrument.set_excitation(self._planner.at_generator(plan.excitation))
+        channels = self._planner.channels(plan.computer, self._noise_lsb)
+        period_s = self._planner.time_scale(plan.computer) / self._datasheet.rate_hz
+        cuts = split_records(scenario.samples, self._datasheet.record_n, [change.sample for change in plan.changes])
+        dials, plant = dict(plan.computer.dials), scenario.plant.plant()
         for record, (start, end) in enumerate(cuts):
-            mine = [dataclasses.replace(t, sample=t.sample - start) for t in plan.tweaks if start <= t.sample < end]
+            changes = [dataclasses.replace(c, sample=c.sample - start) for c in plan.changes if start <= c.sample < end]
             with self._left_safe(instrument):
-                self._settle(instrument, pots, standing, plant)
-                self._standing = {}  # unless the record comes to its end
-                taken, by_hand = self._record(instrument, pots, end - start, mine)
-            for tweak in mine:
-                standing, plant = {**standing, **tweak.dials}, tweak.after
-            self._standing = dict(standing)
-            volts, codes, clipped = self._wired.converted(taken, channels)
+                self._settle(instrument, pots, dials, plant)
+                self._standing = {}  # unknown unless the record is completed
+                taken, by_hand = self._record(instrument, pots, end - start, changes)
+            for change in changes:
+                dials, plant = {**dials, **change.dials}, change.after
+            self._standing = dials
+            volts, codes, clipped = self._planner.convert(taken, channels)
             measured = Signals.of(codes, clipped, channels, period_s)
             if plan.dated is not None:
-                plan.dated.extend(by_hand.dated(measured, start))
+                plan.dated.extend(by_hand.date(measured, start))
             else:
-                plan.doubts.extend(doubts(measured, mine, start))
+                plan.contradictions.extend(contradictions(measured, changes, start))
             for first in range(0, len(codes), BLOCK_SAMPLES):
                 part = slice(first, first + BLOCK_SAMPLES)
                 yield Block(start + first, volts[part], codes[part], clipped[part], record)
 
     def _record(
-        self, instrument: Instrument, pots: Pots, samples: int, tweaks: Sequence[Tweak]
-    ) -> tuple[Record, ByHand]:
-        """:raises RecordStale: the instrument has given a record that it had given before."""
+        self, instrument: Instrument, pots: Pots, samples: int, changes: Sequence[PlannedChange]
+    ) -> tuple[InputRecord, HandChanges]:
+        """Take a record with its changes. Return it with those that are made by hand.
+
+        :raises RecordStale: the record repeats an earlier one.
+        """
         rate_hz = self._datasheet.rate_hz
-        if isinstance(pots, _OnInstrument):
-            pots.schedule(tweaks, rate_hz)
-            taken, by_hand = instrument.record(samples), ByHand(pots, (), rate_hz)
-        else:
-            by_hand = ByHand(pots, tweaks, rate_hz)
-            taken = instrument.record(samples, by_hand.turn_all)
+        if instrument.pots is not None and self._description.pots.exact:
+            instrument.pots.schedule(
+                [
+                    DialChange((c.sample + _AFTER_N) / rate_hz, pot, dial)
+                    for c in changes
+                    for pot, dial in c.dials.items()
+                ]
+            )
+            changes = ()
+        by_hand = HandChanges(pots, changes, rate_hz)
+        taken = instrument.record(samples, by_hand.make_all)
         if taken.repeats and any(wired.noise_lsb for wired in self._description.inputs.values()):
             raise RecordStale(
-                f"{instrument.name}: the record is an old one: to the bit it has been given before, and inputs with"
-                " noise give none twice (if these had none at all: noise_lsb = 0)"
+                f"{instrument.name}: stale record: it repeats an earlier one to the bit, which noise rules out"
+                " (set noise_lsb = 0 for inputs without noise)"
             )
         return taken, by_hand
 
     @contextlib.contextmanager
     def _left_safe(self, instrument: Instrument) -> Iterator[None]:
-        """However it ends; an instrument that cannot be made safe is told of beside what went wrong before."""
+        """Make the instrument safe after the block, however it ends; add a failure to do so to the block's error."""
         try:
             yield
         except RigError as error:
-            danger = self._danger(instrument)
-            self._let_go()  # what it still has to say would be taken for the answer to something else
-            if danger:
-                raise type(error)(f"{error}; {danger}") from error
+            warning = _switch_off(instrument)
+            self._disconnect()  # a late answer would be taken for that to a later query
+            if warning:
+                raise type(error)(f"{error}; {warning}") from error
             raise
         except BaseException:
-            _warn(self._danger(instrument))
+            _log_warning(_switch_off(instrument))
             raise
         instrument.make_safe()
 
-    def _danger(self, instrument: Instrument) -> str:
-        """What has to be done by hand after the attempt to make it safe; nothing if that went well."""
-        try:
-            instrument.make_safe()
-        except RigError:
-            return f"the generator of {instrument.name} may still be on: switch it off by hand"
-        return ""
-
     def _settle(self, instrument: Instrument, pots: Pots, dials: Mapping[str, float], plant: Plant) -> None:
-        """The pots as they shall stand, and the computer at rest."""
+        """Set the pots, and bring the computer to rest."""
         instrument.make_safe()
-        if dict(dials) != self._standing:
-            pots.settle(dials, ", ".join(f"{name} {value:g}" for name, value in plant.parameters().items()))
+        if dials != self._standing:
+            words = ", ".join(f"{name} {value:g}" for name, value in plant.parameters().items())
+            pots.set(dials, words, recording=False)
             self._standing = dict(dials)
         instrument.rest(self._description.settle_s)
 
-    def _opened(self) -> tuple[Instrument, Pots]:
-        """:raises RigError: one of them cannot be reached, or lacks what the description says.
+    def _open(self) -> tuple[Instrument, Pots]:
+        """Lock the instrument, and connect to it and to the pots, unless that is done.
+
+        :raises RigError: a connection failed, or the instrument lacks a pot.
         :raises ConfigurationError: there is no terminal for the operator.
         """
         description = self._description
-        if self._lock is None:
-            self._lock = Lock(description.instrument)
+        if not self._is_locked:
+            self._lock.enter_context(lock_instrument(description.instrument))
+            self._is_locked = True
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)
         if self._pots is None:
-            wanted = SuspensionComputer(description.plant).dials
-            self._pots = (
-                _OnInstrument.of(self._instrument, wanted)
-                if isinstance(description.pots, InstrumentPots)
-                else description.pots.open()
-            )
+            self._pots = description.pots.open_on(self._instrument, description.pot_names)
         return self._instrument, self._pots
 
-    def _tested(self) -> tuple[str, ...]:
-        """What is wrong with the rig, or cannot be told of it.
+    def _test(self) -> None:
+        """Run the self-test once.
 
-        :raises RigError: it failed.
+        :raises RigError: the rig failed; the next play repeats the test.
         """
+        self._caveats = ()  # plays of the self-test itself are not tested
         try:
-            findings = self_test(self.bare(), SELF_TEST_SEED, self._description.plant)
+            findings = self_test(self, SELF_TEST_SEED, self._description.plant)
         except (SelfTestError, ConfigurationError) as error:
-            return (f"the rig's self-test could not be made: {error}",)
+            self._caveats = (f"the rig's self-test could not be made: {error}",)
+            return
+        except BaseException:
+            self._caveats = None
+            raise
         self._noise_lsb = {
             check.channel: math.sqrt(max(0.0, check.value**2 - QUANTISATION_VARIANCE_LSB2))
             for check in findings.checks
             if check.name == "noise" and check.state == "well"
         }
-        return tuple(f"the rig's self-test: {reason}" for reason in findings.reasons)
+        self._caveats = tuple(f"the rig's self-test: {reason}" for reason in findings.reasons)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._instrument is not None:
-            _warn(self._danger(self._instrument))
-        self._let_go()
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+            _log_warning(_switch_off(self._instrument))
+        self._disconnect()
+        self._lock.close()
+        self._is_locked = False
 
-    def _let_go(self) -> None:
-        """Of the instrument and the pots; the next play begins with new connections."""
+    def _disconnect(self) -> None:
+        """Close instrument and pots; the next play opens them again."""
         if self._instrument is not None:
             self._instrument.close()
             self._instrument = None
@@ -265,26 +220,15 @@ class RealRig:
         self._standing = {}
 
 
-class BareRig:
-    """A real rig that does not test itself."""
-
-    def __init__(self, rig: RealRig) -> None:
-        self._rig = rig
-        self.capabilities = rig.capabilities
-
-    def description(self) -> Mapping[str, Any]:
-        return self._rig.description()
-
-    def perform(self, scenario: Scenario, seed: int) -> Performance:
-        return self._rig.performance(scenario, seed, tested=False)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """The rig that it is of is closed by who opened it."""
+def _switch_off(instrument: Instrument) -> str:
+    """Make the instrument safe. Return a warning if that failed, else an empty text."""
+    try:
+        instrument.make_safe()
+    except RigError:
+        return f"the generator of {instrument.name} may still be on: switch it off by hand"
+    return ""
 
 
-def _warn(danger: str) -> None:
-    if danger:
-        _log.warning("%s", danger)
+def _log_warning(warning: str) -> None:
+    if warning:
+        _log.warning("%s", warning)

@@ -1,7 +1,7 @@
-"""A Red Pitaya STEMlab 125-14 by its SCPI server: generator OUT1, inputs IN1 and IN2, 20 kS/s.
+"""Driver of a Red Pitaya STEMlab 125-14 through its SCPI server: generator OUT1, inputs IN1 and IN2, 20 kS/s.
 
-Commands after https://redpitaya.readthedocs.io (OS 2.0), in the order that its examples publish. A box of digital pots
-on the same server (``POT:...``, harness/analogrig/hardware/simulator/red_pitaya.py) is used when it is there.
+Commands and their order follow https://redpitaya.readthedocs.io (OS 2.0). A box of digital pots on the same server
+(``POT:...``, harness/analogrig/hardware/simulator/red_pitaya.py) is used if there is one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigRefused, RigTimeout
-from analogrig.hardware.instrument import Datasheet, Instrument, Taken, Turn
+from analogrig.hardware.instrument import Datasheet, DialChange, InputRecord, Instrument
 from analogrig.hardware.scpi_connection import ScpiConnection
 from analogrig.links.wire import Clock
 from analogrig_emulator import Excitation
@@ -28,14 +28,14 @@ MIDDLE_N = BUFFER_N // 2
 
 _POLL_S = 0.01
 _ZEROS_N = BUFFER_N // 10
-"""So many zeros in a row on all inputs are no measurement."""
+"""Zeros in a row on all inputs that show an unfilled buffer."""
 
 _EARLY_N = 1e-4
-"""Edges come this part of a sample before the sample that shows them, so that no rounding makes them come after it."""
+"""Time from an edge to its first sample, in samples, so that rounding never puts the edge after the sample."""
 
 
 class RedPitaya(Instrument):
-    """Records of 16,384 samples, between which the instrument is blind for as long as they take to be read."""
+    """Red Pitaya with records of 16,384 samples; it samples nothing while a record is read out."""
 
     datasheet = Datasheet(
         rate_hz=CLOCK_HZ / DECIMATION,
@@ -49,18 +49,15 @@ class RedPitaya(Instrument):
     def __init__(self, connection: ScpiConnection, timeout_s: float, clock: Clock = time.monotonic) -> None:
         """Take over ``connection`` and bring the instrument to a known state, the generator off.
 
-        :raises RigError: it does not answer as one.
+        :raises RigError: the answers are not those of a Red Pitaya.
         """
         super().__init__(f"instrument {connection.name}")
         self._scpi = connection
         self._timeout_s = timeout_s
         self._clock = clock
-        self._ranges: tuple[tuple[int, str], ...] = ()
-        self._excitation = Excitation()
         self.make_safe()
         self._scpi.send("*CLS")
-        self._box = _PotBox.found(self._scpi)
-        self.pots = self._box
+        self._box = self.pots = _PotBox.find(self._scpi)
 
     @classmethod
     def is_address(cls, address: str) -> bool:
@@ -78,7 +75,7 @@ class RedPitaya(Instrument):
 
     @classmethod
     def open(cls, address: str, timeout_s: float) -> RedPitaya:
-        """:raises RigError: nobody answers there."""
+        """:raises RigError: the connection failed."""
         connection = ScpiConnection(*_host_and_port(address), timeout_s)
         try:
             return cls(connection, timeout_s)
@@ -90,26 +87,19 @@ class RedPitaya(Instrument):
     def check(cls, excitation: Excitation) -> None:
         super().check(excitation)
         if excitation.shape == "prbs":
-            raise ConfigurationError("the generator of a Red Pitaya has no prbs: say square or pulse")
+            raise ConfigurationError("the generator of a Red Pitaya has no prbs: use square or pulse")
         period_n = cls.datasheet.rate_hz / excitation.frequency_hz
         high_n = period_n * (0.5 if excitation.shape == "square" else excitation.duty)
         if excitation.clock == "card" and not (_is_whole(high_n) and _is_whole(period_n)):
             raise ConfigurationError(
-                f'{excitation.frequency_hz:g} Hz on the clock "card" need edges that are whole samples apart, not'
-                f" {high_n:g} and {period_n - high_n:g}:"
-                ' the generator\'s edges come when they come; say clock = "free"'
+                f'{excitation.frequency_hz:g} Hz on the clock "card" needs edges that are whole samples apart, not'
+                f' {high_n:g} and {period_n - high_n:g}: use another frequency, or clock = "free"'
             )
 
-    def set_inputs(self, ranges: Sequence[tuple[int, str]]) -> None:
-        self._ranges = tuple(ranges)
-
-    def set_excitation(self, excitation: Excitation) -> None:
-        self._excitation = excitation
-
     def rest(self, settle_s: float) -> None:
-        """The samples that go by are those of a record: so it is the computer's time that goes by.
+        """Wait for a record, so that machine time passes.
 
-        They are no measurement, but what the buffer then holds must not come again.
+        Its codes are no measurement, but are remembered: a later record that repeats them is stale.
         """
         self.make_safe()
         self._scpi.send("ACQ:RST", f"ACQ:DEC:Factor {DECIMATION}")
@@ -121,12 +111,12 @@ class RedPitaya(Instrument):
 
     def make_safe(self) -> None:
         self._scpi.send("OUTPUT1:STATE OFF", "GEN:RST")
-        self._scpi.ask("*IDN?")  # it has heard it
+        self._scpi.ask("*IDN?")  # the answer shows that the commands have been executed
 
     def close(self) -> None:
         self._scpi.close()
 
-    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> Taken:  # noqa: ARG002 - always as many
+    def _take(self, samples: int, while_recording: Callable[[], None] | None) -> InputRecord:  # noqa: ARG002
         scheduled_n = self._prepare()
         self._scpi.send("ACQ:START", "ACQ:TRig AWG_PE")
         self._check_waiting()
@@ -135,13 +125,13 @@ class RedPitaya(Instrument):
             while_recording()
         self._await_record(BUFFER_N / self.datasheet.rate_hz)
         self._scpi.check("the record")
-        self._check_alone(scheduled_n)
+        self._check_unchanged(scheduled_n)
         codes = self._codes()
         self._check_filled(codes)
-        return Taken(self._data("VOLTS", ">f4").astype(np.float64), codes, self.datasheet.bits)
+        return InputRecord(self._data("VOLTS", ">f4").astype(np.float64), codes, self.datasheet.bits)
 
     def _prepare(self) -> int:
-        """Returns how many turns of pots are scheduled."""
+        """Send the settings of a record. Return the number of scheduled pot changes."""
         excitation = self._excitation
         middle_v = 0.5 * (excitation.low_v + excitation.high_v)
         self._scpi.send(
@@ -158,7 +148,7 @@ class RedPitaya(Instrument):
             *(f"ACQ:SOUR{number}:GAIN {word}" for number, word in self._ranges),
             f"ACQ:TRig:DLY {MIDDLE_N}",
         )
-        scheduled_n = 0 if self._box is None else self._box.hand_over()
+        scheduled_n = 0 if self._box is None else self._box.send_schedule()
         self._scpi.check("the set-up of the record")
         return scheduled_n
 
@@ -167,7 +157,7 @@ class RedPitaya(Instrument):
         return self._excitation.frequency_hz * (1.0 + 1e-6 * self._excitation.drift_ppm)
 
     def _phase(self) -> float:
-        """Into a period at the first sample; on the card's clock the edges come with samples."""
+        """Phase at the first sample, in periods; on the card's clock the edges coincide with samples."""
         excitation = self._excitation
         if excitation.clock == "free":
             return excitation.phase
@@ -175,14 +165,17 @@ class RedPitaya(Instrument):
         return (math.floor(excitation.phase * period_n) + _EARLY_N) / period_n
 
     def _check_waiting(self) -> None:
-        """:raises RecordStale: it has a record before the generator, which is to trigger it, is on: an old one."""
+        """:raises RecordStale: a record is ready before the generator, which triggers it, is on."""
         if (answer := self._scpi.ask("ACQ:TRig:STAT?")) != "WAIT":
             raise RecordStale(
-                f"{self.name}: the record is an old one: ACQ:TRig:STAT? says {answer[:20]!r} before the generator is on"
+                f"{self.name}: stale record: ACQ:TRig:STAT? answered {answer[:20]!r} before the generator was on"
             )
 
     def _await_record(self, lasting_s: float) -> None:
-        """:raises RigTimeout: it is not full in its own time and the time-out."""
+        """Await a full record.
+
+        :raises RigTimeout: it is not full after its duration and the time-out.
+        """
         deadline_s = self._clock() + lasting_s + self._timeout_s
         for query, wanted, what in (
             ("ACQ:TRig:STAT?", "TD", "was not triggered"),
@@ -191,18 +184,18 @@ class RedPitaya(Instrument):
             while (answer := self._scpi.ask(query)) != wanted:
                 if self._clock() > deadline_s:
                     self._scpi.check("the record")
-                    raise RigTimeout(f"{self.name}: the record {what} in time: {query} says {answer[:20]!r}")
+                    raise RigTimeout(f"{self.name}: the record {what} in time: {query} answered {answer[:20]!r}")
                 time.sleep(_POLL_S)
 
-    def _check_alone(self, scheduled_n: int) -> None:
-        """:raises RigRefused: what was set for the record is not set any more: somebody else has the instrument too."""
-        stand = {"OUTPUT1:STATE?": ("ON", "1"), "ACQ:DEC:Factor?": (str(DECIMATION),)}
+    def _check_unchanged(self, scheduled_n: int) -> None:
+        """:raises RigRefused: another client has changed the settings of the record."""
+        settings = {"OUTPUT1:STATE?": ("ON", "1"), "ACQ:DEC:Factor?": (str(DECIMATION),)}
         if self._box is not None:
-            stand["POT:SCHedule:COUNt?"] = (str(scheduled_n),)
-        changed = f"{self.name}: somebody else has changed it during the record"
-        for query, wanted in stand.items():
+            settings["POT:SCHedule:COUNt?"] = (str(scheduled_n),)
+        changed = f"{self.name}: another client has changed it during the record"
+        for query, wanted in settings.items():
             if (answer := self._scpi.ask(query)) not in wanted:
-                raise RigRefused(f"{changed}: {query} says {answer[:20]!r}, not {wanted[0]}")
+                raise RigRefused(f"{changed}: {query} answered {answer[:20]!r}, not {wanted[0]}")
         frequency_hz = self._scpi.ask("SOUR1:FREQ:FIX?")
         if not _is_close(frequency_hz, self._frequency_hz):
             raise RigRefused(f"{changed}: its generator gives {frequency_hz[:20]} Hz, not {self._frequency_hz:g} Hz")
@@ -211,27 +204,25 @@ class RedPitaya(Instrument):
         return self._data("RAW", ">i2").astype(np.int32)
 
     def _data(self, units: str, dtype: str) -> NDArray[np.generic]:
-        """(16384, inputs): the buffer in one of its units."""
+        """Contents of the buffer in one of its units, (16384, inputs)."""
         self._scpi.send(f"ACQ:DATA:Units {units}", "ACQ:DATA:FORMAT BIN")
-        return np.stack([self._of_input(number, dtype) for number, _ in self._ranges], axis=1)
+        return np.stack([self._read_input(number, dtype) for number, _ in self._ranges], axis=1)
 
-    def _of_input(self, number: int, dtype: str) -> NDArray[np.generic]:
+    def _read_input(self, number: int, dtype: str) -> NDArray[np.generic]:
         block = self._scpi.ask_block(f"ACQ:SOUR{number}:DATA?")
         size = np.dtype(dtype).itemsize
         if len(block) != BUFFER_N * size:
-            raise RecordIncomplete(f"{self.name}: IN{number} gave {len(block) / size:g} of {BUFFER_N} samples")
+            raise RecordIncomplete(f"{self.name}: IN{number} returned {len(block) / size:g} of {BUFFER_N} samples")
         return np.frombuffer(block, dtype)
 
     def _check_filled(self, codes: NDArray[np.int32]) -> None:
-        """:raises RecordIncomplete: a stretch of it was never written."""
+        """:raises RecordIncomplete: part of the buffer was never written."""
         measured = np.flatnonzero((codes != 0).any(axis=1))
         marks = np.concatenate(([-1], measured, [BUFFER_N]))
         longest = int(np.argmax(np.diff(marks)))
         start, end = int(marks[longest]) + 1, int(marks[longest + 1])
         if end - start >= _ZEROS_N:
-            raise RecordIncomplete(
-                f"{self.name}: its buffer is not filled: nothing but zeros from sample {start} to {end - 1}"
-            )
+            raise RecordIncomplete(f"{self.name}: incomplete record: only zeros from sample {start} to {end - 1}")
 
 
 def _host_and_port(address: str) -> tuple[str, int]:
@@ -240,16 +231,16 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 
 class _PotBox:
-    """A PotBox on the instrument's own server."""
+    """Pots on the instrument's own server."""
 
     def __init__(self, scpi: ScpiConnection, names: tuple[str, ...]) -> None:
         self.names = names
         self._scpi = scpi
-        self._turns: tuple[Turn, ...] = ()
+        self._changes: tuple[DialChange, ...] = ()
 
     @classmethod
-    def found(cls, scpi: ScpiConnection) -> _PotBox | None:
-        """An instrument without one says nothing to the first question, or an error."""
+    def find(cls, scpi: ScpiConnection) -> _PotBox | None:
+        """The box of an instrument, or None: without one, the first query has no answer, or an error."""
         scpi.send("POT:CATalog?")
         answer = scpi.ask("*OPC?")
         if answer == "1":
@@ -260,15 +251,15 @@ class _PotBox:
 
     def turn(self, pot: str, dial: float) -> None:
         self._scpi.send(f"POT{self._number(pot)}:DIAL {dial:.12g}")
-        self._scpi.check(f"turning {pot} to {dial:.4g}")
+        self._scpi.check(f"set {pot} to {dial:.4g}")
 
-    def schedule(self, turns: Sequence[Turn]) -> None:
-        self._turns = tuple(turns)
+    def schedule(self, changes: Sequence[DialChange]) -> None:
+        self._changes = tuple(changes)
 
-    def hand_over(self) -> int:
-        """What is scheduled to the instrument, of which it has nothing else; how many turns that is."""
-        turns, self._turns = self._turns, ()
-        scheduled = [f"POT:SCH {self._number(pot)},{dial:.12g},{delay_s:.12g}" for delay_s, pot, dial in turns]
+    def send_schedule(self) -> int:
+        """Replace the schedule of the instrument. Return the number of changes."""
+        changes, self._changes = self._changes, ()
+        scheduled = [f"POT:SCH {self._number(pot)},{dial:.12g},{delay_s:.12g}" for delay_s, pot, dial in changes]
         self._scpi.send("POT:SCH:CLE", *scheduled)
         return len(scheduled)
 

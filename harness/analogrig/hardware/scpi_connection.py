@@ -1,4 +1,4 @@
-"""Speaking SCPI to an instrument over TCP: lines and blocks, each with a deadline."""
+"""SCPI client over TCP."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _MOST_ANSWER_BYTES = 1 << 20
 
 
 class ScpiConnection:
-    """Lines and blocks over TCP, each with a deadline."""
+    """TCP connection that exchanges lines and blocks, each answer within a time-out."""
 
     def __init__(self, host: str, port: int, timeout_s: float, clock: Clock = time.monotonic) -> None:
-        """:raises RigError: nobody answers there."""
+        """:raises RigError: the connection failed."""
         self.name = f"{host}:{port}"
         self._clock = clock
         self._timeout_s = timeout_s
@@ -31,39 +31,41 @@ class ScpiConnection:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, *commands: str) -> None:
-        """Commands without an answer, a line each."""
+        """Send commands that have no answer, one a line."""
         try:
             self._socket.settimeout(self._timeout_s)
             self._socket.sendall("".join(f"{command}\r\n" for command in commands).encode("ascii"))
         except TimeoutError as error:
-            raise RigTimeout(f"instrument {self.name}: took no command for {self._timeout_s:g} s") from error
+            raise RigTimeout(f"instrument {self.name}: accepted no command for {self._timeout_s:g} s") from error
         except OSError as error:
-            raise RigClosed(f"instrument {self.name}: gone at {commands[0]}: {error.strerror or error}") from error
+            raise RigClosed(
+                f"instrument {self.name}: connection lost at {commands[0]}: {error.strerror or error}"
+            ) from error
 
     def ask(self, query: str) -> str:
-        """The one line of its answer, without its end."""
+        """Send a query. Return the line of its answer, without its end."""
         self.send(query)
         return self.next_line(query)
 
     def next_line(self, query: str) -> str:
-        """A further line of the answer to ``query``."""
+        """Next line of the answer to ``query``, without its end."""
         end = self._until(lambda: self._input.find(b"\n"), query)
         line = bytes(self._input[:end]).rstrip(b"\r")
         del self._input[: end + 1]
         return "".join(character if character.isprintable() else "?" for character in line.decode("ascii", "replace"))
 
     def ask_block(self, query: str) -> bytes:
-        """The content of the definite-length block (IEEE 488.2, 8.7.9) that it answers."""
+        """Send a query. Return the content of the definite-length block (IEEE 488.2, 8.7.9) that answers it."""
         self.send(query)
         self._need(2, query)
         head = bytes(self._input[:2])
         if head[:1] != b"#" or not head[1:].isdigit() or head == b"#0":
-            raise RigError(f"instrument {self.name}: {query}: a block was due, {head!r} came")
+            raise RigError(f"instrument {self.name}: {query}: expected a block, received {head!r}")
         digits = int(head[1:])
         self._need(2 + digits, query)
         length = bytes(self._input[2 : 2 + digits])
         if not length.isdigit() or int(length) > _MOST_ANSWER_BYTES:
-            raise RigError(f"instrument {self.name}: {query}: a block of {length!r} bytes cannot be")
+            raise RigError(f"instrument {self.name}: {query}: invalid block length {length!r}")
         start, end = 2 + digits, 2 + digits + int(length)
         self._need(end, query)
         content = bytes(self._input[start:end])
@@ -72,11 +74,11 @@ class ScpiConnection:
         return content
 
     def check(self, what: str) -> None:
-        """:raises RigRefused: the instrument has put an error into its queue."""
+        """:raises RigRefused: the error queue of the instrument is not empty."""
         answer = self.ask("SYST:ERR?")
         if not answer.startswith(("0,", "+0,", "0 ")) and answer != "0":
             self.send("*CLS")
-            raise RigRefused(f"instrument {self.name}: {what}: it says {answer[:120]}")
+            raise RigRefused(f"instrument {self.name}: {what}: error {answer[:120]}")
 
     def close(self) -> None:
         with contextlib.suppress(OSError):
@@ -86,11 +88,11 @@ class ScpiConnection:
         self._until(lambda: count if len(self._input) >= count else -1, query)
 
     def _until(self, found: Callable[[], int], query: str) -> int:
-        """Take what comes until ``found`` says where, no longer than the time-out."""
+        """Receive until ``found`` returns an index, at most for the time-out. Return that index."""
         deadline_s = self._clock() + self._timeout_s
         while (at := found()) < 0:
             if len(self._input) > 2 * _MOST_ANSWER_BYTES:
-                raise RigError(f"instrument {self.name}: {query}: an answer without end")
+                raise RigError(f"instrument {self.name}: {query}: the answer has no end")
             left_s = deadline_s - self._clock()
             if left_s <= 0.0:
                 raise RigTimeout(f"instrument {self.name}: {query}: no whole answer within {self._timeout_s:g} s")
@@ -100,8 +102,10 @@ class ScpiConnection:
             except TimeoutError as error:
                 raise RigTimeout(f"instrument {self.name}: {query}: no answer within {self._timeout_s:g} s") from error
             except OSError as error:
-                raise RigClosed(f"instrument {self.name}: gone at {query}: {error.strerror or error}") from error
+                raise RigClosed(
+                    f"instrument {self.name}: connection lost at {query}: {error.strerror or error}"
+                ) from error
             if not received:
-                raise RigClosed(f"instrument {self.name}: hung up at {query}")
+                raise RigClosed(f"instrument {self.name}: connection closed at {query}")
             self._input += received
         return at

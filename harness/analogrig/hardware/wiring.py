@@ -1,4 +1,4 @@
-"""How a real computer is wired to its instrument: the tables of a rigs file, and what contradicts itself in them."""
+"""Descriptions of real rigs: the tables of a rigs file, and the check for contradictions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal, Self
 
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import Datasheet, located
-from analogrig.hardware.pots import Harmless, PotsDescription
+from analogrig.hardware.instrument import Datasheet, find_driver
+from analogrig.hardware.pots import PotsDescription
 from analogrig.run import MEASURED
 from analogrig.trust import Thing
 from analogrig_emulator import SuspensionComputer
@@ -20,7 +20,7 @@ _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
 @dataclass(frozen=True)
 class Stage:
-    """What is between instrument and computer: out = gain in + offset_v, in the direction in which the signal goes."""
+    """Amplifier between instrument and computer: out = gain in + offset_v, in the direction of the signal."""
 
     gain: float = 1.0
     offset_v: float = 0.0
@@ -31,22 +31,26 @@ class Stage:
         if not abs(self.offset_v) <= _MOST_OFFSET_V:
             raise ValueError(f"offset_v must be within +-{_MOST_OFFSET_V:g} V, not {self.offset_v:g}")
 
+    def input_v(self, output_v: float) -> float:
+        """Input voltage that gives an output voltage."""
+        return (output_v - self.offset_v) / self.gain
+
 
 @dataclass(frozen=True)
 class Input:
-    """A channel's way from the computer to an input of the instrument."""
+    """Path of a channel from the computer to an input of the instrument."""
 
     input: int
-    """Its number, as printed on the instrument."""
+    """Number of the input, as printed on the instrument."""
     range: str
-    """In the instrument's own words."""
+    """The instrument's own name of the range."""
     gain: float = 1.0
     offset_v: float = 0.0
     least_v: float = -1.0
-    """At the computer; what is below counts as clipped. Codes count from here: the larger the code of 0 V, the larger
+    """Lowest voltage at the computer that is not clipped. Codes count from here: the larger the code of 0 V, the larger
     the offset that the estimator has to learn."""
     noise_lsb: float = 1.0
-    """rms before quantisation, as far as it is known; the self-test measures it."""
+    """rms noise before quantisation; the self-test measures it."""
 
     def __post_init__(self) -> None:
         Stage(self.gain, self.offset_v)
@@ -55,15 +59,20 @@ class Input:
         if not 0.0 <= self.noise_lsb <= 1e5:
             raise ValueError(f"noise_lsb must be 0 to 1e5, not {self.noise_lsb:g}")
 
+    def ends_v(self, instrument: Datasheet) -> list[float]:
+        """Lowest and highest voltage at the computer within the range of the input."""
+        stage = Stage(self.gain, self.offset_v)
+        return sorted(stage.input_v(end_v) for end_v in instrument.ranges_v[self.range])
+
 
 @dataclass(frozen=True)
 class Limits:
-    """What must never be exceeded, whatever a scenario asks."""
+    """Limits that no scenario may exceed."""
 
     force_v: tuple[float, float] = (-1.0, 11.0)
-    """At the computer's force input."""
+    """Lowest and highest voltage at the computer's force input."""
     dials: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Of each pot by its name: least and most, 0 to 1; others may stand anywhere."""
+    """Least and greatest position by pot, within 0 to 1; the default is the whole range."""
 
     def __post_init__(self) -> None:
         low_v, high_v = self.force_v
@@ -76,26 +85,19 @@ class Limits:
 
 @dataclass(frozen=True)
 class Scaling:
-    """What the computer's volts mean, where it is not as the program has it."""
+    """Scales of the computer that override those of the program."""
 
     time: float | None = None
-    """How much faster the machine runs than what it models."""
+    """Speed of the machine relative to the system that it models."""
     force_n: float | None = None
-    """10 V of force."""
+    """Force at 10 V."""
     displacement_m: float | None = None
-    """10 V of displacement."""
+    """Displacement at 10 V."""
 
     def __post_init__(self) -> None:
         for name, value in dataclasses.asdict(self).items():
             if value is not None and not 1e-9 < value < 1e9:
                 raise ValueError(f"{name} must be more than 0, not {value:g}")
-
-
-@dataclass(frozen=True)
-class InstrumentPots(Harmless):
-    """The instrument turns the pots itself, at exact instants."""
-
-    kind: Literal["instrument"]
 
 
 @dataclass(frozen=True)
@@ -106,18 +108,18 @@ class RealDescription:
     instrument: str
     """URL: ``redpitaya://HOST``."""
     inputs: Mapping[str, Input]
-    """Of ``force`` and ``displacement``."""
-    pots: InstrumentPots | PotsDescription
+    """Inputs of the channels ``force`` and ``displacement``."""
+    pots: PotsDescription
     generator: Stage = field(default_factory=Stage)
     plant: Literal["front", "shock"] = "front"
-    """The program that is patched."""
+    """Program that is patched on the computer."""
     limits: Limits = field(default_factory=Limits)
     scaling: Scaling = field(default_factory=Scaling)
     settle_s: float = 0.1
-    """Machine time with the generator off before each record: the computer is then at rest."""
+    """Machine time with the generator off before each record, in which the computer comes to rest."""
     timeout_s: float = 5.0
     self_test: bool = True
-    """Before anything is judged."""
+    """True: test the rig before the first run."""
     description: str = ""
     name: str = ""
 
@@ -132,12 +134,17 @@ class RealDescription:
                 raise ValueError(f"{name} must be {least:g} to {most:g}, not {getattr(self, name):g}")
 
     @property
+    def pot_names(self) -> tuple[str, ...]:
+        """Names of the pots of the program."""
+        return tuple(SuspensionComputer(self.plant).dials)
+
+    @property
     def things(self) -> tuple[Thing, ...]:
         """Things that playing on it would run or connect to.
 
-        :raises ConfigurationError: the instrument has no such address.
+        :raises ConfigurationError: the URL of the instrument is wrong.
         """
-        kind, address = located(self.instrument)
+        kind, address = find_driver(self.instrument)
         return (Thing("address", kind.place(address), "the rig connects to"), *self.pots.things)
 
     def placed(self, folder: Path) -> Self:
@@ -146,9 +153,9 @@ class RealDescription:
 
 
 def check_wiring(description: RealDescription, instrument: Datasheet) -> None:
-    """That the description fits what the instrument has.
+    """Check a description against the datasheet of its instrument.
 
-    :raises ConfigurationError: it does not; names the key.
+    :raises ConfigurationError: they contradict each other; the message names the key.
     """
     for name, wired in description.inputs.items():
         if wired.input not in instrument.inputs:
@@ -157,13 +164,13 @@ def check_wiring(description: RealDescription, instrument: Datasheet) -> None:
         if wired.range not in instrument.ranges_v:
             has = " or ".join(map(repr, instrument.ranges_v))
             raise ConfigurationError(f"inputs.{name}: range must be {has}, not {wired.range!r}")
-        low_v, high_v = sorted((end - wired.offset_v) / wired.gain for end in instrument.ranges_v[wired.range])
+        low_v, high_v = wired.ends_v(instrument)
         if not low_v < 0.0 < high_v or wired.least_v > 0.0:
             raise ConfigurationError(
-                f"inputs.{name}: 0 V at the computer must be within what is seen of it, {low_v:g} V to {high_v:g} V"
+                f"inputs.{name}: 0 V at the computer must be within the measured range: {low_v:g} V to {high_v:g} V"
                 f" by gain and offset_v, from least_v, {wired.least_v:g} V, on"
             )
-    pots = tuple(SuspensionComputer(description.plant).dials)
+    pots = description.pot_names
     named = {"limits.dials": description.limits.dials, "pots.names": getattr(description.pots, "names", {})}
     for key, table in named.items():
         if unknown := sorted(set(table) - set(pots)):

@@ -1,1 +1,1 @@
-"""The emulator as an instrument on a TCP port."""
+"""Simulator of a bench instrument: the emulator on a TCP port."""

@@ -1,35 +1,35 @@
-"""The acquisition of the instrument: arming, triggers, records.
+"""Acquisition of the simulated instrument: arming, triggers, records.
 
-Time passes only here, and a command lets no more of it pass than four records take: who waits for a trigger that does
-not come asks again and again, and is told each time that there is none. With a clock, the samples after a trigger come
-no sooner than it says, so that what others do meanwhile falls into the record.
+Machine time passes only here. A command lets at most the time of four records pass: a client that awaits a trigger
+which never comes polls forever, and is told each time that there is none. With a clock, samples after a trigger come no
+sooner than the clock allows, so that other commands take effect within the record.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from analogrig.hardware.simulator.inputs import RANGES_V, Codes, InputFaults, Inputs, Volts, looks_per_sample
+from analogrig.config import check_range
+from analogrig.hardware.simulator.computer import WiredComputer
+from analogrig.hardware.simulator.inputs import Codes, InputFaults, Inputs, Volts, choose_oversampling
 from analogrig.hardware.simulator.scpi import ScpiError
-from analogrig.hardware.simulator.table import Table
 from analogrig.links.wire import Clock
 
 CLOCK_HZ = 125_000_000
 BUFFER_N = 16_384
 MIDDLE_N = BUFFER_N // 2
 LEAST_DECIMATION, MOST_DECIMATION = 125, 65_536
-"""A real one goes down to 1; the computer's slowest amplifier needs no more than a sample a microsecond."""
+"""A real instrument goes down to 1, but the computer's slowest amplifier needs no more than a sample a microsecond."""
 LEAST_DELAY_N, MOST_DELAY_N = -MIDDLE_N, 100 * BUFFER_N
 PAUSE_S = 0.02
-"""That goes by, unseen, before each ACQ:START: time in which a computer that is no longer excited comes to rest."""
+"""Machine time before each ACQ:START, in which a computer without excitation comes to rest."""
 TRIGGERS = ("DISABLED", "NOW", "CH1_PE", "CH1_NE", "CH2_PE", "CH2_NE", "AWG_PE")
 _LOST = slice(3 * BUFFER_N // 8, 5 * BUFFER_N // 8)
-"""Of a record in the middle of which the samples are lost."""
+"""Samples that the drop-out "zeros" loses."""
 
 MOST_PPM = 10_000.0
 MOST_STALE_N = 8
@@ -37,47 +37,45 @@ MOST_STALE_N = 8
 
 @dataclass(frozen=True)
 class AcquisitionFaults:
-    """What acquisitions are known for; none by default."""
+    """Known faults of acquisitions; none by default."""
 
     clock_ppm: float = 0.0
-    """By how much its clock is fast of the generator's and of the computer's time."""
+    """Frequency error relative to the clocks of generator and computer."""
     half_filled: bool = False
     """The second half of every record holds zeros."""
     never_filled: bool = False
-    """ACQ:TRig:FILL? never says that a record is complete."""
+    """ACQ:TRig:FILL? never reports a complete record."""
     drop_out: Literal["none", "zeros", "hang up", "silence"] = "none"
-    """What becomes of one record: zeros in its middle; or half of the first answer with it comes, and then the
-    connection is closed, or nothing follows."""
+    """Fault of one record: zeros in its middle; or its first answer stops halfway, and then the connection is closed,
+    or nothing follows."""
     drop_out_record: int = 1
-    """Which: the first is 1."""
+    """Number of that record, from 1."""
     stale_n: int = 0
-    """Instead of that record it hands out the one so many before, or the first."""
+    """Age in records of the record that is returned in place of that one; the first record at the earliest."""
     triggered_early: bool = False
-    """ACQ:TRig:STAT? says that a trigger has come as soon as it is set."""
+    """ACQ:TRig:STAT? reports a trigger as soon as it is armed."""
 
     def __post_init__(self) -> None:
-        if not abs(self.clock_ppm) <= MOST_PPM:
-            raise ValueError(f"clock_ppm must be within +-{MOST_PPM:g}, not {self.clock_ppm:g}")
+        check_range(self, "clock_ppm", -MOST_PPM, MOST_PPM)
+        check_range(self, "stale_n", 0, MOST_STALE_N)
         if self.drop_out_record < 1:
             raise ValueError(f"drop_out_record must be 1 or more, not {self.drop_out_record}")
-        if not 0 <= self.stale_n <= MOST_STALE_N:
-            raise ValueError(f"stale_n must be 0 to {MOST_STALE_N}, not {self.stale_n}")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """As ACQ:RST leaves them."""
+    """Settings of the acquisition, with the values after ACQ:RST."""
 
     decimation: int = 6250
     averages: bool = True
     delay_n: int = 0
     level_v: float = 0.0
-    switches: tuple[str, str] = ("LV", "LV")
-    """The range of each input."""
+    switches: tuple[str, ...] = ("LV", "LV")
+    """Range of each input."""
     units: str = "VOLTS"
     form: str = "ASCII"
     order: str = "BEND"
-    """Of the bytes of a number in a block: the highest first, or LEND."""
+    """Byte order of a block: most significant byte first, or LEND."""
 
     @property
     def before_n(self) -> int:
@@ -86,48 +84,48 @@ class Settings:
 
     @property
     def after_n(self) -> int:
-        """Samples from the trigger to the end of the record: more than it holds, if the delay is long."""
+        """Samples from the trigger to the end of the record; with a long delay, more than the buffer holds."""
         return MIDDLE_N + self.delay_n
 
 
 @dataclass(frozen=True, eq=False)
 class Buffer:
-    """What a trigger has left in the buffer."""
+    """Contents of the buffer after a trigger."""
 
     codes: Codes
     """(16384, 2)"""
     lsb_v: tuple[float, float]
-    """Volts per code, of each input as it was switched."""
+    """Volts per code of each input."""
 
 
 @dataclass
-class _Waiting:
-    """For a trigger."""
+class _TriggerWait:
+    """State before the trigger."""
 
     trigger: str = "DISABLED"
-    seen: Volts = field(default_factory=lambda: np.empty((0, 2)))
-    """The last samples; before_n + 1 at least, once a trigger is set."""
+    taken: Volts = field(default_factory=lambda: np.empty((0, 2)))
+    """Last samples; at least before_n + 1, once a trigger is armed."""
 
 
 @dataclass
-class _Filling:
-    """The buffer, after the trigger."""
+class _BufferFill:
+    """State after the trigger, until the buffer is full."""
 
-    seen: Volts
-    """The last samples, not more than the buffer holds."""
+    taken: Volts
+    """Last samples, at most those that the buffer holds."""
     left_n: int
-    """Those that are still to come."""
+    """Samples still to come."""
     begun_s: float
-    """On the clock: when ``asked_n`` were still to come."""
-    asked_n: int
+    """Time of the clock at which ``due_n`` samples were still to come."""
+    due_n: int
 
 
 class Acquisition:
-    """Two channels of a table, a record at a time."""
+    """Records of two channels of a computer."""
 
     def __init__(
         self,
-        table: Table,
+        computer: WiredComputer,
         inputs: tuple[InputFaults, np.random.Generator],
         faults: AcquisitionFaults,
         clock: Clock | None = None,
@@ -139,182 +137,164 @@ class Acquisition:
         self._clock = clock
         self.settings = Settings()
         self.record: Buffer | None = None
-        self._table = table
+        self._computer = computer
         self._input_faults = inputs[0]
         self._inputs = Inputs(*inputs)
         self._faults = faults
-        self._doing: _Waiting | _Filling | None = None
+        self._state: _TriggerWait | _BufferFill | None = None
         self._records = 0
         self._buffers: deque[Buffer] = deque(maxlen=faults.stale_n + 1)
-        """The last ones, as they were taken."""
-        self._dropped_out = False
-        self._tune(self.settings.decimation)
+        """Last records, as taken."""
+        self._has_dropped_out = False
+        self._set_rate(self.settings.decimation)
 
     # ---- settings
 
     def change(self, settings: Settings) -> None:
-        """What begins with another rate or delay begins anew: waiting for a trigger, and the record after it.
+        """Change settings. Another rate or delay restarts the wait for a trigger.
 
         :raises EmulatorError: the generator is too fast for the rate; then nothing changes.
         """
-        before, doing = self.settings, self._doing
+        before, state = self.settings, self._state
         if settings.decimation != before.decimation:
-            self._tune(settings.decimation)
+            self._set_rate(settings.decimation)
         self.settings = settings
         if (settings.decimation, settings.delay_n) == (before.decimation, before.delay_n):
             return
-        if isinstance(doing, _Waiting):
-            self._doing = self._armed(doing.trigger)
-        elif doing is not None:
-            self._doing = _Waiting()
+        if isinstance(state, _TriggerWait):
+            self._state = self._arm(state.trigger)
+        elif state is not None:
+            self._state = _TriggerWait()
 
     def reset(self) -> None:
-        """Stopped, with the settings of the beginning and without a record."""
-        self._doing = self.record = None
+        """Stop, restore the initial settings, and discard the record."""
+        self._state = self.record = None
         self.change(Settings())
 
     @property
     def triggered(self) -> bool:
-        """What ACQ:TRig:STAT? says."""
-        early = self._faults.triggered_early and isinstance(self._doing, _Waiting) and self._doing.trigger != "DISABLED"
-        return early or self.record is not None or isinstance(self._doing, _Filling)
+        """True if ACQ:TRig:STAT? reports a trigger."""
+        state = self._state
+        if isinstance(state, _TriggerWait):
+            return self.record is not None or (self._faults.triggered_early and state.trigger != "DISABLED")
+        return self.record is not None or state is not None
 
     @property
     def filled(self) -> bool:
-        """What ACQ:TRig:FILL? says."""
+        """True if ACQ:TRig:FILL? reports a full buffer."""
         return self.record is not None and not self._faults.never_filled
 
-    def drops_out(self) -> bool:
-        """Whether the instrument drops out while it says what is in this record; once."""
-        drops = (
-            self._faults.drop_out in ("hang up", "silence")
-            and self._records == self._faults.drop_out_record
-            and not self._dropped_out
-        )
-        self._dropped_out |= drops
-        return drops
-
-    @property
-    def hangs_up(self) -> bool:
-        """When it drops out."""
-        return self._faults.drop_out == "hang up"
+    def drop_out(self) -> str:
+        """Drop-out that breaks the answer with this record: "hang up" or "silence", once; else an empty text."""
+        fault = self._faults.drop_out if self._records == self._faults.drop_out_record else "none"
+        if self._has_dropped_out or fault not in ("hang up", "silence"):
+            return ""
+        self._has_dropped_out = True
+        return fault
 
     # ---- records
 
     def start(self) -> None:
-        """Forget the record, and be ready for a trigger."""
-        self._table.look(round(PAUSE_S * self._table.rate_hz))
+        """Discard the record, and get ready for a trigger."""
+        self._computer.run(round(PAUSE_S * self._computer.rate_hz))
         self._inputs.forget()
-        self.record, self._doing = None, _Waiting()
+        self.record, self._state = None, _TriggerWait()
 
     def stop(self) -> None:
-        """Wait no more. A record that is there stays."""
-        self._doing = None
+        """Stop waiting. A complete record stays."""
+        self._state = None
 
     def arm(self, trigger: str) -> None:
-        """Set the trigger, one of TRIGGERS, and wait for it.
+        """Arm one of TRIGGERS, and wait for it.
 
-        :raises ScpiError: nothing has been started, or the trigger has come.
+        :raises ScpiError: the acquisition has not been started, or is triggered.
         """
-        if not isinstance(self._doing, _Waiting):
+        if not isinstance(self._state, _TriggerWait):
             raise ScpiError(-221, "ACQ:TRig before ACQ:START")
-        self._doing = self._armed(trigger)
+        self._state = self._arm(trigger)
         self.wait()
 
-    def generator_started(self) -> None:
-        """At this instant, which may be the trigger."""
+    def notice_generator_start(self) -> None:
+        """Take the start of the generator, which is now, for the trigger if AWG_PE is armed."""
         self._inputs.forget()
-        if isinstance(self._doing, _Waiting) and self._doing.trigger == "AWG_PE":
-            self._take(self._doing.seen, len(self._doing.seen))
+        if isinstance(self._state, _TriggerWait) and self._state.trigger == "AWG_PE":
+            self._trigger(self._state.taken, len(self._state.taken))
 
     def wait(self) -> None:
-        """Let the time of a record pass, or less, in which a trigger may come and the buffer be filled."""
-        doing = self._doing
-        if isinstance(doing, _Filling):
-            self._fill(doing)
-        elif doing is not None and doing.trigger == "NOW":
-            self._take(doing.seen, len(doing.seen))
-        elif doing is not None and doing.trigger == "AWG_PE":
-            self._wait_for_edge(doing)
-        elif doing is not None and doing.trigger.startswith("CH"):
-            self._wait_for_level(doing)
+        """Let the time of a record or less pass, in which a trigger may come and the buffer be filled."""
+        state = self._state
+        if isinstance(state, _BufferFill):
+            self._fill(state)
+        elif state is not None and state.trigger == "NOW":
+            self._trigger(state.taken, len(state.taken))
+        elif state is not None and state.trigger == "AWG_PE":
+            self._wait_for_period(state)
+        elif state is not None and state.trigger.startswith("CH"):
+            self._wait_for_level(state)
 
-    def _armed(self, trigger: str) -> _Waiting:
-        return _Waiting(trigger, self._samples(0 if trigger == "DISABLED" else self.settings.before_n + 1))
+    def _arm(self, trigger: str) -> _TriggerWait:
+        return _TriggerWait(trigger, self._sample(0 if trigger == "DISABLED" else self.settings.before_n + 1))
 
-    def _wait_for_edge(self, waiting: _Waiting) -> None:
-        left = self._table.until_edge_n()
+    def _wait_for_period(self, state: _TriggerWait) -> None:
+        left = self._computer.points_to_period()
         if left is None:
             return
-        left_n = self._inputs.until(left)
-        self._see(waiting, min(left_n, BUFFER_N))
+        left_n = self._inputs.samples_in(left)
+        self._extend(state, min(left_n, BUFFER_N))
         if left_n <= BUFFER_N:
-            self._take(waiting.seen, len(waiting.seen))
+            self._trigger(state.taken, len(state.taken))
 
-    def _wait_for_level(self, waiting: _Waiting) -> None:
-        self._see(waiting, BUFFER_N)
-        channel, sign = int(waiting.trigger[2]) - 1, 1.0 if waiting.trigger.endswith("PE") else -1.0
-        above = sign * waiting.seen[:, channel] >= sign * self.settings.level_v
+    def _wait_for_level(self, state: _TriggerWait) -> None:
+        self._extend(state, BUFFER_N)
+        channel, sign = int(state.trigger[2]) - 1, 1.0 if state.trigger.endswith("PE") else -1.0
+        above = sign * state.taken[:, channel] >= sign * self.settings.level_v
         crossed = np.flatnonzero(above[1:] & ~above[:-1]) + 1
         crossed = crossed[crossed >= self.settings.before_n]
         if crossed.size:
-            self._take(waiting.seen, int(crossed[0]))
+            self._trigger(state.taken, int(crossed[0]))
 
-    def _see(self, waiting: _Waiting, count: int) -> None:
-        """Wait on, without forgetting what a record may begin with."""
-        kept = waiting.seen[-(self.settings.before_n + 1) :]
-        waiting.seen = np.concatenate((kept, self._samples(count)))
+    def _extend(self, state: _TriggerWait, count: int) -> None:
+        """Take more samples, and keep those with which a record may begin."""
+        kept = state.taken[-(self.settings.before_n + 1) :]
+        state.taken = np.concatenate((kept, self._sample(count)))
 
-    def _take(self, seen: Volts, trigger_at: int) -> None:
-        """The record of a trigger at that sample of those that were seen."""
-        stop = trigger_at + self.settings.after_n
-        left_n = max(stop - len(seen), 0)
-        self._doing = filling = _Filling(seen[:stop], left_n, self._clock() if self._clock else 0.0, left_n)
-        self._fill(filling)
+    def _trigger(self, taken: Volts, at: int) -> None:
+        """Begin to fill the buffer around the trigger, which is at index ``at`` of the samples."""
+        stop = at + self.settings.after_n
+        left_n = max(stop - len(taken), 0)
+        self._state = state = _BufferFill(taken[:stop], left_n, self._clock() if self._clock else 0.0, left_n)
+        self._fill(state)
 
-    def _fill(self, filling: _Filling) -> None:
-        """By no more than a record's length: of a long delay the rest is left for the next time."""
-        count = min(filling.left_n, self._due_n(filling), BUFFER_N)
-        filling.seen = np.concatenate((filling.seen, self._samples(count)))[-BUFFER_N:]
-        filling.left_n -= count
-        if not filling.left_n:
-            self._keep(filling.seen)
+    def _fill(self, state: _BufferFill) -> None:
+        """Take the samples that are due, at most those of a record; a long delay needs several calls."""
+        due_n = state.left_n
+        if self._clock is not None:
+            passed_n = int((self._clock() - state.begun_s) * CLOCK_HZ / self.settings.decimation)
+            due_n = max(passed_n - (state.due_n - state.left_n), 0)
+        count = min(state.left_n, due_n, BUFFER_N)
+        state.taken = np.concatenate((state.taken, self._sample(count)))[-BUFFER_N:]
+        state.left_n -= count
+        if not state.left_n:
+            self._complete(state.taken)
 
-    def _due_n(self, filling: _Filling) -> int:
-        """How many of the samples that are still to come have come by the clock."""
-        if self._clock is None:
-            return filling.left_n
-        passed_n = int((self._clock() - filling.begun_s) * CLOCK_HZ / self.settings.decimation)
-        return max(passed_n - (filling.asked_n - filling.left_n), 0)
-
-    def _keep(self, volts: Volts) -> None:
-        """As the record."""
+    def _complete(self, volts: Volts) -> None:
+        """Store samples as the record, or what the faults make of it."""
         codes = self._inputs.codes(volts, self.settings.switches)
         self._records += 1
+        is_faulty = self._records == self._faults.drop_out_record
         if self._faults.half_filled:
             codes[MIDDLE_N:] = 0
-        if self._faults.drop_out == "zeros" and self._records == self._faults.drop_out_record:
+        if self._faults.drop_out == "zeros" and is_faulty:
             codes[_LOST] = 0
         self._buffers.append(Buffer(codes, self._inputs.lsb_v(self.settings.switches)))
-        is_stale = self._records == self._faults.drop_out_record
-        self.record, self._doing = self._buffers[0 if is_stale else -1], None
+        self.record, self._state = self._buffers[0 if is_faulty else -1], None
 
-    def _samples(self, count: int) -> Volts:
-        return self._inputs.samples(self._table.look, count, averages=self.settings.averages)
+    def _sample(self, count: int) -> Volts:
+        return self._inputs.sample(self._computer.run, count, averages=self.settings.averages)
 
-    def _tune(self, decimation: int) -> None:
+    def _set_rate(self, decimation: int) -> None:
         """:raises EmulatorError: the generator is too fast for the rate; then nothing changes."""
         true_rate_hz = CLOCK_HZ / decimation * (1.0 + 1e-6 * self._faults.clock_ppm)
-        looks_n = looks_per_sample(self._input_faults, true_rate_hz)
-        self._table.look_at(looks_n * true_rate_hz)
-        self._inputs.tune(looks_n, true_rate_hz)
-
-
-def with_switch(settings: Settings, channel: int, switch: str) -> Settings:
-    """Settings with the range of one input changed."""
-    first, second = settings.switches
-    return dataclasses.replace(settings, switches=(switch, second) if channel == 0 else (first, switch))
-
-
-LARGEST_V = max(RANGES_V.values())
-"""That a level can be set to, either way."""
+        oversampling = choose_oversampling(self._input_faults, true_rate_hz)
+        self._computer.set_rate(oversampling * true_rate_hz)
+        self._inputs.set_rate(oversampling, true_rate_hz)

@@ -1,4 +1,4 @@
-"""The two inputs of an instrument: from what its leads show to the codes of a record."""
+"""Inputs of the simulated instrument: from the voltages at its connectors to the codes of a record."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.config import check_range
 from analogrig_emulator import Card, Sampler
 
 BITS = 14
 RANGES_V = {"LV": 1.0, "HV": 20.0}
-"""By the position of an input's switch: it takes plus and minus this."""
-LEAST_LOOKS, MOST_LOOKS = 8, 40
-"""So often the leads are looked at while the instrument averages over one of its samples."""
-_AT_A_LOOK = 1e-3
-"""Looks: so close to one an instant is taken for its own."""
+"""Full scale, plus and minus, by the position of an input's switch."""
+LEAST_OVERSAMPLING, MOST_OVERSAMPLING = 8, 40
+"""Points in time within a sample, over which the instrument averages."""
+_ON_POINT = 1e-3
+"""Distance from a point, in points, below which an instant counts as that of the point."""
 
 MOST_SKEW_S = 1e-3
-
 MOST_INPUT_V = 100.0
 MOST_GAIN_ERROR = 0.5
 CHANNELS_N = 2
@@ -31,83 +31,70 @@ Codes = NDArray[np.int16]
 
 @dataclass(frozen=True)
 class InputFaults:
-    """What inputs are known for; none by default."""
+    """Known faults of inputs, each for IN1 and IN2; none by default."""
 
     noise_v: tuple[float, float] = (0.0, 0.0)
-    """rms, on IN1 and IN2, before quantisation."""
+    """rms before quantisation."""
     gain_error: tuple[float, float] = (0.0, 0.0)
-    """A fraction."""
+    """Relative gain error."""
     offset_v: tuple[float, float] = (0.0, 0.0)
     reach: tuple[float, float] = (0.0, 0.0)
-    """By which fraction a converter takes more than its switch says. The volts that it says are right, so that its ends
-    are not at those of the range."""
+    """Relative excess of the converter's range over that of the switch. The volts are right, so that the ends of the
+    converter are not those of the range."""
     skew_s: float = 0.0
-    """By so much IN2 is taken later than IN1; earlier, if it is negative."""
+    """Delay of the samples of IN2 after those of IN1."""
 
     def __post_init__(self) -> None:
-        for noise_v in self.noise_v:
-            if not 0.0 <= noise_v <= MOST_INPUT_V:
-                raise ValueError(f"noise_v must be 0 to {MOST_INPUT_V:g}, not {noise_v:g}")
-        for gain_error in self.gain_error:
-            if not abs(gain_error) <= MOST_GAIN_ERROR:
-                raise ValueError(f"gain_error must be within +-{MOST_GAIN_ERROR:g}, not {gain_error:g}")
-        for offset_v in self.offset_v:
-            if not abs(offset_v) <= MOST_INPUT_V:
-                raise ValueError(f"offset_v must be within +-{MOST_INPUT_V:g}, not {offset_v:g}")
-        for reach in self.reach:
-            if not abs(reach) <= MOST_GAIN_ERROR:
-                raise ValueError(f"reach must be within +-{MOST_GAIN_ERROR:g}, not {reach:g}")
-        if not abs(self.skew_s) <= MOST_SKEW_S:
-            raise ValueError(f"skew_s must be within +-{MOST_SKEW_S:g}, not {self.skew_s:g}")
+        check_range(self, "noise_v", 0.0, MOST_INPUT_V)
+        check_range(self, "gain_error", -MOST_GAIN_ERROR, MOST_GAIN_ERROR)
+        check_range(self, "offset_v", -MOST_INPUT_V, MOST_INPUT_V)
+        check_range(self, "reach", -MOST_GAIN_ERROR, MOST_GAIN_ERROR)
+        check_range(self, "skew_s", -MOST_SKEW_S, MOST_SKEW_S)
 
 
 class Inputs:
     """Samplers and converters of both channels."""
 
     def __init__(self, faults: InputFaults, rng: np.random.Generator) -> None:
-        """``rng`` gives the noise."""
+        """``rng`` draws the noise."""
         self._faults = faults
         self._rng = rng
-        self._looks_n = LEAST_LOOKS
-        self._late = 0.0
+        self._oversampling = LEAST_OVERSAMPLING
+        self._delay_n = 0.0
         self._ahead: Volts = np.empty((0, CHANNELS_N))
+        """Points of the next samples that are already taken: the later channel needs them early."""
 
-    def tune(self, looks_n: int, sample_rate_hz: float) -> None:
-        """A sample is made of so many looks, and there are so many samples a second."""
-        self._looks_n = looks_n
-        self._late = abs(self._faults.skew_s) * sample_rate_hz * looks_n
+    def set_rate(self, oversampling: int, sample_rate_hz: float) -> None:
+        """Set the number of points in a sample, and the samples per second."""
+        self._oversampling = oversampling
+        self._delay_n = abs(self._faults.skew_s) * sample_rate_hz * oversampling
         self.forget()
 
-    def until(self, looks_n: int) -> int:
-        """Samples until so many looks from now, whole ones."""
-        return (looks_n + self.ahead_n) // self._looks_n
-
-    @property
-    def ahead_n(self) -> int:
-        """Looks that have been taken and are of the samples that come: the later channel needs them before its time."""
-        return len(self._ahead)
+    def samples_in(self, points: int) -> int:
+        """Number of whole samples that end within the next ``points`` points."""
+        return (points + len(self._ahead)) // self._oversampling
 
     def forget(self) -> None:
-        """What has been seen has nothing to do with what comes."""
+        """Discard points that were taken ahead."""
         self._ahead = self._ahead[:0]
 
-    def samples(self, look: Callable[[int], Volts], count: int, *, averages: bool) -> Volts:
-        """The next samples, (count, 2), from consecutive looks: ``look(n)`` is (n, 2).
+    def sample(self, run: Callable[[int], Volts], count: int, *, averages: bool) -> Volts:
+        """The next samples, (count, 2), from consecutive points: ``run(n)`` returns n of them, (n, 2).
 
-        A sample is the mean of its looks, or the first of them. The later channel is taken on the chord between two.
+        A sample is the mean of its points, or the first of them. The later channel is interpolated between two points.
         """
-        own = count * self._looks_n
-        lacking = own + math.ceil(self._late) - self.ahead_n
-        seen = np.concatenate((self._ahead, look(lacking))) if count else self._ahead
-        looks, self._ahead = seen[:own].copy(), seen[own:]
-        if self._late and count:
+        own = count * self._oversampling
+        lacking = own + math.ceil(self._delay_n) - len(self._ahead)
+        taken = np.concatenate((self._ahead, run(lacking))) if count else self._ahead
+        points, self._ahead = taken[:own].copy(), taken[own:]
+        if self._delay_n and count:
             later = 1 if self._faults.skew_s > 0.0 else 0
-            looks[:, later] = np.interp(np.arange(own) + self._late, np.arange(len(seen)), seen[:, later])
-        by_sample = looks.reshape(count, self._looks_n, CHANNELS_N)
+            points[:, later] = np.interp(np.arange(own) + self._delay_n, np.arange(len(taken)), taken[:, later])
+        by_sample = points.reshape(count, self._oversampling, CHANNELS_N)
         return np.asarray(by_sample.mean(axis=1) if averages else by_sample[:, 0])
 
     def codes(self, volts: Volts, switches: Sequence[str]) -> Codes:
-        """What the converters make of samples: (n, 2), 0 for 0 V. ``switches``: the range of each channel."""
+        """Codes of samples, (n, 2), 0 for 0 V. ``switches``: the range of each channel."""
         lsbs_v = np.array(self.lsb_v(switches))
         most_v = lsbs_v * (1 << (BITS - 1))
         card = Card(
@@ -127,8 +114,8 @@ class Inputs:
         return first_v, second_v
 
 
-def looks_per_sample(faults: InputFaults, sample_rate_hz: float) -> int:
-    """So many that the later channel's instant is that of a look, if that can be; else it is close to one."""
+def choose_oversampling(faults: InputFaults, sample_rate_hz: float) -> int:
+    """Number of points in a sample at which the later channel's instant is that of a point, or else close to one."""
     part = abs(faults.skew_s) * sample_rate_hz
-    counts = range(LEAST_LOOKS, MOST_LOOKS + 1)
-    return next((n for n in counts if abs(part * n - round(part * n)) < _AT_A_LOOK), MOST_LOOKS)
+    counts = range(LEAST_OVERSAMPLING, MOST_OVERSAMPLING + 1)
+    return next((n for n in counts if abs(part * n - round(part * n)) < _ON_POINT), MOST_OVERSAMPLING)

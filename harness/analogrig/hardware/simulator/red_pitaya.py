@@ -1,19 +1,19 @@
-"""The instrument: a Red Pitaya STEMlab 125-14 as its SCPI server shows it, with a box of digital pots beside it.
+"""Simulated instrument: a Red Pitaya STEMlab 125-14 behind its SCPI server, with a box of digital pots beside it.
 
-Generator and acquisition of two channels, after https://redpitaya.readthedocs.io (SCPI commands, OS 2.0). What is here
-behaves as there: 125 MHz through a decimation, records of 16,384 samples with the trigger in their middle plus a delay,
-+-1 V (LV) or +-20 V (HV) on 14 bits, numbers in braces or as float32 and int16 in a block, the highest byte first
-unless ACQ:DATA:BYTE:ORDER LEND says otherwise. Commands that it does not have are refused; a real one has many more.
+Generator and acquisition of two channels follow https://redpitaya.readthedocs.io (SCPI commands, OS 2.0): 125 MHz
+through a decimation, records of 16,384 samples with the trigger in their middle plus a delay, +-1 V (LV) or +-20 V (HV)
+on 14 bits. Numbers come in braces, or as float32 and int16 in a block, most significant byte first unless
+ACQ:DATA:BYTE:ORDER LEND is set. Unknown commands are refused; a real instrument has many more.
 
     GEN:RST  ACQ:RST  SOUR1:FUNC SQUARE  SOUR1:FREQ:FIX 100  SOUR1:VOLT .5  SOUR1:VOLT:OFFS .5  ACQ:DEC:Factor 6250
     ACQ:AVG ON  ACQ:DATA:Units VOLTS  ACQ:DATA:FORMAT ASCII  ACQ:SOUR1:GAIN HV  ACQ:TRig:DLY 8192  ACQ:START
     ACQ:TRig AWG_PE  OUTPUT1:STATE ON  SOUR1:TRig:INT  ACQ:TRig:STAT?  ACQ:TRig:FILL?  ACQ:SOUR1:DATA?
 
-The pots are numbered as POT:CATalog? lists them:
+Pots have the numbers of their places in POT:CATalog?:
 
-    POT:CATalog?                     their names
-    POT<n>:DIAL 0.25    POT<n>:DIAL?    turn one at once; where it stands, 0 to 1
-    POT:SCHedule <n>,<dial>,<s>      turn it so long after each SOUR1:TRig:INT; up to 64 of them
+    POT:CATalog?                     names of the pots
+    POT<n>:DIAL 0.25    POT<n>:DIAL?    set a pot at once; its position, 0 to 1
+    POT:SCHedule <n>,<dial>,<s>      set it this long after each SOUR1:TRig:INT; at most 64 entries
     POT:SCHedule:CLEar    POT:SCHedule:COUNt?
 """
 
@@ -21,79 +21,123 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.simulator.acquisition import (
     BUFFER_N,
     CLOCK_HZ,
-    LARGEST_V,
     LEAST_DECIMATION,
     LEAST_DELAY_N,
     MOST_DECIMATION,
     MOST_DELAY_N,
     TRIGGERS,
     Acquisition,
-    Settings,
-    with_switch,
+    AcquisitionFaults,
 )
-from analogrig.hardware.simulator.description import InstrumentDescription
-from analogrig.hardware.simulator.generator import MOST_VOLTS, SHAPES, Generator
-from analogrig.hardware.simulator.inputs import RANGES_V, Codes
+from analogrig.hardware.simulator.computer import WiredComputer, Wiring
+from analogrig.hardware.simulator.inputs import RANGES_V, Codes, InputFaults
 from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
-from analogrig.hardware.simulator.table import DueTurn, Table
 from analogrig.links.wire import Clock
-from analogrig_emulator import EmulatorError, SuspensionComputer
+from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
 
 MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
+MOST_OUTPUT_V = 1.0
+MOST_LEVEL_V = max(RANGES_V.values())
+SHAPES = ("SQUARE", "PWM", "DC")
+_ROUNDING_V = 1e-9
 _ORDERS = {"BEND": ">", "LEND": "<"}
 _IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 
+Commands = dict[str, tuple[int, Command]]
+"""By pattern: the largest number of arguments, and the action."""
+
+
+@dataclass(frozen=True)
+class InstrumentDescription:
+    """Table ``[instrument]`` of a served rig: its leads and its faults, none by default."""
+
+    wiring: Wiring = field(default_factory=Wiring)
+    inputs: InputFaults = field(default_factory=InputFaults)
+    acquisition: AcquisitionFaults = field(default_factory=AcquisitionFaults)
+
+
+@dataclass(frozen=True)
+class Generator:
+    """Settings of the generator, with the values after GEN:RST."""
+
+    shape: str = "SQUARE"
+    frequency_hz: float = 1000.0
+    amplitude_v: float = 1.0
+    """Half the distance between the two levels."""
+    offset_v: float = 0.0
+    phase_deg: float = 0.0
+    duty: float = 0.5
+    """Duty cycle of the shape PWM."""
+    on: bool = False
+
+    def waveform(self) -> Excitation:
+        """Waveform of the generator once it is triggered.
+
+        :raises ScpiError: it exceeds the range of the output.
+        """
+        low_v, high_v = self.offset_v - self.amplitude_v, self.offset_v + self.amplitude_v
+        if max(-low_v, high_v) > MOST_OUTPUT_V + _ROUNDING_V:
+            raise ScpiError(-221, f"{low_v:g} V to {high_v:g} V exceeds +-{MOST_OUTPUT_V:g} V")
+        if not self.on:
+            low_v = high_v = 0.0
+        elif self.shape == "DC":
+            low_v = high_v
+        shape, duty = ("pulse", self.duty) if self.shape == "PWM" else ("square", 0.5)
+        phase = self.phase_deg / 360.0 % 1.0 % 1.0
+        return Excitation(shape, low_v, high_v, self.frequency_hz, phase, duty, clock="free")
+
 
 class ServedRedPitaya:
-    """The instrument on a table, with a computer that is switched on. Its state is the same for all who speak to it."""
+    """Instrument with a computer in operation. All clients share its state."""
 
     def __init__(
         self,
-        computer: Callable[[float], SuspensionComputer],
+        make: Callable[[float], SuspensionComputer],
         rng: np.random.Generator,
         description: InstrumentDescription | None = None,
         clock: Clock | None = None,
     ) -> None:
-        """``computer`` makes the machine for a rate of looks in Hz; ``rng`` gives the noise of the inputs.
+        """``make`` returns the machine for a rate in Hz; ``rng`` draws the noise of the inputs.
 
-        With a ``clock`` a record takes the time that it lasts, and a pot turns where in the record it was turned.
+        With a ``clock`` a record takes its real time, and a pot set meanwhile changes within the record.
 
         :raises EmulatorError: the computer cannot be made.
         """
         described = description or InstrumentDescription()
-        self._table = Table(computer, described.wiring)
-        self._acquisition = Acquisition(self._table, (described.inputs, rng), described.acquisition, clock)
+        self._computer = WiredComputer(make, described.wiring)
+        self._acquisition = Acquisition(self._computer, (described.inputs, rng), described.acquisition, clock)
         self._generator = Generator()
-        self._pots = tuple(self._table.dials)
-        self._scheduled: list[DueTurn] = []
+        self._pots = tuple(self._computer.dials)
+        self._scheduled: list[DialChange] = []
 
     @property
     def live(self) -> bool:
-        """Whether the generator's output is switched on."""
+        """True if the generator's output is on."""
         return self._generator.on
 
     def silence(self) -> None:
-        """The output off: what a bench should be left as."""
+        """Switch the output off."""
         self._generator = dataclasses.replace(self._generator, on=False)
-        self._table.silence()
+        self._computer.silence()
 
     @property
-    def commands(self) -> Mapping[str, tuple[int, Command]]:
-        """By pattern the number of arguments, and what is done."""
-        commands = self._general() | self._of_generator() | self._of_acquisition() | self._of_pots()
-        return {pattern: (most, functools.partial(_refusing, command)) for pattern, (most, command) in commands.items()}
+    def commands(self) -> Commands:
+        commands = self._general() | self._generator_commands() | self._acquisition_commands() | self._pot_commands()
+        return {pattern: (most, functools.partial(_run, command)) for pattern, (most, command) in commands.items()}
 
-    def _general(self) -> dict[str, tuple[int, Command]]:
+    def _general(self) -> Commands:
         return {
             "*IDN?": (0, lambda _: _IDENTITY),
             "*OPC?": (0, lambda _: "1"),
@@ -107,58 +151,48 @@ class ServedRedPitaya:
 
     # ---- generator
 
-    def _of_generator(self) -> dict[str, tuple[int, Command]]:
-        return {
+    def _generator_commands(self) -> Commands:
+        commands: Commands = {
             "GEN:RST": (0, lambda _: self._reset_generator()),
-            "SOUR#:FUNC": (1, lambda call: self._generate_with(self._out(call), shape=call.word(0, SHAPES))),
-            "SOUR#:FUNC?": (0, lambda call: self._out(call).shape),
-            "OUTPUT#:STATE": (1, lambda call: self._generate_with(self._out(call), on=call.switch(0))),
-            "OUTPUT#:STATE?": (0, lambda call: _on_off(self._out(call).on)),
             "SOUR#:TRig:INT": (0, self._trigger_generator),
-            **self._quantity("SOUR#:FREQ[:FIX]", "frequency_hz", 1e-3, 1e6, HERTZ),
-            **self._quantity("SOUR#:VOLT", "amplitude_v", 0.0, MOST_VOLTS, VOLTS),
-            **self._quantity("SOUR#:VOLT:OFFS", "offset_v", -MOST_VOLTS, MOST_VOLTS, VOLTS),
-            **self._quantity("SOUR#:PHAS", "phase_deg", -360.0, 360.0),
-            **self._quantity("SOUR#:DCYC", "duty", 0.001, 0.999),
+            **_setting("OUTPUT#:STATE", "on", self._output, self._set_generator, lambda call: call.switch(0), _on_off),
+            **_setting("SOUR#:FUNC", "shape", self._output, self._set_generator, lambda call: call.word(0, SHAPES)),
         }
+        for pattern, name, low, high, suffixes in (
+            ("SOUR#:FREQ[:FIX]", "frequency_hz", 1e-3, 1e6, HERTZ),
+            ("SOUR#:VOLT", "amplitude_v", 0.0, MOST_OUTPUT_V, VOLTS),
+            ("SOUR#:VOLT:OFFS", "offset_v", -MOST_OUTPUT_V, MOST_OUTPUT_V, VOLTS),
+            ("SOUR#:PHAS", "phase_deg", -360.0, 360.0, {}),
+            ("SOUR#:DCYC", "duty", 0.001, 0.999, {}),
+        ):
+            parse = functools.partial(Call.number, at=0, low=low, high=high, suffixes=suffixes)
+            commands |= _setting(pattern, name, self._output, self._set_generator, parse, _number)
+        return commands
 
-    def _quantity(
-        self, pattern: str, name: str, low: float, high: float, suffixes: Mapping[str, float] | None = None
-    ) -> dict[str, tuple[int, Command]]:
-        """A number of the generator's, set and asked for."""
-        return {
-            pattern: (
-                1,
-                lambda call: self._generate_with(self._out(call), **{name: call.number(0, low, high, suffixes)}),
-            ),
-            f"{pattern}?": (0, lambda call: _number(getattr(self._out(call), name))),
-        }
-
-    def _out(self, call: Call) -> Generator:
+    def _output(self, call: Call) -> Generator:
         if call.numbers[0] != 1:
-            raise ScpiError(-114, "OUT1 is the one that is wired")
+            raise ScpiError(-114, "only OUT1 is wired")
         return self._generator
 
-    def _generate_with(self, generator: Generator, **changes: Any) -> None:
-        """A generator that runs goes on with the new settings, from the beginning of a period."""
-        changed = dataclasses.replace(generator, **changes)
+    def _set_generator(self, changed: Generator) -> None:
+        """Change settings; a running generator continues with them from the beginning of a period."""
         waveform = changed.waveform()
-        if self._table.generates:
-            self._table.generate(waveform)
+        if self._computer.generates:
+            self._computer.generate(waveform)
         self._generator = changed
 
     def _trigger_generator(self, call: Call) -> None:
-        self._table.generate(self._out(call).waveform())
-        self._table.schedule(self._scheduled)
-        self._acquisition.generator_started()
+        self._computer.generate(self._output(call).waveform())
+        self._computer.schedule(self._scheduled)
+        self._acquisition.notice_generator_start()
 
     def _reset_generator(self) -> None:
         self._generator = Generator()
-        self._table.silence()
+        self._computer.silence()
 
     # ---- acquisition
 
-    def _of_acquisition(self) -> dict[str, tuple[int, Command]]:
+    def _acquisition_commands(self) -> Commands:
         acquisition = self._acquisition
         return {
             "ACQ:RST": (0, lambda _: acquisition.reset()),
@@ -168,54 +202,39 @@ class ServedRedPitaya:
             "ACQ:TRig:STAT?": (0, lambda _: self._triggered()),
             "ACQ:TRig:FILL?": (0, lambda _: self._filled()),
             "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
+            "ACQ:SRATe?": (0, lambda _: f"{_number(CLOCK_HZ / acquisition.settings.decimation)} Hz"),
+            "ACQ:SOUR#:GAIN": (1, self._set_range),
+            "ACQ:SOUR#:GAIN?": (0, lambda call: acquisition.settings.switches[_channel(call)]),
             "ACQ:SOUR#:DATA?": (0, lambda call: self._data(call, 0, BUFFER_N)),
             "ACQ:SOUR#:DATA:STArt:N?": (2, self._part_of_data),
             "ACQ:SOUR#:DATA:Old:N?": (1, lambda call: self._data(call, 0, call.whole(0, 1, BUFFER_N))),
             "ACQ:SOUR#:DATA:LATest:N?": (1, self._latest_data),
-            **self._settings_of_time(),
-            **self._settings_of_data(),
+            **self._acquisition_settings(),
         }
 
-    def _settings_of_time(self) -> dict[str, tuple[int, Command]]:
-        def settings() -> Settings:
-            return self._acquisition.settings
+    def _acquisition_settings(self) -> Commands:
+        def setting(
+            pattern: str, name: str, parse: Callable[[Call], Any], show: Callable[[Any], str] = str
+        ) -> Commands:
+            return _setting(pattern, name, lambda _: self._acquisition.settings, self._acquisition.change, parse, show)
 
         return {
-            "ACQ:DEC[:Factor]": (
-                1,
-                lambda call: self._acquire_with(decimation=call.whole(0, LEAST_DECIMATION, MOST_DECIMATION)),
+            **setting("ACQ:DEC[:Factor]", "decimation", lambda call: call.whole(0, LEAST_DECIMATION, MOST_DECIMATION)),
+            **setting("ACQ:AVG", "averages", lambda call: call.switch(0), _on_off),
+            **setting(
+                "ACQ:TRig:LEV", "level_v", lambda call: call.number(0, -MOST_LEVEL_V, MOST_LEVEL_V, VOLTS), _number
             ),
-            "ACQ:DEC[:Factor]?": (0, lambda _: str(settings().decimation)),
-            "ACQ:SRATe?": (0, lambda _: f"{_number(CLOCK_HZ / settings().decimation)} Hz"),
-            "ACQ:AVG": (1, lambda call: self._acquire_with(averages=call.switch(0))),
-            "ACQ:AVG?": (0, lambda _: _on_off(settings().averages)),
-            "ACQ:TRig:LEV": (1, lambda call: self._acquire_with(level_v=call.number(0, -LARGEST_V, LARGEST_V, VOLTS))),
-            "ACQ:TRig:LEV?": (0, lambda _: _number(settings().level_v)),
-            "ACQ:TRig:DLY": (1, lambda call: self._acquire_with(delay_n=call.whole(0, LEAST_DELAY_N, MOST_DELAY_N))),
-            "ACQ:TRig:DLY?": (0, lambda _: str(settings().delay_n)),
+            **setting("ACQ:TRig:DLY", "delay_n", lambda call: call.whole(0, LEAST_DELAY_N, MOST_DELAY_N)),
+            **setting("ACQ:DATA:Units", "units", lambda call: call.word(0, ("VOLTS", "RAW"))),
+            **setting("ACQ:DATA:FORMAT", "form", lambda call: call.word(0, ("ASCII", "BIN"))),
+            **setting("ACQ:DATA:BYTE:ORDER", "order", lambda call: call.word(0, tuple(_ORDERS))),
         }
-
-    def _settings_of_data(self) -> dict[str, tuple[int, Command]]:
-        def settings() -> Settings:
-            return self._acquisition.settings
-
-        return {
-            "ACQ:SOUR#:GAIN": (1, self._set_range),
-            "ACQ:SOUR#:GAIN?": (0, lambda call: settings().switches[_channel(call)]),
-            "ACQ:DATA:Units": (1, lambda call: self._acquire_with(units=call.word(0, ("VOLTS", "RAW")))),
-            "ACQ:DATA:Units?": (0, lambda _: settings().units),
-            "ACQ:DATA:FORMAT": (1, lambda call: self._acquire_with(form=call.word(0, ("ASCII", "BIN")))),
-            "ACQ:DATA:FORMAT?": (0, lambda _: settings().form),
-            "ACQ:DATA:BYTE:ORDER": (1, lambda call: self._acquire_with(order=call.word(0, tuple(_ORDERS)))),
-            "ACQ:DATA:BYTE:ORDER?": (0, lambda _: settings().order),
-        }
-
-    def _acquire_with(self, **changes: Any) -> None:
-        self._acquisition.change(dataclasses.replace(self._acquisition.settings, **changes))
 
     def _set_range(self, call: Call) -> None:
-        changed = with_switch(self._acquisition.settings, _channel(call), call.word(0, tuple(RANGES_V)))
-        self._acquisition.change(changed)
+        settings = self._acquisition.settings
+        switches = list(settings.switches)
+        switches[_channel(call)] = call.word(0, tuple(RANGES_V))
+        self._acquisition.change(dataclasses.replace(settings, switches=tuple(switches)))
 
     def _triggered(self) -> str:
         self._acquisition.wait()
@@ -228,7 +247,7 @@ class ServedRedPitaya:
     def _part_of_data(self, call: Call) -> Response:
         first, count = call.whole(0, 0, BUFFER_N - 1), call.whole(1, 1, BUFFER_N)
         if first + count > BUFFER_N:
-            raise ScpiError(-222, f"{first} + {count} is beyond the buffer of {BUFFER_N}")
+            raise ScpiError(-222, f"{first} + {count} exceeds the buffer of {BUFFER_N}")
         return self._data(call, first, count)
 
     def _latest_data(self, call: Call) -> Response:
@@ -236,14 +255,15 @@ class ServedRedPitaya:
         return self._data(call, BUFFER_N - count, count)
 
     def _data(self, call: Call, first: int, count: int) -> Response:
-        """Samples of the record, in the units and the form that are set."""
+        """Samples of the record, in the chosen units and format."""
         channel, record = _channel(call), self._acquisition.record
         if record is None:
             raise ScpiError(-230, "no record is complete")
-        data = self._formed(record.codes[first : first + count, channel], record.lsb_v[channel])
-        return Broken(data, hangs_up=self._acquisition.hangs_up) if self._acquisition.drops_out() else data
+        data = self._format(record.codes[first : first + count, channel], record.lsb_v[channel])
+        drop_out = self._acquisition.drop_out()
+        return Broken(data, hangs_up=drop_out == "hang up") if drop_out else data
 
-    def _formed(self, codes: Codes, lsb_v: float) -> str | bytes:
+    def _format(self, codes: Codes, lsb_v: float) -> str | bytes:
         settings = self._acquisition.settings
         order, binary = _ORDERS[settings.order], settings.form == "BIN"
         if settings.units == "RAW":
@@ -253,11 +273,11 @@ class ServedRedPitaya:
 
     # ---- pots
 
-    def _of_pots(self) -> dict[str, tuple[int, Command]]:
+    def _pot_commands(self) -> Commands:
         return {
             "POT:CATalog?": (0, lambda _: ",".join(self._pots)),
             "POT#:DIAL": (1, self._turn),
-            "POT#:DIAL?": (0, lambda call: _number(self._table.dials[self._pot(call.numbers[0])])),
+            "POT#:DIAL?": (0, lambda call: _number(self._computer.dials[self._pot(call.numbers[0])])),
             "POT:SCHedule": (3, self._schedule),
             "POT:SCHedule:CLEar": (0, lambda _: self._scheduled.clear()),
             "POT:SCHedule:COUNt?": (0, lambda _: str(len(self._scheduled))),
@@ -265,25 +285,40 @@ class ServedRedPitaya:
 
     def _pot(self, number: int) -> str:
         if not 1 <= number <= len(self._pots):
-            raise ScpiError(-114, f"there are pots 1 to {len(self._pots)}")
+            raise ScpiError(-114, f"the pots are 1 to {len(self._pots)}")
         return self._pots[number - 1]
 
     def _turn(self, call: Call) -> None:
-        """At this instant: what has been recorded by now was taken before."""
+        """Set a pot now; samples that are due by now are taken before."""
         pot, dial = self._pot(call.numbers[0]), call.number(0, 0.0, 1.0)
         if self._acquisition.triggered:
             self._acquisition.wait()
-        self._table.turn(pot, dial)
+        self._computer.turn(pot, dial)
 
     def _schedule(self, call: Call) -> None:
         if len(self._scheduled) == MOST_SCHEDULED:
-            raise ScpiError(-223, f"{MOST_SCHEDULED} turns are scheduled")
+            raise ScpiError(-223, f"at most {MOST_SCHEDULED} changes can be scheduled")
         pot = self._pots[call.whole(0, 1, len(self._pots)) - 1]
-        self._scheduled.append(DueTurn(call.number(2, 0.0, MOST_DELAY_S), pot, call.number(1, 0.0, 1.0)))
+        self._scheduled.append(DialChange(call.number(2, 0.0, MOST_DELAY_S), pot, call.number(1, 0.0, 1.0)))
 
 
-def _refusing(command: Command, call: Call) -> Response:
-    """What the emulator refuses, the instrument does."""
+def _setting(
+    pattern: str,
+    name: str,
+    get: Callable[[Call], Any],
+    put: Callable[[Any], None],
+    parse: Callable[[Call], Any],
+    show: Callable[[Any], str] = str,
+) -> Commands:
+    """Commands that set and query the field ``name`` of a dataclass, which ``get`` returns and ``put`` stores."""
+    return {
+        pattern: (1, lambda call: put(dataclasses.replace(get(call), **{name: parse(call)}))),
+        f"{pattern}?": (0, lambda call: show(getattr(get(call), name))),
+    }
+
+
+def _run(command: Command, call: Call) -> Response:
+    """Run a command; convert errors of the emulator to those of the instrument."""
     try:
         return command(call)
     except EmulatorError as error:
@@ -292,7 +327,7 @@ def _refusing(command: Command, call: Call) -> Response:
 
 def _channel(call: Call) -> int:
     if not 1 <= call.numbers[0] <= 2:
-        raise ScpiError(-114, "there are IN1 and IN2")
+        raise ScpiError(-114, "the inputs are IN1 and IN2")
     return call.numbers[0] - 1
 
 

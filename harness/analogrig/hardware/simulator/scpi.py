@@ -1,12 +1,12 @@
-"""SCPI: program messages in, response messages out, for whatever instrument has a table of commands.
+"""SCPI interpreter: program messages in, response messages out, for an instrument with a table of commands.
 
-A program message is a line; a command a header and its arguments, `ACQ:DEC 8`; several stand in a line behind
-semicolons, and what they answer comes in a line too, behind semicolons (IEEE 488.2, 8.4). A header's words may be short
-or long, in capitals or not: the pattern `SYSTem:ERRor` is met by `syst:err` and `SYSTEM:ERROR`. `#` in a pattern stands
-for a number, 1 if there is none; `[...]` for words that may be left out. Behind a semicolon a header may begin where
-the one before it left off (SCPI 1999, 6.2.4), or at the root, with a colon or without.
+A program message is a line. A command is a header and its arguments, `ACQ:DEC 8`. Semicolons separate several commands
+in a line, and their responses in one line (IEEE 488.2, 8.4). Words of a header may be short or long, in either case:
+the pattern `SYSTem:ERRor` matches `syst:err` and `SYSTEM:ERROR`. In a pattern, `#` stands for a number, 1 if it is
+missing, and `[...]` for optional words. After a semicolon, a header may continue the path of the previous one (SCPI
+1999, 6.2.4), or start at the root, with or without a colon.
 
-What is wrong goes into the queue of errors, which `SYST:ERR?` reads, and has no other effect.
+Errors go into the queue that `SYST:ERR?` reads, and have no other effect.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 MOST_LINE_BYTES = 4096
 MOST_ARGUMENTS = 16
 MOST_ERRORS = 32
-"""The queue holds no more; the last place is then taken by "queue overflow" (SCPI 1999, 21.8.1)."""
+"""Length of the queue; its last entry then becomes "queue overflow" (SCPI 1999, 21.8.1)."""
 END = b"\r\n"
 
 ERRORS = {
@@ -43,21 +43,21 @@ ERRORS = {
     -350: "Queue overflow",
     -363: "Input buffer overrun",
 }
-"""SCPI 1999, 21.8.9 to 21.8.11."""
+"""Texts by number (SCPI 1999, 21.8.9 to 21.8.11)."""
 _MOST_ERROR_CHARACTERS = 255
 
 VOLTS = {"V": 1.0, "MV": 1e-3}
 HERTZ = {"HZ": 1.0, "KHZ": 1e3, "MHZ": 1e6}
-"""Suffixes behind a number, and what they multiply it with (IEEE 488.2, 7.7.3: MHZ is a million, MV a thousandth)."""
+"""Factors by suffix of a number (IEEE 488.2, 7.7.3: MHZ is a million, MV a thousandth)."""
 _ERROR_QUEUE = 4
-"""The bit of the status byte that says that it holds something (SCPI 1999, 9)."""
+"""Bit of the status byte: the error queue is not empty (SCPI 1999, 9)."""
 
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z]*)")
 _HEADER = re.compile(r"(?:\*|:?[A-Za-z])[\w:]*\??")
 
 
 class ScpiError(Exception):
-    """One of ERRORS, and what it is here."""
+    """One of ERRORS, with details."""
 
     def __init__(self, number: int, detail: str = "") -> None:
         super().__init__(number, detail)
@@ -70,52 +70,52 @@ class ScpiError(Exception):
 
 
 class DropOut(Exception):  # noqa: N818 - the word of the field
-    """The instrument ceases to answer, in the middle of a response."""
+    """The instrument stops in the middle of a response."""
 
     def __init__(self, *, hangs_up: bool) -> None:
-        super().__init__("the connection is closed" if hangs_up else "nothing more is said")
+        super().__init__("the connection is closed" if hangs_up else "nothing more is sent")
         self.hangs_up = hangs_up
 
 
 @dataclass(frozen=True)
 class Call:
-    """One command as it came."""
+    """Received command."""
 
     numbers: tuple[int, ...]
-    """For each `#` of the pattern."""
+    """Number for each `#` of the pattern."""
     arguments: tuple[str, ...]
 
     def word(self, at: int, allowed: Sequence[str]) -> str:
-        """An argument that is one of some words, in capitals."""
+        """Argument that is one of the allowed words, in capitals."""
         word = self._argument(at).upper()
         if word not in allowed:
-            raise ScpiError(-224, f"{_shown(word)}, it may be {', '.join(allowed)}")
+            raise ScpiError(-224, f"{_shown(word)}: must be {', '.join(allowed)}")
         return word
 
     def number(self, at: int, low: float, high: float, suffixes: Mapping[str, float] | None = None) -> float:
-        """An argument that is a number from ``low`` to ``high``, perhaps with a suffix."""
+        """Argument that is a number from ``low`` to ``high``, with an optional suffix."""
         text = self._argument(at)
         found = _NUMBER.fullmatch(text)
         if not found:
-            raise ScpiError(-104, f"{_shown(text)} is no number")
+            raise ScpiError(-104, f"{_shown(text)} is not a number")
         value = float(found[1]) * _factor(found[2].upper(), suffixes or {})
         if not (math.isfinite(value) and low <= value <= high):
-            raise ScpiError(-222, f"{_shown(text)}, it may be {low:g} to {high:g}")
+            raise ScpiError(-222, f"{_shown(text)}: must be {low:g} to {high:g}")
         return value
 
     def whole(self, at: int, low: int, high: int) -> int:
-        """An argument that is a whole number from ``low`` to ``high``."""
+        """Argument that is a whole number from ``low`` to ``high``."""
         value = self.number(at, low, high)
         if value != int(value):
-            raise ScpiError(-104, f"{_shown(self._argument(at))} is no whole number")
+            raise ScpiError(-104, f"{_shown(self._argument(at))} is not a whole number")
         return int(value)
 
     def switch(self, at: int) -> bool:
-        """An argument that is ON or OFF, or 1 or 0."""
+        """Argument that is ON or OFF, or 1 or 0."""
         return self.word(at, ("ON", "OFF", "1", "0")) in ("ON", "1")
 
-    def expect(self, count: int) -> None:
-        """That there are no more arguments than that."""
+    def check_count(self, count: int) -> None:
+        """:raises ScpiError: there are more arguments than ``count``."""
         if len(self.arguments) > count:
             raise ScpiError(-108, _shown(self.arguments[count]))
 
@@ -133,23 +133,23 @@ def _factor(suffix: str, suffixes: Mapping[str, float]) -> float:
 
 @dataclass(frozen=True)
 class Broken:
-    """A response of which the first half is sent, and then nothing any more: DropOut."""
+    """Response that stops after its first half; then the interpreter raises DropOut."""
 
     response: str | bytes
     hangs_up: bool
 
 
 Response = str | bytes | Broken | None
-"""What a query answers: a text, or a block of bytes as IEEE 488.2 has them; None for a command."""
+"""Response of a query: a text, or the content of a block of IEEE 488.2; None for a command."""
 
 Command = Callable[[Call], Response]
 
 
 class Interpreter:
-    """Takes lines, calls commands, keeps the errors of one connection."""
+    """Interpreter of one connection, with its error queue."""
 
     def __init__(self, commands: Mapping[str, tuple[int, Command]]) -> None:
-        """``commands``: by pattern the number of arguments it takes at most, and what it does."""
+        """``commands``: by pattern, the largest number of arguments and the action."""
         own: dict[str, tuple[int, Command]] = {
             "*CLS": (0, lambda _: self._errors.clear()),
             "*STB?": (0, lambda _: str(_ERROR_QUEUE if self._errors else 0)),
@@ -162,9 +162,9 @@ class Interpreter:
         self._errors: deque[ScpiError] = deque()
 
     def enter(self, line: bytes) -> Iterator[bytes]:
-        """One line without its end; yields what is to be sent back, in a part for each command, perhaps empty.
+        """Execute a line without its end. Yield the bytes to send back, one part for each command; it may be empty.
 
-        :raises DropOut: the instrument is no longer there.
+        :raises DropOut: the instrument drops out.
         """
         try:
             text = line.decode("ascii")
@@ -179,7 +179,7 @@ class Interpreter:
             except ScpiError as error:
                 self.refuse(error)
                 response = None
-            part = b"" if response is None else separator + _as_sent(response)
+            part = b"" if response is None else separator + _encode(response)
             if isinstance(response, Broken):
                 yield part
                 raise DropOut(hangs_up=response.hangs_up)
@@ -187,14 +187,14 @@ class Interpreter:
             yield part + END if separator and not left else part
 
     def refuse(self, error: ScpiError) -> None:
-        """Remember what was wrong."""
+        """Add an error to the queue."""
         if len(self._errors) < MOST_ERRORS:
             self._errors.append(error)
         else:
             self._errors[-1] = ScpiError(-350)
 
     def _execute(self, unit: str, path: str) -> tuple[Response, str]:
-        """Response of a command, and where the next header may begin."""
+        """Execute a command. Return its response, and the path that the next header may continue."""
         if not unit:
             return None, path
         header, *rest = unit.split(maxsplit=1)
@@ -207,7 +207,7 @@ class Interpreter:
             for expression, most, command in self._commands:
                 if found := expression.fullmatch(full):
                     call = Call(tuple(int(number or 1) for number in found.groups()), arguments)
-                    call.expect(most)
+                    call.check_count(most)
                     return command(call), path if header.startswith("*") else full[: full.rfind(":") + 1]
         raise ScpiError(-113, _shown(header))
 
@@ -221,10 +221,10 @@ def block(content: bytes) -> bytes:
     return f"#{len(length)}{length}".encode("ascii") + content
 
 
-def _as_sent(response: str | bytes | Broken) -> bytes:
-    """As it goes out; of a broken one the first half."""
+def _encode(response: str | bytes | Broken) -> bytes:
+    """Bytes of a response; the first half of a broken one."""
     if isinstance(response, Broken):
-        whole = _as_sent(response.response)
+        whole = _encode(response.response)
         return whole[: len(whole) // 2]
     return response.encode("ascii") if isinstance(response, str) else block(response)
 
@@ -233,7 +233,7 @@ _PARTS = {"[": "(?:", "]": ")?", "#": r"(\d{0,4})", "?": r"\?", "*": r"\*", ":":
 
 
 def _expression(pattern: str) -> re.Pattern[str]:
-    """What a header of the pattern may look like."""
+    """Regular expression for the headers that match a pattern."""
     return re.compile("".join(map(_part, re.findall(r"\w+|.", pattern))), re.IGNORECASE)
 
 
@@ -245,5 +245,5 @@ def _part(part: str) -> str:
 
 
 def _shown(text: str) -> str:
-    """Of what a client sent, what an error may repeat."""
+    """Printable part of received text, for error messages."""
     return "".join(letter if letter.isprintable() and letter != '"' else "'" for letter in text[:40])

@@ -1,15 +1,14 @@
-"""The instrument on a TCP port: many clients, one instrument; whatever they send or fail to take, it goes on.
+"""TCP server of one instrument for many clients. Survives malformed input and slow clients.
 
-A client may cost so much and no more:
+Limits of a client:
 
-    memory   a line of MOST_LINE_BYTES, one answer that it has not taken, and what the system buffers, BUFFERED_BYTES
-    time     one command, then whoever else waits has a turn
-    a place  of MOST_CLIENTS; when all are taken, a newcomer gets that of the client that has been silent for longest,
-             IDLE_S at least, and is turned away if there is none. Who has the generator running keeps its place.
+    memory   a line of MOST_LINE_BYTES, one unsent response, and the system's buffers of BUFFERED_BYTES
+    time     one command; then waiting clients have a turn
+    place    one of MOST_CLIENTS. A newcomer replaces the client that has been silent longest, at least IDLE_S, or is
+             turned away. The client that has switched the generator on keeps its place.
 
-A client that takes nothing of an answer for SLOW_S is dropped, and one whose machine does not answer any more after
-half a minute (TCP keepalive). Whoever switched the generator on is responsible for it: when that client is gone, for
-whatever reason, the generator is off.
+A client that reads nothing of a response for SLOW_S is dropped, and one whose machine does not respond after half a
+minute (TCP keepalive). When the client that switched the generator on disconnects, the server switches it off.
 """
 
 from __future__ import annotations
@@ -30,45 +29,45 @@ IDLE_S = 10.0
 SLOW_S = 10.0
 BUFFERED_BYTES = 65_536
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 15), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
-"""Seconds of silence, seconds between questions, questions."""
+"""Idle seconds, seconds between probes, probes."""
 
 _log = logging.getLogger(__name__)
 
 
 class Servable(Protocol):
-    """What can be served."""
+    """Instrument that can be served."""
 
     @property
     def commands(self) -> Mapping[str, tuple[int, Command]]:
-        """As an Interpreter takes them."""
+        """Commands for an Interpreter."""
 
     @property
     def live(self) -> bool:
-        """Whether it drives the bench."""
+        """True if its output is on."""
 
     def silence(self) -> None:
-        """Leave the bench safe."""
+        """Switch the output off."""
 
 
 class _Client:
-    """A connection."""
+    """Connection to a client."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
         self.writer = writer
         self.heard_s = asyncio.get_running_loop().time()
-        """When it last said a whole line."""
+        """Time of its last complete line."""
 
     def hang_up(self) -> None:
-        """At once; what it has not taken is lost."""
+        """Close the connection at once; unsent data is lost."""
         self.writer.transport.abort()
 
-    def note(self) -> None:
+    def note_line(self) -> None:
         self.heard_s = asyncio.get_running_loop().time()
 
 
 class Server:
-    """Serves one instrument; every connection has its own queue of errors."""
+    """Server of one instrument; every connection has its own error queue."""
 
     def __init__(self, instrument: Servable, *, slow_s: float = SLOW_S, idle_s: float = IDLE_S) -> None:
         self._instrument = instrument
@@ -79,24 +78,24 @@ class Server:
         self._server: asyncio.Server | None = None
 
     async def listen(self, host: str, port: int) -> tuple[str, int]:
-        """Begin to listen; returns where. Port 0: any that is free.
+        """Listen. Return host and port; port 0 stands for any free one.
 
-        :raises ConfigurationError: there one cannot listen; nowhere is not everywhere.
+        :raises ConfigurationError: listening there failed, or the host is empty.
         """
         if not host:
-            raise ConfigurationError("cannot listen: the host is empty; say 0.0.0.0 for every network of this machine")
+            raise ConfigurationError("cannot listen: the host is empty: use 0.0.0.0 for all networks of this machine")
         try:
             self._server = await asyncio.start_server(self._accept, host, port, limit=MOST_LINE_BYTES)
         except OSError as error:
             raise ConfigurationError(f"cannot listen at {host}:{port}: {error.strerror or error}") from error
-        for listening in self._server.sockets:  # what it accepts inherits them
+        for listening in self._server.sockets:  # accepted connections inherit the options
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFERED_BYTES)
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFERED_BYTES)
         address = self._server.sockets[0].getsockname()
         return str(address[0]), int(address[1])
 
     async def close(self) -> None:
-        """Listen no more, hang up, and leave the bench safe."""
+        """Close all connections, and switch the output off."""
         if self._server is not None:
             self._server.close()
         for task in self._clients:
@@ -106,7 +105,7 @@ class Server:
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         client, task = _Client(reader, writer), asyncio.current_task()
-        if task is None or not self._has_place():
+        if task is None or not self._make_place():
             client.hang_up()
             return
         self._clients[task] = client
@@ -114,20 +113,20 @@ class Server:
             _keep_alive(writer)
             await self._serve(client)
         except (OSError, TimeoutError, asyncio.CancelledError) as error:
-            _log.info("a client is gone: %r", error)
+            _log.info("client disconnected: %r", error)
         finally:
             del self._clients[task]
             client.hang_up()
             self._release(client)
 
     def _release(self, client: _Client) -> None:
-        """It is gone."""
+        """Switch the output off if this client, which is gone, is responsible for it."""
         if client is self._responsible:
             self._responsible = None
             self._instrument.silence()
 
-    def _has_place(self) -> bool:
-        """Whether there is one for a newcomer, perhaps by hanging up on somebody else."""
+    def _make_place(self) -> bool:
+        """Disconnect an idle client if all places are taken. Return True if there is a place for a newcomer."""
         if len(self._clients) < MOST_CLIENTS:
             return True
         silent = min(
@@ -141,35 +140,35 @@ class Server:
 
     async def _serve(self, client: _Client) -> None:
         interpreter = Interpreter(self._instrument.commands)
-        while (line := await _line(client.reader, interpreter)) is not None:
-            client.note()
+        while (line := await _read_line(client.reader, interpreter)) is not None:
+            client.note_line()
             try:
-                await self._obey(client, interpreter, line)
+                await self._execute(client, interpreter, line)
             except DropOut as drop_out:
                 if not drop_out.hangs_up:
-                    await _ignore(client.reader)
+                    await _discard(client.reader)
                 break
         self._release(client)
         client.writer.close()
         async with asyncio.timeout(self._slow_s):
             await client.writer.wait_closed()
 
-    async def _obey(self, client: _Client, interpreter: Interpreter, line: bytes) -> None:
-        """One command after the other; between two of them others have their turn."""
+    async def _execute(self, client: _Client, interpreter: Interpreter, line: bytes) -> None:
+        """Execute the commands of a line; between two of them other clients have a turn."""
         was_live = self._instrument.live
         for part in interpreter.enter(line):
             if self._instrument.live and not was_live:
                 self._responsible = client
             if part:
                 client.writer.write(part)
-                await self._taken(client)
+                await self._drain(client)
             await asyncio.sleep(0)
             was_live = self._instrument.live
 
-    async def _taken(self, client: _Client) -> None:
-        """Wait until the client has taken its answer, or most of it.
+    async def _drain(self, client: _Client) -> None:
+        """Wait until the client has read its response, or most of it.
 
-        :raises TimeoutError: it takes nothing.
+        :raises TimeoutError: it reads nothing.
         """
         transport = client.writer.transport
         while True:
@@ -179,11 +178,11 @@ class Server:
                     await client.writer.drain()
                 return
             if transport.get_write_buffer_size() >= left:
-                raise TimeoutError("it takes nothing")
+                raise TimeoutError("it reads nothing")
 
 
-async def _line(reader: asyncio.StreamReader, interpreter: Interpreter) -> bytes | None:
-    """The next line without its end; None when there is none. One that is too long is refused."""
+async def _read_line(reader: asyncio.StreamReader, interpreter: Interpreter) -> bytes | None:
+    """Next line without its end; None at the end of input. A line that is too long is refused."""
     for too_long in itertools.count():
         try:
             line = await reader.readuntil(b"\n")
@@ -199,8 +198,8 @@ async def _line(reader: asyncio.StreamReader, interpreter: Interpreter) -> bytes
     return None
 
 
-async def _ignore(reader: asyncio.StreamReader) -> None:
-    """Until the client is gone."""
+async def _discard(reader: asyncio.StreamReader) -> None:
+    """Discard input until the client disconnects."""
     while await reader.read(MOST_LINE_BYTES):
         pass
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analogrig.hardware.simulator.table import AT_A_TIME_N, Amplifier, Booster, DueTurn, Table, Wiring
+from analogrig.hardware.instrument import DialChange
+from analogrig.hardware.simulator.computer import CHUNK_N, Amplifier, Booster, WiredComputer, Wiring
 from analogrig_emulator import EmulatorError, Excitation, PotChange
 from tests.served.talk import front
 
@@ -20,49 +21,51 @@ def played(samples: int, tweaks: tuple[PotChange, ...] = (), rate_hz: float = RA
     return np.concatenate(list(front(rate_hz).play(AMPLIFIED, samples, tweaks)))[:, :2]
 
 
-def table(wiring: Wiring | None = None) -> Table:
-    return Table(front, wiring or Wiring(), RATE_HZ)
+def wired(wiring: Wiring | None = None) -> WiredComputer:
+    return WiredComputer(front, wiring or Wiring(), RATE_HZ)
 
 
-def test_a_table_gives_what_the_computer_gives_however_it_is_looked_at() -> None:
-    laid = table()
-    laid.generate(SQUARE)
-    parts = [laid.look(count) for count in (1, 0, 7, 199, 1000, 793)]
+def test_wired_computer_gives_what_the_computer_gives_however_it_is_looked_at() -> None:
+    computer = wired()
+    computer.generate(SQUARE)
+    parts = [computer.run(count) for count in (1, 0, 7, 199, 1000, 793)]
     assert np.array_equal(np.concatenate(parts), played(2000))
 
 
 def test_a_long_look_is_played_in_parts_that_cannot_be_seen() -> None:
-    laid = table()
-    laid.generate(SQUARE)
-    assert np.array_equal(laid.look(AT_A_TIME_N + 1000), played(AT_A_TIME_N + 1000))
+    computer = wired()
+    computer.generate(SQUARE)
+    assert np.array_equal(computer.run(CHUNK_N + 1000), played(CHUNK_N + 1000))
 
 
-def test_a_pot_turns_right_after_the_look_at_or_before_its_instant_and_in_order_of_time() -> None:
-    laid = table()
-    laid.generate(SQUARE)
-    laid.schedule([DueTurn(900 / RATE_HZ, "B", 0.8), DueTurn(300 / RATE_HZ, "K", 0.6), DueTurn(1e3, "M", 0.1)])
+def test_a_pot_turns_right_after_the_set_rate_or_before_its_instant_and_in_order_of_time() -> None:
+    computer = wired()
+    computer.generate(SQUARE)
+    computer.schedule(
+        [DialChange(900 / RATE_HZ, "B", 0.8), DialChange(300 / RATE_HZ, "K", 0.6), DialChange(1e3, "M", 0.1)]
+    )
     tweaks = (PotChange(300, {"K_dial": 0.6}), PotChange(900, {"B_dial": 0.8}))
-    assert np.abs(laid.look(1500) - played(1500, tweaks)).max() < ROUNDING_V
+    assert np.abs(computer.run(1500) - played(1500, tweaks)).max() < ROUNDING_V
 
 
 def test_a_pot_that_is_turned_at_once_stays_there() -> None:
-    laid = table()
-    laid.generate(SQUARE)
-    first = laid.look(500)
-    laid.turn("K", 0.6)
-    assert laid.dials["K"] == pytest.approx(0.6, abs=1e-3)
+    computer = wired()
+    computer.generate(SQUARE)
+    first = computer.run(500)
+    computer.turn("K", 0.6)
+    assert computer.dials["K"] == pytest.approx(0.6, abs=1e-3)
     assert (
-        np.abs(np.concatenate((first, laid.look(500))) - played(1000, (PotChange(499, {"K_dial": 0.6}),))).max()
+        np.abs(np.concatenate((first, computer.run(500))) - played(1000, (PotChange(499, {"K_dial": 0.6}),))).max()
         < ROUNDING_V
     )
 
 
 def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest() -> None:
-    laid = table()
-    laid.generate(SQUARE)
-    laid.look(100)
-    laid.silence()
-    volts = laid.look(2000)
+    computer = wired()
+    computer.generate(SQUARE)
+    computer.run(100)
+    computer.silence()
+    volts = computer.run(2000)
     assert not volts[:, 0].any()
     assert abs(volts[0, 1]) > 1.0
     assert np.abs(volts[-1]).max() < 0.01
@@ -70,56 +73,56 @@ def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest()
 
 def test_leads_have_gain_offset_and_limits_and_may_be_swapped() -> None:
     force, displacement = Amplifier(gain=-0.5, offset_v=0.25), Amplifier(offset_v=-1.0, limits_v=(-0.5, 3.0))
-    laid = table(Wiring(force=force, displacement=displacement, swapped=True))
-    laid.generate(SQUARE)
+    computer = wired(Wiring(force=force, displacement=displacement, swapped=True))
+    computer.generate(SQUARE)
     emulated = played(1000)
     expected = np.stack((np.clip(emulated[:, 1] - 1.0, -0.5, 3.0), -0.5 * emulated[:, 0] + 0.25), axis=1)
-    seen = laid.look(1000)
+    seen = computer.run(1000)
     assert np.abs(seen - expected).max() < ROUNDING_V
     assert seen[:, 0].max() == 3.0 and seen[:, 0].min() == -0.5
 
 
 def test_the_booster_multiplies_shifts_and_limits_what_the_generator_gives() -> None:
-    laid = table(Wiring(generator=Booster(gain=8.0, offset_v=0.5, limits_v=(-1.0, 7.0))))
-    laid.generate(SQUARE)
-    assert sorted(set(np.round(laid.look(1000)[:, 0], 9))) == [0.58, 7.0]
+    computer = wired(Wiring(generator=Booster(gain=8.0, offset_v=0.5, limits_v=(-1.0, 7.0))))
+    computer.generate(SQUARE)
+    assert sorted(set(np.round(computer.run(1000)[:, 0], 9))) == [0.58, 7.0]
 
 
 def test_another_rate_leaves_generator_pots_and_turns_as_they_are() -> None:
     """The computer begins from rest: after 15 ms nothing is left of that."""
-    laid = table()
-    laid.generate(SQUARE)
-    laid.turn("B", 0.8)
-    laid.schedule([DueTurn(0.04, "K", 0.6)])
-    laid.look(250)  # into the second period
-    laid.look_at(2 * RATE_HZ)
+    computer = wired()
+    computer.generate(SQUARE)
+    computer.turn("B", 0.8)
+    computer.schedule([DialChange(0.04, "K", 0.6)])
+    computer.run(250)  # into the second period
+    computer.set_rate(2 * RATE_HZ)
     tweaks = (PotChange(0, {"B_dial": 0.8}), PotChange(1600, {"K_dial": 0.6}))
     expected = played(4500, tweaks, 2 * RATE_HZ)[500:]
-    seen = laid.look(4000)
+    seen = computer.run(4000)
     assert np.array_equal(seen[:, 0], expected[:, 0])
     assert np.abs(seen - expected)[600:].max() < 1e-6
-    assert laid.dials["K"] == pytest.approx(0.6, abs=1e-3)
+    assert computer.dials["K"] == pytest.approx(0.6, abs=1e-3)
 
 
 def test_the_next_period_of_the_generator_is_known() -> None:
-    laid = table()
-    assert laid.until_edge_n() is None
-    laid.generate(SQUARE)
-    assert laid.until_edge_n() == 0
-    laid.look(1)
-    assert laid.until_edge_n() == 199
-    laid.look(199)
-    assert laid.until_edge_n() == 0
+    computer = wired()
+    assert computer.points_to_period() is None
+    computer.generate(SQUARE)
+    assert computer.points_to_period() == 0
+    computer.run(1)
+    assert computer.points_to_period() == 199
+    computer.run(199)
+    assert computer.points_to_period() == 0
 
 
 def test_a_generator_that_is_too_fast_for_the_looks_is_refused_and_goes_on_as_it_was() -> None:
-    laid = table()
-    laid.generate(SQUARE)
+    computer = wired()
+    computer.generate(SQUARE)
     with pytest.raises(EmulatorError, match="half the sample rate"):
-        laid.generate(Excitation("square", 0.0, 1.0, 0.6 * RATE_HZ, clock="free"))
+        computer.generate(Excitation("square", 0.0, 1.0, 0.6 * RATE_HZ, clock="free"))
     with pytest.raises(EmulatorError, match="half the sample rate"):
-        laid.look_at(150.0)
-    assert np.array_equal(laid.look(1000), played(1000))
+        computer.set_rate(150.0)
+    assert np.array_equal(computer.run(1000), played(1000))
 
 
 @pytest.mark.parametrize(
