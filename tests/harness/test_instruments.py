@@ -292,7 +292,7 @@ def test_pots_are_turned_at_once_or_at_instants_of_the_next_record_alone() -> No
     np.testing.assert_array_equal(turned.codes[:201], still.codes[:201])
     assert differs(turned, still)
     instrument.rest(0.0)
-    instrument.pots.turn("K", 0.8511)  # facts 1: the dial of the front suspension
+    instrument.pots.set_one("K", 0.8511)  # facts 1: the dial of the front suspension
     again = instrument.record(SAMPLES)
     np.testing.assert_allclose(again.volts, still.volts, atol=1e-3)
 
@@ -302,4 +302,4 @@ def test_pot_that_cannot_stand_there_is_refused_by_name() -> None:
     assert instrument.pots is not None
     assert instrument.pots.names == ("M", "B", "K")
     with pytest.raises(RigRefused, match="instrument here: set K to 1.5: error -222"):
-        instrument.pots.turn("K", 1.5)
+        instrument.pots.set_one("K", 1.5)

@@ -220,16 +220,18 @@ def test_record_of_the_play_before_is_found_out(tmp_path: Path) -> None:
     assert "stale record: it repeats an earlier one to the bit" in second.reasons[0]
 
 
-class Disobedient:
-    """A box of pots that does something else with the turns of a record."""
+class DisplacedPots(PotBox):
+    """Pots that make the changes of a record late, or not at all."""
 
     def __init__(self, box: PotBox, late_s: float) -> None:
         self.names = box.names
-        self.turn = box.turn
         self._box, self._late_s = box, late_s
 
-    def schedule(self, turns: Sequence[DialChange]) -> None:
-        late = [DialChange(delay_s + self._late_s, pot, dial) for delay_s, pot, dial in turns]
+    def set_one(self, pot: str, dial: float) -> None:
+        self._box.set_one(pot, dial)
+
+    def schedule(self, changes: Sequence[DialChange]) -> None:
+        late = [DialChange(delay_s + self._late_s, pot, dial) for delay_s, pot, dial in changes]
         self._box.schedule(late if self._late_s else [])
 
 
@@ -240,7 +242,7 @@ def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
     def connected(address: str, timeout_s: float) -> RedPitaya:
         instrument = RedPitaya.open(address, timeout_s)
         assert instrument.pots is not None
-        instrument.pots = Disobedient(instrument.pots, late_s)
+        instrument.pots = DisplacedPots(instrument.pots, late_s)
         return instrument
 
     scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])

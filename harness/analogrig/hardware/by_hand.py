@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from analogrig.hardware.dating.jump import NoInstant, date_jump
 from analogrig.hardware.dating.turn import TurnInstants, date_turn
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.pots import Pots
+from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import Clock
 from analogrig.plant import AT_REST, Plant, SampledPlant
 from analogrig.run import Segment

@@ -7,7 +7,7 @@ Volts are those at the instrument's connectors. ``analogrig.hardware.wiring`` de
 from __future__ import annotations
 
 import hashlib
-import importlib
+import pkgutil
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -51,15 +51,47 @@ class DialChange(NamedTuple):
     dial: float
 
 
-class PotBox(Protocol):
-    """Pots that an instrument sets itself. All methods may raise RigError."""
+class Pots(Protocol):
+    """Pots that can be set."""
 
-    @property
-    def names(self) -> tuple[str, ...]: ...
+    slow: bool
+    """True if a hand turns them for many samples; otherwise each jumps, one after the other."""
 
-    def turn(self, pot: str, dial: float) -> None:
-        """Set a pot at once."""
+    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:
+        """Set pots by name, and return when they stand.
 
+        :param words: the target values for the operator prompt: ``M 115 kg, K 24500 N/m``.
+        :param recording: True if a record is being taken, so that they must move at once.
+        :raises RigError: they could not be set.
+        """
+
+    def close(self) -> None:
+        """Release the connection to the pots."""
+
+
+class PotsOneByOne(ABC):
+    """Pots that are set one after another."""
+
+    slow = False
+
+    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - for an operator
+        for pot, dial in dials.items():
+            self.set_one(pot, dial)
+
+    @abstractmethod
+    def set_one(self, pot: str, dial: float) -> None:
+        """Set a pot. :raises RigError: that failed."""
+
+    def close(self) -> None:  # noqa: B027
+        """Do nothing, unless overridden."""
+
+
+class PotBox(PotsOneByOne):
+    """Pots that an instrument sets itself."""
+
+    names: tuple[str, ...]
+
+    @abstractmethod
     def schedule(self, changes: Sequence[DialChange]) -> None:
         """Replace the changes that the box makes at exact instants within the next record, and in no later one."""
 
@@ -197,21 +229,11 @@ class Instrument(ABC):
         """Close the connection. Raises nothing."""
 
 
-class Driver(NamedTuple):
-    """Location of a driver class."""
-
-    module: str
-    kind: str
-    """Name of the class."""
-    address: str
-    """Form of its addresses, for error messages."""
-
-
 DRIVERS = {
-    "redpitaya": Driver("analogrig.hardware.red_pitaya", "RedPitaya", "HOST[:PORT]"),
-    "nidaqmx": Driver("analogrig.hardware.ni_daqmx", "NiDaqmx", "CARD"),
+    "redpitaya": ("analogrig.hardware.red_pitaya:RedPitaya", "HOST[:PORT]"),
+    "nidaqmx": ("analogrig.hardware.ni_daqmx:NiDaqmx", "CARD"),
 }
-"""Drivers by the scheme of an instrument's URL."""
+"""Driver class and form of its addresses, by the scheme of an instrument's URL."""
 
 
 def find_driver(url: str) -> tuple[type[Instrument], str]:
@@ -222,9 +244,9 @@ def find_driver(url: str) -> tuple[type[Instrument], str]:
     scheme, _, rest = url.partition(":")
     known = DRIVERS.get(scheme.lower())
     if known is not None and rest.startswith("//"):
-        kind: type[Instrument] = getattr(importlib.import_module(known.module), known.kind)
+        kind: type[Instrument] = pkgutil.resolve_name(known[0])
         if kind.is_address(address := rest.removeprefix("//")):
             return kind, address
     forms = DRIVERS if known is None else {scheme: known}
-    written = " or ".join(f"{scheme}://{driver.address}" for scheme, driver in forms.items())
+    written = " or ".join(f"{scheme}://{form}" for scheme, (_, form) in forms.items())
     raise ConfigurationError(f"instrument {url!r}: give it as {written}")

@@ -19,12 +19,12 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol, Self
+from typing import ClassVar, Literal, Self
 
 import serial
 
 from analogrig.errors import ConfigurationError, LinkError, RigError
-from analogrig.hardware.instrument import Instrument
+from analogrig.hardware.instrument import Instrument, Pots, PotsOneByOne
 from analogrig.links.wire import DEFAULT_BAUD, PortWire
 from analogrig.trust import Thing, placed, placed_port
 
@@ -41,24 +41,6 @@ _MOST_SHOWN = 300
 _MOST_REPLY_BYTES = 4096
 _PLACEHOLDER = re.compile(r"\{(\w*)\}")
 _PLACEHOLDERS = ("pot", "dial", "step")
-
-
-class Pots(Protocol):
-    """Pots that can be set."""
-
-    slow: bool
-    """True if a hand turns them for many samples; otherwise each jumps, one after the other."""
-
-    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:
-        """Set pots by name, and return when they stand.
-
-        :param words: the target values for the operator prompt: ``M 115 kg, K 24500 N/m``.
-        :param recording: True if a record is being taken, so that they must move at once.
-        :raises RigError: they could not be set.
-        """
-
-    def close(self) -> None:
-        """Release the connection to the pots."""
 
 
 class PotsKind:
@@ -106,7 +88,11 @@ class InstrumentPots(PotsKind):
 
     def open_on(self, instrument: Instrument, names: tuple[str, ...]) -> Pots:
         """:raises RigError: the instrument lacks some of these pots."""
-        return _OnInstrument(instrument, names)
+        box = instrument.pots
+        lacking = sorted(set(names) - set(box.names if box else ()))
+        if box is None or lacking:
+            raise RigError(f"{instrument.name}: lacks the pots {', '.join(lacking)}")
+        return box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,42 +234,11 @@ def _check_placeholders(key: str, template: str, *, needed: bool = True) -> None
         raise ValueError(f"{key} must have {{pot}}, and {{dial}} or {{step}}, in it")
 
 
-class _OneByOne:
-    """Pots that are set one after another."""
-
-    slow = False
-
-    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - for an operator
-        for pot, dial in dials.items():
-            self._set_one(pot, dial)
-
-    def close(self) -> None:
-        pass
-
-    def _set_one(self, pot: str, dial: float) -> None:
-        raise NotImplementedError
-
-
-class _OnInstrument(_OneByOne):
-    """Pots of an instrument between records; changes within a record are in its schedule."""
-
-    def __init__(self, instrument: Instrument, names: tuple[str, ...]) -> None:
-        """:raises RigError: the instrument lacks some of these pots."""
-        box = instrument.pots
-        lacking = sorted(set(names) - set(box.names if box else ()))
-        if box is None or lacking:
-            raise RigError(f"{instrument.name}: lacks the pots {', '.join(lacking)}")
-        self._box = box
-
-    def _set_one(self, pot: str, dial: float) -> None:
-        self._box.turn(pot, dial)
-
-
-class _Command(_OneByOne):
+class _Command(PotsOneByOne):
     def __init__(self, description: CommandPots) -> None:
         self._description = description
 
-    def _set_one(self, pot: str, dial: float) -> None:
+    def set_one(self, pot: str, dial: float) -> None:
         arguments = [self._description.fill(each, pot, dial) for each in self._description.arguments]
         where = f"pot {pot} to {dial:.{DECIMALS}f}: {shlex.join(arguments)}"
         with _start(arguments, where) as process:
@@ -335,7 +290,7 @@ def _start(arguments: list[str], where: str) -> Iterator[subprocess.Popen[bytes]
                 os.killpg(process.pid, signal.SIGKILL)
 
 
-class _Box(_OneByOne):
+class _Box(PotsOneByOne):
     def __init__(self, description: SerialPots) -> None:
         self._description = description
         try:
@@ -343,7 +298,7 @@ class _Box(_OneByOne):
         except LinkError as error:
             raise RigError(f"pots: {error}") from error
 
-    def _set_one(self, pot: str, dial: float) -> None:
+    def set_one(self, pot: str, dial: float) -> None:
         description = self._description
         where = f"pot {pot} to {dial:.{DECIMALS}f}: {description.url}"
         wanted = description.fill(description.reply, pot, dial)
@@ -416,10 +371,10 @@ class _Operator:
             os.close(fd)
 
 
-class _FixedPots(_OneByOne):
+class _FixedPots(PotsOneByOne):
     """Pots that are assumed to stand as wanted."""
 
-    def _set_one(self, pot: str, dial: float) -> None:
+    def set_one(self, pot: str, dial: float) -> None:
         pass
 
 

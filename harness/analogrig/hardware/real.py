@@ -18,10 +18,9 @@ from typing import Any, Self
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
-from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, find_driver
+from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
 from analogrig.hardware.plan import Planner, PlayPlan, split_records
-from analogrig.hardware.pots import Pots
 from analogrig.hardware.self_test.conduct import self_test
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigRefused, RigTimeout
-from analogrig.hardware.instrument import Datasheet, DialChange, InputRecord, Instrument
+from analogrig.hardware.instrument import Datasheet, DialChange, InputRecord, Instrument, PotBox
 from analogrig.hardware.scpi_connection import ScpiConnection
 from analogrig.links.wire import Clock
 from analogrig_emulator import Excitation
@@ -57,7 +57,7 @@ class RedPitaya(Instrument):
         self._clock = clock
         self.make_safe()
         self._scpi.send("*CLS")
-        self._box = self.pots = _PotBox.find(self._scpi)
+        self._box = self.pots = _ScpiPots.find(self._scpi)
 
     @classmethod
     def is_address(cls, address: str) -> bool:
@@ -230,7 +230,7 @@ def _host_and_port(address: str) -> tuple[str, int]:
     return str(split.hostname), split.port or PORT
 
 
-class _PotBox:
+class _ScpiPots(PotBox):
     """Pots on the instrument's own server."""
 
     def __init__(self, scpi: ScpiConnection, names: tuple[str, ...]) -> None:
@@ -239,7 +239,7 @@ class _PotBox:
         self._changes: tuple[DialChange, ...] = ()
 
     @classmethod
-    def find(cls, scpi: ScpiConnection) -> _PotBox | None:
+    def find(cls, scpi: ScpiConnection) -> _ScpiPots | None:
         """The box of an instrument, or None: without one, the first query has no answer, or an error."""
         scpi.send("POT:CATalog?")
         answer = scpi.ask("*OPC?")
@@ -249,7 +249,7 @@ class _PotBox:
         scpi.next_line("*OPC?")
         return None if answer.upper().startswith("ERR") else cls(scpi, tuple(answer.split(",")))
 
-    def turn(self, pot: str, dial: float) -> None:
+    def set_one(self, pot: str, dial: float) -> None:
         self._scpi.send(f"POT{self._number(pot)}:DIAL {dial:.12g}")
         self._scpi.check(f"set {pot} to {dial:.4g}")
 

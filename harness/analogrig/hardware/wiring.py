@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Self
 
+from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import Datasheet, find_driver
 from analogrig.hardware.pots import PotsDescription
@@ -28,8 +29,7 @@ class Stage:
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.gain) <= _MOST_GAIN:
             raise ValueError(f"gain must be within +-{_MOST_GAIN:g} and not 0, not {self.gain:g}")
-        if not abs(self.offset_v) <= _MOST_OFFSET_V:
-            raise ValueError(f"offset_v must be within +-{_MOST_OFFSET_V:g} V, not {self.offset_v:g}")
+        check_range(self, "offset_v", -_MOST_OFFSET_V, _MOST_OFFSET_V)
 
     def input_v(self, output_v: float) -> float:
         """Input voltage that gives an output voltage."""
@@ -54,10 +54,8 @@ class Input:
 
     def __post_init__(self) -> None:
         Stage(self.gain, self.offset_v)
-        if not abs(self.least_v) <= _MOST_VOLTS:
-            raise ValueError(f"least_v must be within +-{_MOST_VOLTS:g} V, not {self.least_v:g}")
-        if not 0.0 <= self.noise_lsb <= 1e5:
-            raise ValueError(f"noise_lsb must be 0 to 1e5, not {self.noise_lsb:g}")
+        check_range(self, "least_v", -_MOST_VOLTS, _MOST_VOLTS)
+        check_range(self, "noise_lsb", 0.0, 1e5)
 
     def ends_v(self, instrument: Datasheet) -> list[float]:
         """Lowest and highest voltage at the computer within the range of the input."""
@@ -129,9 +127,8 @@ class RealDescription:
         numbers = [wired.input for wired in self.inputs.values()]
         if len(set(numbers)) < len(numbers):
             raise ValueError(f"inputs: force and displacement cannot both be at input {numbers[0]}")
-        for name, least, most in (("settle_s", 0.0, 10.0), ("timeout_s", 0.01, 3600.0)):
-            if not least <= getattr(self, name) <= most:
-                raise ValueError(f"{name} must be {least:g} to {most:g}, not {getattr(self, name):g}")
+        check_range(self, "settle_s", 0.0, 10.0)
+        check_range(self, "timeout_s", 0.01, 3600.0)
 
     @property
     def pot_names(self) -> tuple[str, ...]:
