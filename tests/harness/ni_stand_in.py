@@ -1,4 +1,4 @@
-"""A stand-in for NI's Python package nidaqmx, which needs NI's driver: so much of it as ours uses.
+"""Stand-in for the parts of NI's Python package nidaqmx that the driver uses; the package needs NI's driver.
 
 Names and arguments are those of nidaqmx 1.7 (https://github.com/ni/nidaqmx-python).
 """
@@ -17,11 +17,11 @@ from analogrig_emulator import TICKS_PER_SAMPLE, Edges, Excitation, SuspensionCo
 
 
 class Error(Exception):
-    """The root of nidaqmx's errors, of which one without a number is raised where NI's driver is not installed."""
+    """Base of nidaqmx's errors; raised without a code if NI's driver is not installed."""
 
 
 class DaqError(Error):
-    """Many lines."""
+    """Error with a code and a message of several lines."""
 
     def __init__(self, message: str, error_code: int) -> None:
         super().__init__(message)
@@ -30,19 +30,19 @@ class DaqError(Error):
 
 @dataclass
 class Card:
-    """What the tasks of the stand-in act on: ao0 goes to an ideal computer, inputs see force and displacement."""
+    """Card whose ao0 drives an ideal computer, and whose inputs measure force and displacement."""
 
     bits: int = 16
     reach: float = 0.0
-    """By which fraction its converter takes more than the range."""
+    """Relative excess of the converter's range."""
     noise_v: float = 0.0
     gain: float = 1.0
-    """Between the computer and each of its inputs."""
+    """Gain between the computer and each input."""
     lost_n: int = 0
     failing: Error | None = None
-    """When a task is started."""
+    """Error raised when a task is started."""
     stale: bool = False
-    """It gives what it gave last."""
+    """True: each record repeats the first."""
     done: list[tuple[Any, ...]] = field(default_factory=list)
     output_v: float = 0.0
     levels: list[float] = field(default_factory=list)
@@ -53,11 +53,11 @@ class Card:
 
     @property
     def lsb_v(self) -> float:
-        """In its range of +-10 V."""
+        """Volts per code in the range +-10 V."""
         return 20.0 / (1 << self.bits) * (1.0 + self.reach)
 
     def measured(self, samples: int) -> NDArray[np.int64]:
-        """(2, n) codes."""
+        """Codes, (2, n)."""
         if self._last is None or not self.stale:
             computer = SuspensionComputer("front", opamp=preset("ideal"), sample_rate_hz=20e3)
             volts = self.gain * np.concatenate(list(computer.play(_Played(np.array(self.levels)), samples)))[:, :2]
@@ -68,7 +68,7 @@ class Card:
 
 
 class _Played(Excitation):
-    """An excitation that is whatever was written to the card."""
+    """Excitation with the levels written to the card."""
 
     def __init__(self, levels: NDArray[np.float64]) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ class _Played(Excitation):
 
 
 class Task:
-    """Of nidaqmx, on a card; its channels, timing, triggers and stream are itself."""
+    """Task of nidaqmx; its channels, timing, triggers and stream are the task itself."""
 
     def __init__(self, card: Card) -> None:
         self.card = card
@@ -135,7 +135,7 @@ class AnalogUnscaledReader:
 
 
 def library(card: Card) -> ModuleType:
-    """The module nidaqmx."""
+    """Module nidaqmx for a card."""
     module = ModuleType("nidaqmx")
     vars(module).update(
         Task=lambda: Task(card),

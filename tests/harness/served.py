@@ -1,4 +1,4 @@
-"""The emulated rig as an instrument in another process, for tests of what speaks to it."""
+"""Emulated rig served as an instrument in another process."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Served(NamedTuple):
     address: str
 
     def rigs_file(self, folder: Path, *, self_test: bool = False, more: str = "") -> Path:
-        """A rigs file with the rig ``bench``: this instrument, as it is wired when nothing is wrong with it."""
+        """Rigs file with the rig ``bench``: this instrument, correctly wired."""
         path = folder / "rigs.toml"
         path.write_text(RIG.format(address=self.address, self_test=str(self_test).lower()) + more)
         return path
@@ -38,6 +38,6 @@ class Served(NamedTuple):
 
 @contextlib.contextmanager
 def served(*arguments: str) -> Iterator[Served]:
-    """``analogrig serve`` with some arguments, listening; it is ended afterwards."""
+    """Run ``analogrig serve`` with some arguments until the end of the block."""
     with serving(*arguments) as instrument:
         yield Served(instrument.process, instrument.said["address"])

@@ -1,4 +1,4 @@
-"""Tweaks that pots without exact instants made while a record was taken, dated by its samples."""
+"""Pot changes at unknown instants of a record, dated by its samples."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RATE_HZ = 20e3
 
 @dataclasses.dataclass
 class Hand:
-    """Whoever needs so long for each turn."""
+    """Pots that take ``takes_s`` for each change."""
 
     clock: VirtualClock
     takes_s: float
@@ -35,7 +35,7 @@ class Hand:
 
 
 def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = False) -> HandChanges:
-    """By a hand in virtual time: each asked for when it was to be."""
+    """Changes made by hand in virtual time, each when it is due."""
     clock = VirtualClock()
     by_hand = HandChanges(Hand(clock, takes_s, slow), tweaks, RATE_HZ, clock, clock.advance)
     by_hand.make_all()
@@ -43,7 +43,7 @@ def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = Fals
 
 
 def taken(samples: int, *changes: Tweak) -> Signals:
-    """By the card of a machine of real components."""
+    """Signals of a machine of real components."""
     return play(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
 
 
@@ -51,7 +51,7 @@ def asked(sample: int, dials: Mapping[str, float], before: Plant, after: Plant) 
     return PlannedChange(sample, dials, before, after)
 
 
-def test_jump_is_dated_wherever_the_pot_was_between_question_and_answer() -> None:
+def test_jump_between_request_and_answer_is_dated() -> None:
     soft = FRONT.scaled("K", 0.7)
     signals = taken(4000, PotChange(1630, stiffness_n_per_m=soft.stiffness_n_per_m))
     (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(signals, first=5000)
@@ -87,8 +87,8 @@ def test_slow_hand_is_dated_from_begin_to_end() -> None:
     assert 300 < segment.ramp_n < 550
 
 
-def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
-    """Asked for 2000 samples apart; a search of the one never looks at samples in which the other may have been."""
+def test_two_changes_of_a_record_are_dated_separately() -> None:
+    """The changes are due 1700 samples apart; the search for one excludes samples in which the other may be."""
     soft = FRONT.scaled("K", 0.7)
     light = soft.scaled("M", 0.6)
     signals = taken(
@@ -103,21 +103,21 @@ def test_second_tweak_of_a_record_does_not_spoil_the_first() -> None:
         assert segment.earliest().start <= sample <= segment.latest().start
 
 
-def test_pot_that_did_not_move_is_a_change_that_nobody_has_seen() -> None:
+def test_pot_that_did_not_move_is_an_unseen_change() -> None:
     soft = FRONT.scaled("K", 0.7)
     (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(taken(4000), first=0)
     assert "shows that the plant has changed" in segment.unseen
     assert segment.start <= 1500 and segment.start + segment.ramp_n >= 1700
 
 
-def test_pot_that_is_turned_when_the_record_is_over_is_one_too() -> None:
+def test_change_after_the_end_of_the_record_is_unseen() -> None:
     soft = FRONT.scaled("K", 0.7)
     (segment,) = turned([asked(1500, {"K": 0.6}, FRONT, soft)], takes_s=0.01).date(taken(1100), first=0)
     assert "when the record was over" in segment.unseen
     assert segment.start < 1100
 
 
-def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
+def test_plant_between_two_jumps_has_the_first_change() -> None:
     after = FRONT.scaled("B", 0.7).scaled("K", 0.75)
     assert asked(0, {"K": 0.6, "B": 0.5}, FRONT, after).middle == FRONT.scaled("K", 0.75)
     assert asked(0, {"B": 0.5, "K": 0.6}, FRONT, after).middle == FRONT.scaled("B", 0.7)
@@ -125,7 +125,7 @@ def test_plant_between_two_jumps_has_the_first_pot_turned() -> None:
     assert np.isclose(asked(0, {"K": 0.6}, FRONT, FRONT.scaled("K", 0.75)).after.stiffness_n_per_m, 18375.0)
 
 
-def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> None:
+def test_two_changes_after_the_end_of_the_record_are_one() -> None:
     soft, light = FRONT.scaled("K", 0.7), FRONT.scaled("K", 0.7).scaled("M", 0.5)
     tweaks = [asked(2600, {"K": 0.6}, FRONT, soft), asked(2900, {"M": 0.5}, soft, light)]
     (segment,) = turned(tweaks, takes_s=0.01).date(taken(1100), first=0)
@@ -136,16 +136,16 @@ def test_two_pots_that_are_turned_when_the_record_is_over_are_one_change() -> No
 
 
 @pytest.mark.parametrize("clock", ["card", "free"])
-def test_turns_at_the_very_instants_that_are_told_are_not_doubted(clock: Clock) -> None:
-    """24 turns each. ``make bench ARGS=onset`` has 400."""
+def test_changes_at_the_scheduled_instants_are_not_contradicted(clock: Clock) -> None:
+    """Test 24 changes each. ``make bench ARGS=onset`` has 400."""
     for seed in range(3):
         several = Several.of(seed, clock)
         assert contradictions(several.signals, several.tweaks, first=0) == []
 
 
 @pytest.mark.parametrize("error_n", [-900, -250, -30, -2, 2, 30, 250, 900])
-def test_instant_that_is_wrong_is_doubted_wherever_the_pot_was_turned(error_n: int) -> None:
-    """K falls by a fifth while the mass is on its way."""
+def test_wrong_instant_is_contradicted_for_any_displacement(error_n: int) -> None:
+    """K falls by a fifth while the mass moves."""
     stiff = FRONT.scaled("K", 0.8)
     quiet = taken(4000)
     moving = 2004 + int(np.flatnonzero(np.abs(np.diff(quiet.force_n[2000:])) > 1000.0)[0])

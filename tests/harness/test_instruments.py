@@ -1,4 +1,4 @@
-"""What every driver of an instrument has to do: each at an ideal computer, its instrument in this process."""
+"""Requirements of every instrument driver, each tested on an ideal computer in this process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.harness.ni_stand_in import Card, library
 
 SAMPLES = 400
 AT_COMPUTER = Excitation(low_v=0.1, high_v=9.9, frequency_hz=100.0)
-"""Of the force, V."""
+"""Force at the computer, V."""
 
 
 def ideal(rate_hz: float) -> SuspensionComputer:
@@ -34,7 +34,7 @@ def ideal(rate_hz: float) -> SuspensionComputer:
 
 
 class InThisProcess(ScpiConnection):
-    """No line to wait for: what is said is answered when ``send`` returns."""
+    """Connection to an interpreter in this process; answers are complete when ``send`` returns."""
 
     def __init__(self, interpreter: Interpreter) -> None:
         self.name = "here"
@@ -52,13 +52,13 @@ class InThisProcess(ScpiConnection):
 
 
 class Bench(ABC):
-    """An instrument at an ideal computer, both inputs of it in the range of ``WORD``, which ends at ``END_V``."""
+    """Instrument at an ideal computer, both inputs in the range ``WORD``, whose end is ``END_V``."""
 
     WORD: str
     END_V: float
     INPUTS: tuple[int, int]
     GENERATOR: float
-    """Volts at the generator for one at the computer's force input."""
+    """Volts at the generator for one volt at the computer's force input."""
 
     @abstractmethod
     def opened(
@@ -72,10 +72,10 @@ class Bench(ABC):
 
     @abstractmethod
     def is_off(self) -> bool:
-        """Whether the generator is."""
+        """True if the generator is off."""
 
     def ready(self, **settings: Any) -> Instrument:
-        """Everything set for a record."""
+        """Instrument that is set for a record."""
         instrument = self.opened(**settings)
         instrument.set_inputs([(number, self.WORD) for number in self.INPUTS])
         low_v, high_v = (self.GENERATOR * volts for volts in (AT_COMPUTER.low_v, AT_COMPUTER.high_v))
@@ -96,7 +96,7 @@ class RedPitayaBench(Bench):
         stale: bool = False,
         faults: AcquisitionFaults | None = None,
     ) -> RedPitaya:
-        """A record is taken while the computer comes to rest, before each of those that are asked for."""
+        """Open the instrument. It takes a record of rest before each requested record."""
         noise_v = noise_lsb * 2.0 / (1 << 14)
         described = InstrumentDescription(
             Wiring(Booster(10.0), Amplifier(gain), Amplifier(gain)),
@@ -126,12 +126,12 @@ BENCHES: dict[str, Callable[[], Bench]] = {"redpitaya": RedPitayaBench, "nidaqmx
 
 @pytest.fixture(params=DRIVERS)
 def bench(request: pytest.FixtureRequest) -> Bench:
-    """A driver without one here cannot be tested, and fails."""
+    """Bench of a driver; a driver without one fails."""
     return BENCHES[request.param]()
 
 
 def exact(samples: int = SAMPLES) -> np.ndarray:
-    """(n, 2) volts at the computer."""
+    """Volts at the computer, (n, 2)."""
     return np.concatenate(list(ideal(20e3).play(AT_COMPUTER, samples)))[:, :2]
 
 
@@ -148,7 +148,7 @@ def exact(samples: int = SAMPLES) -> np.ndarray:
         ("nidaqmx://cDAQ1Mod1", "cDAQ1Mod1"),
     ],
 )
-def test_address_is_what_the_driver_of_the_scheme_takes(url: str, address: str) -> None:
+def test_address_is_passed_to_the_driver_of_the_scheme(url: str, address: str) -> None:
     kinds = {"redpitaya": RedPitaya, "nidaqmx": NiDaqmx}
     assert find_driver(url) == (kinds[url.partition(":")[0].lower()], address)
 
@@ -169,17 +169,15 @@ def test_address_is_what_the_driver_of_the_scheme_takes(url: str, address: str) 
         ("", "redpitaya://HOST[:PORT] or nidaqmx://CARD"),
     ],
 )
-def test_address_that_is_none_is_refused_with_the_form_of_one(url: str, form: str) -> None:
+def test_malformed_address_is_refused_with_the_right_form(url: str, form: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         find_driver(url)
     assert str(caught.value) == f"instrument {url!r}: give it as {form}"
 
 
 @pytest.mark.parametrize("address", ["ip:192.168.2.1", "usb:1.2.5", "ip:pluto.local"])
-def test_addresses_of_other_kinds_of_instruments_are_left_to_their_drivers(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those of libm2k have colons that are no port's."""
+def test_each_driver_checks_its_own_addresses(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Addresses of libm2k have colons that do not introduce a port."""
 
     class Adalm2000(NiDaqmx):
         @classmethod
@@ -193,7 +191,7 @@ def test_addresses_of_other_kinds_of_instruments_are_left_to_their_drivers(
 # ---- what it has
 
 
-def test_levels_beyond_the_generator_are_refused_with_both(bench: Bench) -> None:
+def test_levels_beyond_the_generator_are_refused_with_both_ranges(bench: Bench) -> None:
     kind = type(bench.opened())
     least_v, most_v = kind.datasheet.output_v
     kind.check(Excitation(low_v=least_v, high_v=most_v))
@@ -202,7 +200,7 @@ def test_levels_beyond_the_generator_are_refused_with_both(bench: Bench) -> None
             kind.check(Excitation(low_v=low_v, high_v=high_v))
 
 
-def test_record_is_what_the_computer_does_in_volts_and_in_codes(bench: Bench) -> None:
+def test_record_shows_the_computer_in_volts_and_codes(bench: Bench) -> None:
     """Exact to half a step of the converter, and to what the force's edge moves before the sample that shows it."""
     gain = 0.9 * bench.END_V / 10.0
     instrument = bench.ready(gain=gain)
@@ -214,7 +212,7 @@ def test_record_is_what_the_computer_does_in_volts_and_in_codes(bench: Bench) ->
     assert not record.clipped.any()
 
 
-def test_generator_is_on_in_a_record_alone(bench: Bench) -> None:
+def test_generator_is_on_during_records_only(bench: Bench) -> None:
     instrument = bench.ready()
     assert bench.is_off()
     instrument.record(SAMPLES)
@@ -223,7 +221,7 @@ def test_generator_is_on_in_a_record_alone(bench: Bench) -> None:
     assert bench.is_off()
 
 
-def test_somebody_else_may_act_while_a_record_is_taken(bench: Bench) -> None:
+def test_callback_runs_while_a_record_is_taken(bench: Bench) -> None:
     acted = []
     bench.ready().record(SAMPLES, lambda: acted.append(bench.is_off()))
     assert len(acted) == 1
@@ -233,7 +231,7 @@ def test_somebody_else_may_act_while_a_record_is_taken(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("reach", [-0.05, 0.0, 0.05])
-def test_sample_is_clipped_where_the_converter_ends_whatever_its_volts_say(reach: float, bench: Bench) -> None:
+def test_sample_is_clipped_at_the_end_of_the_converter_for_any_calibration(reach: float, bench: Bench) -> None:
     """The force goes to 1.02 of the range: a converter that takes 5 % more measures it, one that takes 5 % less clips
     at volts that lie within the range."""
     gain = 1.02 * bench.END_V / AT_COMPUTER.high_v
@@ -251,7 +249,7 @@ def differs(record: InputRecord, other: InputRecord) -> bool:
     return not np.array_equal(record.codes, other.codes)
 
 
-def test_record_that_was_given_before_is_told_by_its_bits(bench: Bench) -> None:
+def test_repeated_record_is_recognised_by_its_bits(bench: Bench) -> None:
     instrument = bench.ready(noise_lsb=0.5, stale=True)
     first = instrument.record(SAMPLES)
     instrument.rest(0.0)
@@ -260,7 +258,7 @@ def test_record_that_was_given_before_is_told_by_its_bits(bench: Bench) -> None:
     assert second.repeats
 
 
-def test_noise_makes_each_record_another(bench: Bench) -> None:
+def test_records_with_noise_differ(bench: Bench) -> None:
     instrument = bench.ready(noise_lsb=0.05)
     first, second = instrument.record(SAMPLES), instrument.record(SAMPLES)
     assert differs(first, second)
@@ -268,12 +266,12 @@ def test_noise_makes_each_record_another(bench: Bench) -> None:
     assert not second.repeats
 
 
-def test_what_a_red_pitaya_has_taken_at_rest_is_no_record() -> None:
+def test_record_taken_at_rest_is_stale_on_a_red_pitaya() -> None:
     at_rest = AcquisitionFaults(stale_n=1, drop_out_record=2)
     assert RedPitayaBench().ready(noise_lsb=0.5, faults=at_rest).record(SAMPLES).repeats
 
 
-def test_red_pitaya_that_has_a_record_before_it_could_is_found_out() -> None:
+def test_early_trigger_of_a_red_pitaya_is_a_stale_record() -> None:
     early = AcquisitionFaults(triggered_early=True)
     with pytest.raises(RecordStale, match=r"instrument here: stale record: ACQ:TRig:STAT\? answered 'TD'"):
         RedPitayaBench().ready(faults=early).record(SAMPLES)
@@ -282,7 +280,7 @@ def test_red_pitaya_that_has_a_record_before_it_could_is_found_out() -> None:
 # ---- pots
 
 
-def test_pots_are_turned_at_once_or_at_instants_of_the_next_record_alone() -> None:
+def test_pots_are_set_at_once_or_at_instants_of_the_next_record_only() -> None:
     instrument = RedPitayaBench().ready(gain=0.1)
     assert instrument.pots is not None
     still = instrument.record(SAMPLES)
@@ -297,7 +295,7 @@ def test_pots_are_turned_at_once_or_at_instants_of_the_next_record_alone() -> No
     np.testing.assert_allclose(again.volts, still.volts, atol=1e-3)
 
 
-def test_pot_that_cannot_stand_there_is_refused_by_name() -> None:
+def test_impossible_dial_is_refused_with_the_pot() -> None:
     instrument = RedPitayaBench().ready()
     assert instrument.pots is not None
     assert instrument.pots.names == ("M", "B", "K")

@@ -1,4 +1,4 @@
-"""The driver for cards of NI-DAQmx, against a stand-in for its Python package: NI's own needs NI's driver."""
+"""Driver for NI-DAQmx on a stand-in for NI's Python package, which needs NI's driver."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_output_and_inputs_run_on_one_clock_and_begin_together(card: Card) -> No
     assert ("trigger", "/Dev1/ai/StartTrigger") in card.done
 
 
-def test_levels_hold_from_each_edge_on() -> None:
+def test_levels_hold_from_edge_to_edge() -> None:
     levels = levels_v(Excitation(low_v=1.0, high_v=2.0, frequency_hz=5e3), 8).reshape(8, LEVELS_PER_SAMPLE)
     assert (levels == levels[:, :1]).all()
     assert levels[:, 0].tolist() == [2.0, 2.0, 1.0, 1.0, 2.0, 2.0, 1.0, 1.0]
@@ -99,7 +99,7 @@ def test_error_of_the_card_is_one_line_of_its_kind_and_the_output_is_left_at_0_v
     assert card.output_v == 0.0
 
 
-def test_without_the_driver_of_ni_the_rig_cannot_be_had(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_driver_of_ni_is_a_configuration_error(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_task() -> None:
         raise Error("Could not find an installation of NI-DAQmx.")
 
@@ -115,8 +115,8 @@ def test_record_that_is_too_short_is_an_error(card: Card, rigs_file: str) -> Non
         list(rig.perform(SCENARIO, 1).blocks)
 
 
-def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A card that gives its 12 bits at the upper end of 16 would else be read 16 times too large, and clip unseen."""
+def test_code_beyond_the_resolution_is_an_error(card: Card, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A card with its 12 bits at the upper end of 16 would otherwise be read 16 times too large, and clip unnoticed."""
     instrument = NiDaqmx(library(card), "Dev1", 1.0)
     instrument.set_inputs([(0, "10V"), (1, "10V")])
     instrument.set_excitation(SCENARIO.excitation)
@@ -125,7 +125,7 @@ def test_code_that_the_converter_does_not_have_is_an_error(card: Card, monkeypat
         instrument.record(100)
 
 
-def test_rig_tests_itself_well(card: Card, rigs_file: str) -> None:
+def test_self_test_passes(card: Card, rigs_file: str) -> None:
     file = Path(rigs_file)
     file.write_text(RIG.replace("self_test = false", "self_test = true"))
     with open_allowed(rigs_file) as rig:
@@ -135,7 +135,7 @@ def test_rig_tests_itself_well(card: Card, rigs_file: str) -> None:
     assert card.output_v == 0.0
 
 
-def test_without_the_package_the_line_that_installs_it_is_named(
+def test_missing_package_is_named_with_the_command_that_installs_it(
     rigs_file: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "nidaqmx", None)

@@ -1,4 +1,4 @@
-"""Pots that a command, a box at a serial line or an operator turns: real processes, real terminals."""
+"""Pots set by a command, a box on a serial line or an operator: real processes, real terminals."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_wrong_description_is_one_line_that_names_the_key(table: Mapping[str, An
     assert "\n" not in str(raised.value)
 
 
-def test_error_of_one_kind_is_not_those_of_all_the_others() -> None:
+def test_error_names_the_keys_of_the_chosen_kind_only() -> None:
     with pytest.raises(ConfigurationError) as raised:
         described(kind="serial", url="/dev/null", line="{pot} {dial}", retries=3)
     known = "steps, names, timeout_s, kind, url, baud, line, reply"
@@ -85,7 +85,7 @@ def test_error_of_one_kind_is_not_those_of_all_the_others() -> None:
 
 
 def script(folder: Path, body: str) -> list[str]:
-    """A program that keeps its arguments, one call a line, and then does what ``body`` says."""
+    """Program that appends its arguments to a file, one call a line, and then runs ``body``."""
     program = folder / "set_pot.py"
     program.write_text(
         f"import os, sys, time\nopen({str(folder / 'calls')!r}, 'a').write(repr(sys.argv[1:]) + '\\n')\n{body}"
@@ -97,7 +97,7 @@ def calls(folder: Path) -> list[str]:
     return (folder / "calls").read_text().splitlines()
 
 
-def test_command_is_given_each_pot_and_its_dial(tmp_path: Path) -> None:
+def test_command_receives_each_pot_and_its_dial(tmp_path: Path) -> None:
     pots = opened(
         kind="command", arguments=[*script(tmp_path, ""), "--pot={pot}", "{dial}", "{step}"], names={"K": "2"}
     )
@@ -110,13 +110,13 @@ def test_command_is_given_each_pot_and_its_dial(tmp_path: Path) -> None:
     ]
 
 
-def test_no_shell_reads_the_arguments(tmp_path: Path) -> None:
+def test_no_shell_interprets_the_arguments(tmp_path: Path) -> None:
     pots = opened(kind="command", arguments=[*script(tmp_path, ""), "{pot}", "{dial}; touch $HOME/x && `id` {oops"])
     pots.set({"K": 0.5}, WORDS, recording=True)
     assert calls(tmp_path) == ["['K', '0.5000; touch $HOME/x && `id` {oops']"]
 
 
-def test_command_that_fails_is_an_error_with_its_status_and_what_it_said(tmp_path: Path) -> None:
+def test_failed_command_is_an_error_with_status_and_output(tmp_path: Path) -> None:
     body = "print('no such pot'); sys.stderr.write('try 1 to 4\\n'); sys.exit(7)"
     pots = opened(kind="command", arguments=[*script(tmp_path, body), "{pot}", "{dial}"])
     with pytest.raises(RigError) as raised:
@@ -128,14 +128,14 @@ def test_command_that_fails_is_an_error_with_its_status_and_what_it_said(tmp_pat
     assert len(calls(tmp_path)) == 1, "the pot after one that failed was not to be touched"
 
 
-def test_command_that_is_killed_names_the_signal(tmp_path: Path) -> None:
+def test_killed_command_is_an_error_with_the_signal(tmp_path: Path) -> None:
     body = f"os.kill(os.getpid(), {int(signal.SIGKILL)})"
     pots = opened(kind="command", arguments=[*script(tmp_path, body), "{pot}", "{dial}"])
     with pytest.raises(RigError, match="ended with signal 9"):
         pots.set({"K": 0.5}, WORDS, recording=True)
 
 
-def test_command_that_hangs_is_killed_with_all_it_has_started(tmp_path: Path) -> None:
+def test_hanging_command_is_killed_with_its_children(tmp_path: Path) -> None:
     hanging = f"sleep 600 & echo $$ $! > {shlex.quote(str(tmp_path / 'pids'))}; wait"  # a shell is up at once
     pots = opened(kind="command", arguments=["sh", "-c", hanging, "{pot}", "{dial}"], timeout_s=5.0)
     with pytest.raises(RigError, match=r"pot K to 0\.5000: .*: not done within 5 s, killed"):
@@ -143,7 +143,7 @@ def test_command_that_hangs_is_killed_with_all_it_has_started(tmp_path: Path) ->
     assert all(ends(int(pid)) for pid in (tmp_path / "pids").read_text().split())
 
 
-def test_command_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> None:
+def test_missing_command_is_named(tmp_path: Path) -> None:
     pots = opened(kind="command", arguments=[str(tmp_path / "no-such-program"), "{pot}", "{dial}"])
     with pytest.raises(RigError, match=r"no-such-program K 0\.5000: cannot be started: No such file or directory"):
         pots.set({"K": 0.5}, WORDS, recording=True)
@@ -153,7 +153,7 @@ def test_command_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> 
 
 
 class Box:
-    """What is at the other end of a pseudo-terminal; answers each line with the next of ``answers``."""
+    """Box on a pseudo-terminal that answers each line with the next of ``answers``."""
 
     def __init__(self, *answers: bytes) -> None:
         self.heard: list[bytes] = []
@@ -205,7 +205,7 @@ def test_box_gets_a_line_for_each_pot_and_its_answers_are_checked(boxes: list[Bo
     assert box.heard == [b"W K 653\n", b"W B 834\n"]
 
 
-def test_box_that_says_nothing_is_not_waited_for(boxes: list[Box]) -> None:
+def test_box_without_replies_is_not_awaited(boxes: list[Box]) -> None:
     box = Box()
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot}={dial};")
@@ -214,7 +214,7 @@ def test_box_that_says_nothing_is_not_waited_for(boxes: list[Box]) -> None:
     pots.close()
 
 
-def test_box_that_refuses_is_an_error_with_its_words(boxes: list[Box]) -> None:
+def test_refusal_of_a_box_is_an_error_with_its_reply(boxes: list[Box]) -> None:
     box = Box(b"ERR locked\n")
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK")
@@ -225,7 +225,7 @@ def test_box_that_refuses_is_an_error_with_its_words(boxes: list[Box]) -> None:
     pots.close()
 
 
-def test_box_that_stops_in_the_middle_of_an_answer_is_not_waited_for_for_ever(boxes: list[Box]) -> None:
+def test_box_that_stops_within_a_reply_is_a_time_out(boxes: list[Box]) -> None:
     box = Box(b"O")
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK", timeout_s=2.0)
@@ -234,7 +234,7 @@ def test_box_that_stops_in_the_middle_of_an_answer_is_not_waited_for_for_ever(bo
     pots.close()
 
 
-def test_box_that_chatters_without_end_of_line_is_cut_off(boxes: list[Box]) -> None:
+def test_endless_reply_is_cut_off(boxes: list[Box]) -> None:
     box = Box(b"x" * 4096)
     boxes.append(box)
     pots = opened(kind="serial", url=box.url, line="{pot} {dial}\n", reply="OK")
@@ -243,7 +243,7 @@ def test_box_that_chatters_without_end_of_line_is_cut_off(boxes: list[Box]) -> N
     pots.close()
 
 
-def test_line_that_cannot_be_opened_is_an_error_of_the_rig() -> None:
+def test_missing_port_is_an_error_of_the_rig() -> None:
     with pytest.raises(RigError, match="pots: cannot open /dev/no-such-port: No such file or directory"):
         opened(kind="serial", url="/dev/no-such-port", line="{pot} {dial}\n")
 
@@ -278,7 +278,7 @@ def terminal() -> Iterator[Terminal]:
 
 
 def asked(terminal: Terminal, typed: bytes, *, turn: bool) -> tuple[str, list[BaseException]]:
-    """What an operator who answers so is shown, and what comes of it."""
+    """Prompt for an operator who types ``typed``, and the resulting errors."""
     pots = OperatorPots(kind="operator").open(terminal.path)
     failed: list[BaseException] = []
 
@@ -299,26 +299,26 @@ def asked(terminal: Terminal, typed: bytes, *, turn: bool) -> tuple[str, list[Ba
     return shown, failed
 
 
-def test_operator_is_told_what_to_set_and_waited_for(terminal: Terminal) -> None:
+def test_operator_is_prompted_and_awaited(terminal: Terminal) -> None:
     shown, failed = asked(terminal, b"\n", turn=False)
     assert shown == f"Set the pots to K 0.6380, B 0.8152 ({WORDS}), then press Enter: "
     assert not failed
 
 
-def test_operator_is_told_when_to_turn(terminal: Terminal) -> None:
+def test_operator_is_prompted_within_a_record(terminal: Terminal) -> None:
     shown, failed = asked(terminal, b"done\n", turn=True)
     assert shown.startswith("NOW turn to K 0.6380, B 0.8152")
     assert not failed
 
 
-def test_enter_from_before_the_question_answers_nothing(terminal: Terminal) -> None:
+def test_enter_typed_before_the_prompt_does_not_count(terminal: Terminal) -> None:
     terminal.type(b"\n\n")
     terminal.shown(b"\r\n\r\n")  # echoed: they wait in the terminal's input
     _, failed = asked(terminal, b"\n", turn=False)
     assert not failed
 
 
-def test_operator_who_leaves_is_an_error(terminal: Terminal) -> None:
+def test_end_of_input_is_an_error(terminal: Terminal) -> None:
     _, (failed,) = asked(terminal, b"\x04", turn=False)
     assert str(failed) == f"pots: the operator at {terminal.path} has left (end of input)"
 
@@ -326,6 +326,6 @@ def test_operator_who_leaves_is_an_error(terminal: Terminal) -> None:
 @pytest.mark.parametrize(
     ("path", "reason"), [("/dev/null", "is no terminal"), ("/nowhere/tty", "No such file or directory")]
 )
-def test_operator_without_a_terminal_is_refused_with_the_reason(path: str, reason: str) -> None:
+def test_operator_needs_a_terminal(path: str, reason: str) -> None:
     with pytest.raises(ConfigurationError, match=f'kind "operator" needs a terminal.*{reason}'):
         OperatorPots(kind="operator").open(Path(path))

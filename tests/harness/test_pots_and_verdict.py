@@ -1,4 +1,4 @@
-"""From a command that turns pots at instants nobody knows to the verdict: a real process, an emulated computer."""
+"""Pots set by a command at unknown instants, up to the verdict: a real process, an emulated computer."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
+from analogrig.devices.dut import open_dut
 from analogrig.hardware.instrument import InputRecord, Instrument
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.real import RealRig
@@ -25,15 +26,15 @@ from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 
 SAMPLES, ASKED_AT = 10_000, 3000
 INSTANTS = (3215, 3311)
-"""After which samples the pots do what they are told within a record, the first and the second; the force is high then.
-They are searched however long the process takes, so that all comes out the same every time."""
+"""Samples of a record after which the first and the second pot move; the force is high then. They do not depend on the
+duration of the process, so that results are reproducible."""
 
 BLOCK_N = 16
-"""Pots of the computer turn between blocks of so many samples."""
+"""Samples of a block; pots of the computer move between blocks."""
 
 
 class CardAndComputer(NiDaqmx):
-    """A card of 16 bits at a computer of real components, whose pots go where the command says."""
+    """Card of 16 bits at a computer of real components, whose pots the command sets."""
 
     def __init__(self, said: Path) -> None:
         Instrument.__init__(self, "card")
@@ -66,7 +67,7 @@ class CardAndComputer(NiDaqmx):
         return InputRecord(np.asarray(codes * lsb_v, np.float64), codes, self.datasheet.bits)
 
     def _heard(self) -> list[tuple[str, float]]:
-        """What the command was told, in order."""
+        """Arguments of the calls of the command, in order."""
         lines = self._said.read_text().splitlines() if self._said.exists() else []
         return [(pot, float(dial)) for pot, dial in map(str.split, lines)]
 
@@ -97,7 +98,7 @@ def described(program: Path) -> RealDescription:
 
 @pytest.fixture
 def program(tmp_path: Path) -> Path:
-    """Turns a pot: says which, and to what."""
+    """Program that records the pot and its dial."""
     out = tmp_path / "set-pot"
     out.write_text(f'#!/bin/sh\necho "$1 $2" >> {tmp_path / "said"}\n')
     out.chmod(out.stat().st_mode | stat.S_IXUSR)
@@ -113,7 +114,7 @@ def played(program: Path, tweak: Asked) -> Run:
         return Bench(rig, dut).play(scenario, seed=1)
 
 
-def test_instant_of_a_command_is_learned_and_the_device_is_judged_by_it(program: Path) -> None:
+def test_instant_of_a_command_is_dated_and_the_device_is_judged_by_it(program: Path) -> None:
     run = played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0))
     (tweak,) = judge(run).tweaks
     assert tweak.between[0] <= INSTANTS[0] <= tweak.between[1]
@@ -131,7 +132,7 @@ def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(progr
     assert judge(run).tweaks[0].result == "noticed"
 
 
-def test_command_that_turns_nothing_leaves_a_change_that_is_not_judged(program: Path) -> None:
+def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None:
     program.write_text("#!/bin/sh\nexit 0\n")
     verdict = judge(played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0)))
     assert verdict.tweaks[0].result == "not judged"

@@ -1,4 +1,4 @@
-"""Pots that others turn while a record is taken: the harness learns when, and judges with what it does not know."""
+"""Pots set by a user's command while a record is taken; the harness dates the change, and judges with its interval."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ with socket.create_connection((host, int(port))) as connection:
     lines.write(f"POT{number}:DIAL {dial}\\r\\nPOT{number}:DIAL?\\r\\n".encode()); lines.flush()
     assert abs(float(lines.readline()) - float(dial)) < 1e-3
 """
-"""What a user would write who has a box of digital pots at the network."""
+"""Program of a user with a box of digital pots on the network."""
 
 SCENARIO = dataclasses.replace(
     Scenario.load("thesis"),
@@ -59,7 +59,7 @@ def played(name: str) -> Run:
         return Bench(opened, dut).play(SCENARIO, 1)
 
 
-def test_instants_of_a_users_command_are_learned_and_the_run_is_judged(clocked: Served, tmp_path: Path) -> None:
+def test_instants_of_a_users_command_are_dated_and_the_run_is_judged(clocked: Served, tmp_path: Path) -> None:
     run = played(rig(clocked, tmp_path, PROGRAM))
     assert run.samples == SCENARIO.samples
     changes = run.conditions.segments[1:]
@@ -75,7 +75,7 @@ def test_instants_of_a_users_command_are_learned_and_the_run_is_judged(clocked: 
     assert verdict.outcome == "passed", verdict.reasons
 
 
-def test_pots_that_did_not_turn_are_found_out(clocked: Served, tmp_path: Path) -> None:
+def test_pots_that_did_not_move_are_detected(clocked: Served, tmp_path: Path) -> None:
     name = rig(clocked, tmp_path, PROGRAM)
     with open_allowed(name) as opened, open_dut("inproc") as dut:
         bench = Bench(opened, dut)

@@ -1,4 +1,4 @@
-"""The same scenarios on a real rig: proven against the emulator served as the instrument, in another process."""
+"""Real rig, tested on the emulator served as the instrument in another process."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def ideal() -> Iterator[Served]:
 
 @pytest.fixture
 def bench(ideal: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of a rig at the ideal instrument."""
+    """Name of a rig on the ideal instrument."""
     monkeypatch.setenv("ANALOGRIG_RIGS", str(ideal.rigs_file(tmp_path)))
     return "bench"
 
@@ -88,7 +88,7 @@ def test_verdicts_are_those_of_the_emulated_rig(bench: str) -> None:
 
 
 def test_each_play_begins_with_the_pots_of_its_scenario(ideal: Served, tmp_path: Path) -> None:
-    """Without noise all its records are the same, to the bit."""
+    """Records without noise are the same to the bit."""
     file = ideal.rigs_file(tmp_path)
     file.write_text(file.read_text().replace('range = "HV"', 'range = "HV", noise_lsb = 0.0'))
     with open_allowed(str(file)) as rig:
@@ -107,7 +107,7 @@ def test_scenario_longer_than_a_record_is_played_in_several(bench: str) -> None:
     assert verdict.estimates[-1].error["B"] == pytest.approx(0.0, abs=0.02)
 
 
-def test_records_keep_their_distance_from_tweaks() -> None:
+def test_records_start_well_before_changes() -> None:
     assert split_records(1000, 16_384, [500]) == [(0, 1000)]
     assert split_records(20_000, 16_384, []) == [(0, 16_384), (16_384, 20_000)]
     assert split_records(20_000, 16_384, [16_380]) == [(0, 16_380 - LEAD_N), (16_380 - LEAD_N, 20_000)]
@@ -121,14 +121,14 @@ WAVEFORMS = [
 
 
 @pytest.mark.parametrize("excitation", WAVEFORMS)
-def test_waveforms_are_those_that_were_asked_for(bench: str, excitation: Excitation) -> None:
+def test_waveforms_are_those_of_the_scenario(bench: str, excitation: Excitation) -> None:
     scenario = Scenario(600, excitation, name="waveform")
     with open_allowed(bench) as real, open_rig("emulator-ideal") as emulated:
         measured, exact = volts(real.perform(scenario, 1)), volts(emulated.perform(scenario, 1))
     np.testing.assert_allclose(measured, exact, atol=0.002)
 
 
-def test_stages_between_instrument_and_computer_are_taken_out(tmp_path: Path) -> None:
+def test_stages_between_instrument_and_computer_are_compensated(tmp_path: Path) -> None:
     stages = {"generator": (-10.0, 0.5), "force": (0.5, 0.0), "displacement": (-1.0, 0.25)}
     defects = [
         part
@@ -168,7 +168,7 @@ FAILURES = {
 }
 
 
-def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
+def test_slow_answer_is_a_time_out(tmp_path: Path) -> None:
     def drips(listening: socket.socket) -> None:
         connection, _ = listening.accept()
         with connection, contextlib.suppress(OSError):
@@ -188,7 +188,7 @@ def test_answer_that_drips_is_given_up_in_time(tmp_path: Path) -> None:
         thread.join(LONG_S)
 
 
-def test_instrument_belongs_to_one_who_plays(bench: str) -> None:
+def test_instrument_in_use_is_locked(bench: str) -> None:
     with open_allowed(bench) as first, open_allowed(bench) as second:
         next(first.perform(SHORT, 1).blocks)
         with pytest.raises(RigClosed, match="in use by another process or rig on this machine"):
@@ -197,18 +197,18 @@ def test_instrument_belongs_to_one_who_plays(bench: str) -> None:
         next(third.perform(SHORT, 1).blocks)
 
 
-def test_run_after_one_that_failed_is_a_good_one(tmp_path: Path) -> None:
+def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
     second = ("--defect", "acquisition.drop_out_record=2")
     with served("--defect", 'acquisition.drop_out="zeros"', *second) as instrument:
         file = instrument.rigs_file(tmp_path)
         with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
-            table = Bench(rig, dut)
-            outcomes = [judge(table.play(SHORT, 1)).outcome for _ in range(2)]
+            bench = Bench(rig, dut)
+            outcomes = [judge(bench.play(SHORT, 1)).outcome for _ in range(2)]
     assert outcomes == ["inconclusive", "passed"]
 
 
-def test_record_of_the_play_before_is_found_out(tmp_path: Path) -> None:
-    """The fourth that the instrument takes: before each of those that count there is one of rest."""
+def test_stale_record_of_an_earlier_play_is_detected(tmp_path: Path) -> None:
+    """The fourth record of the instrument is stale; a record of rest precedes each one that counts."""
     fourth = ("--defect", "acquisition.stale_n=2", "--defect", "acquisition.drop_out_record=4")
     with (
         served(*fourth) as instrument,
@@ -236,9 +236,7 @@ class DisplacedPots(PotBox):
 
 
 @pytest.mark.parametrize(("late_s", "said"), [(0.0, "nothing in the samples"), (60 / 20e3, "moved at 1260")])
-def test_pots_of_the_instrument_that_do_not_do_as_they_are_told_are_found_out(
-    late_s: float, said: str, bench: str
-) -> None:
+def test_displaced_changes_of_the_instrument_are_detected(late_s: float, said: str, bench: str) -> None:
     def connected(address: str, timeout_s: float) -> RedPitaya:
         instrument = RedPitaya.open(address, timeout_s)
         assert instrument.pots is not None
@@ -278,7 +276,7 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
     [(None, RigTimeout), (b"", RigClosed), (b"nonsense" * 300_000, RigError), (b"\n\n#9\n\xff\xff\n" * 50, RigError)],
     ids=["says nothing", "hangs up", "an answer without end", "nonsense"],
 )
-def test_what_is_no_instrument_is_a_named_error(answer: bytes | None, error: type[RigError], tmp_path: Path) -> None:
+def test_other_servers_are_a_named_error(answer: bytes | None, error: type[RigError], tmp_path: Path) -> None:
     def answers(listening: socket.socket) -> None:
         connection, _ = listening.accept()
         with connection:
@@ -300,7 +298,7 @@ def test_what_is_no_instrument_is_a_named_error(answer: bytes | None, error: typ
         thread.join(LONG_S)
 
 
-def test_nobody_there_is_one_clear_line_and_inconclusive(tmp_path: Path) -> None:
+def test_unreachable_instrument_is_one_line_and_inconclusive(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
     file = tmp_path / "rigs.toml"
@@ -326,7 +324,7 @@ def test_generator_is_off_while_the_device_works_and_afterwards(bench: str, idea
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_run_that_is_ended_leaves_the_generator_off(number: signal.Signals, tmp_path: Path) -> None:
+def test_interrupted_run_leaves_the_generator_off(number: signal.Signals, tmp_path: Path) -> None:
     silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
     with served(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
@@ -456,20 +454,20 @@ SICK = {
 
 
 @pytest.mark.parametrize("defect", SICK)
-def test_run_on_a_rig_that_is_not_well_is_inconclusive_and_says_why(defect: str, tmp_path: Path) -> None:
+def test_run_on_a_faulty_rig_is_inconclusive_with_the_reason(defect: str, tmp_path: Path) -> None:
     with served("--defect", defect) as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
 
 
-def test_noise_is_that_which_the_self_test_has_measured(tmp_path: Path) -> None:
+def test_noise_is_measured_by_the_self_test(tmp_path: Path) -> None:
     with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.0042]") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert run.conditions.channels["displacement"].noise_lsb == pytest.approx(0.0042 * (1 << 14) / 40.0, rel=0.05)
 
 
-def test_rig_with_drawn_components_is_judged_when_it_tests_well(tmp_path: Path) -> None:
+def test_rig_with_drawn_components_is_judged_after_a_good_self_test(tmp_path: Path) -> None:
     with served("--rig", "emulator-real") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert judge(run).outcome == "passed", judge(run).reasons
@@ -498,7 +496,7 @@ def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
     assert "13 passed, 3 skipped" in result.stdout  # what takes a million samples, and faults of a line that is none
 
 
-def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Path) -> None:
+def test_rig_with_fixed_pots_refuses_changes_beforehand(tmp_path: Path) -> None:
     name = described(tmp_path, lambda text: text.replace('pots.kind = "instrument"', 'pots.kind = "none"'))
     with open_allowed(name) as rig:
         assert "tweak" not in rig.capabilities
@@ -508,7 +506,7 @@ def test_rig_without_anybody_at_its_pots_refuses_tweaks_beforehand(tmp_path: Pat
             rig.perform(THESIS, 1)
 
 
-def test_rig_of_which_something_could_not_be_measured_is_not_judged_on(tmp_path: Path) -> None:
+def test_run_is_inconclusive_if_the_self_test_could_not_measure_everything(tmp_path: Path) -> None:
     with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.009]") as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"

@@ -71,7 +71,7 @@ def single(seed: int) -> Run:
         return Bench(rig, dut).play(dataclasses.replace(SCENARIO, samples=RECORD_N), seed)
 
 
-def test_device_begins_each_record_afresh(run: Run) -> None:
+def test_device_restarts_with_each_record(run: Run) -> None:
     first, second = single(0), single(1)
     assert run.conditions.records == (0, RECORD_N)
     np.testing.assert_array_equal(run.theta, np.concatenate((first.theta, second.theta)))
@@ -81,7 +81,7 @@ def test_device_begins_each_record_afresh(run: Run) -> None:
         assert count == first.conditions.counters[name] + second.conditions.counters[name]
 
 
-def test_each_record_is_judged_as_a_run_of_its_own(run: Run) -> None:
+def test_each_record_is_judged_as_a_separate_run(run: Run) -> None:
     whole, parts = judge(run), [judge(single(seed)) for seed in (0, 1)]
     assert whole.outcome == "passed"
     assert [tweak.sample for tweak in whole.tweaks] == [400, RECORD_N + 400]
@@ -90,14 +90,14 @@ def test_each_record_is_judged_as_a_run_of_its_own(run: Run) -> None:
     assert [(each.start, each.end) for each in whole.estimates] == [(0, 400), (400, 700), (700, 1100), (1100, 1400)]
 
 
-def test_alarm_of_the_next_record_detects_no_change_of_the_one_before(run: Run) -> None:
+def test_alarm_detects_no_change_of_an_earlier_record(run: Run) -> None:
     late = dataclasses.replace(run, alarm_index=np.array([RECORD_N + 5, RECORD_N + 405]))
     verdict = judge(dataclasses.replace(late, alarm_kind=run.alarm_kind[:2], alarm_statistic=run.alarm_statistic[:2]))
     assert verdict.tweaks[0].missed
     assert verdict.false_alarms == (RECORD_N + 5,)
 
 
-def test_records_survive_the_file_and_are_played_again(run: Run, tmp_path: Any) -> None:
+def test_records_are_saved_and_replayed(run: Run, tmp_path: Any) -> None:
     run.save(tmp_path / "run.npz")
     with RecordingRig.open(tmp_path / "run.npz") as rig, open_dut("inproc") as dut:
         again = Bench(rig, dut).play(rig.scenario(), 0)

@@ -1,11 +1,11 @@
-"""Clients that no server deserves; as a program, each of them for some seconds, with what the server needed for it.
+"""Hostile clients beside one well-behaved client; as a program, a table of the memory and time that each costs.
 
     python -m tests.served.hostile SECONDS SEED
 
-A witness speaks to the server at the same time, as one who means well would.
+A witness queries the server at the same time.
 """
 
-# ruff: noqa: S311, T201 - what is said is drawn from a seed and is no secret; a program prints
+# ruff: noqa: S311, T201 - input drawn from a seed is no secret; a program prints
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tests.served.talk import SEQUENCE
 
 IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 MOST_GROWTH_KB = 96 * 1024
-"""Of the resident memory, over that of a server that has taken a record: 16 clients with an answer each are 4 MB; the
-rest is the largest record, at a million samples a second."""
+"""Limit of the growth in resident memory after the first record: 4 MB for the answers of 16 clients; the rest for the
+largest record, at a million samples a second."""
 WITNESS_S = 10.0
-"""Processor time of the server until it answers: the commands of all clients before, a record's computation each."""
+"""Limit of the server's processor time per answer: commands of all clients before it, each computing a record."""
 LONG_LINE_BYTES = 10_000_000
 SILENT_BYTES = 30_000_000
-"""Of commands, more than the server's buffers and this machine's take from a client that never reads."""
+"""More commands than the buffers of server and system accept from a client that never reads."""
 
 WORDS = (
     *(line.partition(" ")[0] for line in SEQUENCE),
@@ -63,11 +63,11 @@ RIGHT = (
     *("POT1:DIAL 0", "POT1:DIAL 1", "POT2:DIAL 0", "POT3:DIAL 1", "POT:SCH 2,1,0", "POT:SCH 3,0,1e-5", "ACQ:STOP"),
     *("ACQ:DATA:FORMAT BIN", "ACQ:DATA:Units RAW", "ACQ:SOUR1:DATA?", "ACQ:SOUR2:DATA:STA:N? 5,7", "ACQ:TRig:STAT?"),
 )
-"""Commands that are understood, to the ends of what may be asked for."""
+"""Valid commands, up to the limits of their arguments."""
 
 
 def line(draw: random.Random) -> bytes:
-    """Mostly what the instrument understands, or nearly."""
+    """Random line, mostly of valid or almost valid commands."""
     if draw.random() < 0.1:
         return draw.randbytes(draw.choice((1, 10, 100, 5000))) + b"\n"
     units = []
@@ -85,14 +85,14 @@ def line(draw: random.Random) -> bytes:
 
 Stop = Callable[[], bool]
 Attack = Callable[[Served, random.Random, Stop], int]
-"""Goes on until it is told to stop, at least once; returns how often it did what it does."""
+"""Attack at least once, and until the stop. Return the number of attacks."""
 
 
 def talk(served: Served, draw: random.Random, stop: Stop) -> int:
-    """Lines by chance, and most answers are read."""
+    """Send random lines, and read most answers."""
     said = 0
     while True:
-        with _gone_is_gone(), served.connect() as connection:
+        with _ignore_disconnection(), served.connect() as connection:
             connection.settimeout(0.01)
             for _ in range(draw.randrange(1, 200)):
                 connection.sendall(line(draw))
@@ -105,7 +105,7 @@ def talk(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def talk_at_once(served: Served, draw: random.Random, stop: Stop) -> int:
-    """Several of them."""
+    """Run ``talk`` in several clients at once."""
     said: list[int] = []
     own = [random.Random(draw.random()) for _ in range(6)]
     clients = [
@@ -119,11 +119,11 @@ def talk_at_once(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def leave_half_open(served: Served, draw: random.Random, stop: Stop) -> int:
-    """Half a line, and then: close one way, vanish with a reset, or stay and say nothing more."""
+    """Send half a line, then close one way, reset the connection, or stay silent."""
     left: list[socket.socket] = []
     count = 0
     while True:
-        with _gone_is_gone():
+        with _ignore_disconnection():
             connection = served.connect()
             connection.sendall(draw.choice((b"", b"*IDN", b"OUTPUT1:STATE ON\nSOUR1:TRig:INT\nACQ:", line(draw)[:-1])))
             match draw.randrange(3):
@@ -146,9 +146,9 @@ def leave_half_open(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def read_slowly(served: Served, draw: random.Random, stop: Stop) -> int:
-    """A kilobyte at a time of answers of 100 kB."""
+    """Read answers of 100 kB a kilobyte at a time."""
     count = 0
-    with served.connect() as connection, _gone_is_gone():
+    with served.connect() as connection, _ignore_disconnection():
         connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
         connection.sendall(b"ACQ:SOUR1:DATA?;" * 200 + b"\n")
         while not stop() or count < 100:
@@ -158,10 +158,10 @@ def read_slowly(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def never_read(served: Served, draw: random.Random, stop: Stop) -> int:
-    """Large answers are asked for until nothing more is taken."""
+    """Query large answers until the server reads no more."""
     count = 0
     while True:
-        with served.connect() as connection, _gone_is_gone():
+        with served.connect() as connection, _ignore_disconnection():
             connection.settimeout(0.2)
             connection.sendall("".join(f"{command}\n" for command in SEQUENCE).encode())
             for _ in range(SILENT_BYTES // 4000):
@@ -172,7 +172,7 @@ def never_read(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
-    """10 MB without an end; then one line more, which is understood."""
+    """Send 10 MB without an end of line, then a valid line."""
     count = 0
     while True:
         client = served.client()
@@ -181,7 +181,7 @@ def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
             client.connection.sendall(chunk)
         client.say("", "")
         if client.ask("SYST:ERR?") != '-363,"Input buffer overrun"' or client.ask("*IDN?") != IDENTITY:
-            raise AssertionError("a line of 10 MB was not refused as one")
+            raise AssertionError("a line of 10 MB was not refused")
         client.close()
         count += 1
         if stop():
@@ -189,11 +189,11 @@ def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
 
 
 def connect_often(served: Served, draw: random.Random, stop: Stop) -> int:
-    """And go at once, or a little later."""
+    """Connect, and disconnect at once or a little later."""
     count = 0
     kept: list[socket.socket] = []
     while True:
-        with _gone_is_gone():
+        with _ignore_disconnection():
             kept.append(served.connect())
         count += 1
         if len(kept) > draw.randrange(1, 100):
@@ -216,36 +216,36 @@ ATTACKS: tuple[Attack, ...] = (
 
 
 @contextlib.contextmanager
-def _gone_is_gone() -> Iterator[None]:
-    """A server may hang up on clients like these, and turn them away."""
+def _ignore_disconnection() -> Iterator[None]:
+    """Ignore errors of a connection that the server has closed or refused."""
     with contextlib.suppress(OSError):
         yield
 
 
 @dataclass(frozen=True)
 class Survival:
-    """What an attack did, and what the server needed."""
+    """Cost of an attack for the server."""
 
     times: int
     grown_kb: int
     slowest_s: float
-    """In which the witness had its answer."""
+    """Longest time until the witness had its answer."""
 
 
 def warm(served: Served) -> None:
-    """What a server needs for its work at all: a record at the highest rate has been taken and read."""
+    """Take and read a record at the highest rate, so that the server has all the memory that it needs."""
     client = served.client()
     client.say(*SEQUENCE, "ACQ:DEC 125", "ACQ:START", "ACQ:TRig NOW")
     if len(client.ask("ACQ:SOUR1:DATA?")) < 16384:
-        raise AssertionError("it takes no record")
+        raise AssertionError("no record")
     client.say("*RST")
     client.close()
 
 
-def survived(served: Served, attack: Attack, seed: int, seconds: float) -> Survival:
+def survive(served: Served, attack: Attack, seed: int, seconds: float) -> Survival:
     """Attack a server that is warm.
 
-    :raises AssertionError: it does not answer the witness, or needs too much memory.
+    :raises AssertionError: the witness gets no answer, or the memory grows too much.
     """
     before_kb = served.most_resident_kb
     until_s = time.monotonic() + seconds
@@ -266,23 +266,25 @@ def survived(served: Served, attack: Attack, seed: int, seconds: float) -> Survi
 
 
 def _watch(served: Served, done: threading.Event, slowest_s: list[float], failures: list[str]) -> None:
-    """Ask again and again, and once more at the end."""
+    """Query repeatedly, and once more at the end."""
     over = False
     while not over and not failures:
         over = done.wait(0.02)
         begun_s, worked_s = time.monotonic(), served.processor_s
         try:
-            heard = _asked(served)
+            heard = _query(served)
         except OSError as error:
             heard = repr(error)
         waited_s, worked_s = time.monotonic() - begun_s, served.processor_s - worked_s
         slowest_s[0] = max(slowest_s[0], waited_s)
         if heard != IDENTITY or worked_s > WITNESS_S:
-            failures.append(f"the witness heard {heard!r} after {waited_s:.1f} s and {worked_s:.1f} s of the processor")
+            failures.append(
+                f"the witness received {heard!r} after {waited_s:.1f} s and {worked_s:.1f} s of the processor"
+            )
 
 
-def _asked(served: Served) -> str:
-    """When all places are taken, one who means well comes again."""
+def _query(served: Served) -> str:
+    """Query the identity; retry while all places are taken."""
     deadline_s = time.monotonic() + LONG_S
     while True:
         client = served.client()
@@ -298,12 +300,12 @@ def _asked(served: Served) -> str:
 
 
 def main(seconds: float, seed: int) -> None:
-    """One table; a fault is an exception."""
+    """Print a table; raise AssertionError at the first failure."""
     print(f"{'client':18} {'times':>9} {'grown kB':>9} {'slowest answer s':>17}")
     with serving() as served:
         warm(served)
         for attack in ATTACKS:
-            survival = survived(served, attack, seed, seconds)
+            survival = survive(served, attack, seed, seconds)
             print(
                 f"{attack.__name__:18} {survival.times:9d} {survival.grown_kb:9d} {survival.slowest_s:17.2f}",
                 flush=True,

@@ -21,11 +21,11 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class Served:
-    """A server at work."""
+    """Running server."""
 
     process: subprocess.Popen[str]
     said: dict[str, Any]
-    """When it began."""
+    """First line of its output."""
 
     @property
     def port(self) -> int:
@@ -39,19 +39,19 @@ class Served:
 
     @property
     def most_resident_kb(self) -> int:
-        """Of its memory, the most that has been resident."""
+        """Largest resident memory so far."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0])
 
     @property
     def processor_s(self) -> float:
-        """Processor time of the server: on a busy machine an answer takes longer, but no more of it."""
+        """Processor time of the server, which does not depend on the load of the machine."""
         times = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
         return (int(times[11]) + int(times[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class Client:
-    """Says lines, hears lines."""
+    """Client that sends and receives lines."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection = connection
@@ -65,7 +65,7 @@ class Client:
         return self._heard.readline().decode("ascii").removesuffix("\r\n")
 
     def rest(self) -> bytes:
-        """All that comes before the other end is gone."""
+        """Everything received until the connection is closed."""
         return self._heard.read()
 
     def close(self) -> None:
@@ -75,19 +75,22 @@ class Client:
 
 @contextmanager
 def serving(*options: str) -> Iterator[Served]:
-    """On any free port, until the end of the block."""
+    """Serve on a free port until the end of the block."""
     command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--json", *options]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None:
-                raise RuntimeError("it has no standard output")
+                raise RuntimeError("no standard output")
             yield Served(process, json.loads(process.stdout.readline()))
         finally:
             process.kill()
 
 
 def ended(served: Served, statuses: Sequence[int] = (0,)) -> str:
-    """What it has said on standard error; its end must be one of these."""
+    """Await the end of a server. Return its standard error.
+
+    :raises AssertionError: another exit status than those expected.
+    """
     _, said = served.process.communicate(timeout=LONG_S)
     if served.process.returncode not in statuses:
         raise AssertionError(f"ended with {served.process.returncode}: {said}")

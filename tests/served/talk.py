@@ -1,4 +1,4 @@
-"""Speaking to the served instrument in its own language, in this process."""
+"""SCPI dialogue with the served instrument in this process."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ SEQUENCE = (
     "OUTPUT1:STATE ON",
     "SOUR1:TRig:INT",
 )
-"""As Red Pitaya publishes it for generator and acquisition together, with a x10 stage behind the generator."""
+"""Sequence that Red Pitaya publishes for generator and acquisition together, with a x10 stage behind the generator."""
 POINT_SAMPLES = tuple("ACQ:AVG OFF" if line == "ACQ:AVG ON" else line for line in SEQUENCE)
-"""The same, each sample taken at an instant, as a card does."""
+"""The same with point samples, as a card takes them."""
 
 Ask = Callable[[str], str]
 
@@ -49,7 +49,7 @@ def interpreter(
 
 
 def asking(interpreter: Interpreter) -> Ask:
-    """A line goes in, what comes back is returned without its end."""
+    """Function that sends a line and returns the response without its end."""
 
     def ask(line: str) -> str:
         return b"".join(interpreter.enter(line.encode())).decode("ascii").removesuffix("\r\n")
@@ -69,6 +69,6 @@ def numbers(answer: str) -> NDArray[np.float64]:
 
 
 def record(ask: Ask) -> NDArray[np.float64]:
-    """Of both channels, V."""
+    """Record of both channels, volts, (n, 2)."""
     assert ask("ACQ:TRig:STAT?") == "TD" and ask("ACQ:TRig:FILL?") == "1"
     return np.stack([numbers(ask(f"ACQ:SOUR{channel}:DATA?")) for channel in (1, 2)], axis=1)

@@ -1,4 +1,4 @@
-"""What stands on the table: time, generator, pots and leads, against the emulator played directly."""
+"""Wired computer of the simulator against the emulator played directly: time, generator, pots and leads."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def wired(wiring: Wiring | None = None) -> WiredComputer:
     return WiredComputer(front, wiring or Wiring(), RATE_HZ)
 
 
-def test_wired_computer_gives_what_the_computer_gives_however_it_is_looked_at() -> None:
+def test_signals_are_those_of_the_emulator_for_any_division_into_runs() -> None:
     computer = wired()
     computer.generate(SQUARE)
     parts = [computer.run(count) for count in (1, 0, 7, 199, 1000, 793)]
     assert np.array_equal(np.concatenate(parts), played(2000))
 
 
-def test_a_long_look_is_played_in_parts_that_cannot_be_seen() -> None:
+def test_long_run_is_played_in_chunks_without_seams() -> None:
     computer = wired()
     computer.generate(SQUARE)
     assert np.array_equal(computer.run(CHUNK_N + 1000), played(CHUNK_N + 1000))
 
 
-def test_a_pot_turns_right_after_the_set_rate_or_before_its_instant_and_in_order_of_time() -> None:
+def test_scheduled_changes_are_made_in_order_of_time_after_the_point_at_or_before_each() -> None:
     computer = wired()
     computer.generate(SQUARE)
     computer.schedule(
@@ -48,7 +48,7 @@ def test_a_pot_turns_right_after_the_set_rate_or_before_its_instant_and_in_order
     assert np.abs(computer.run(1500) - played(1500, tweaks)).max() < ROUNDING_V
 
 
-def test_a_pot_that_is_turned_at_once_stays_there() -> None:
+def test_pot_set_at_once_stays_there() -> None:
     computer = wired()
     computer.generate(SQUARE)
     first = computer.run(500)
@@ -60,7 +60,7 @@ def test_a_pot_that_is_turned_at_once_stays_there() -> None:
     )
 
 
-def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest() -> None:
+def test_silenced_generator_gives_0_v_and_the_computer_comes_to_rest() -> None:
     computer = wired()
     computer.generate(SQUARE)
     computer.run(100)
@@ -71,7 +71,7 @@ def test_a_generator_that_is_silenced_gives_0_v_and_the_computer_comes_to_rest()
     assert np.abs(volts[-1]).max() < 0.01
 
 
-def test_leads_have_gain_offset_and_limits_and_may_be_swapped() -> None:
+def test_leads_have_gain_offset_and_limits_and_can_be_swapped() -> None:
     force, displacement = Amplifier(gain=-0.5, offset_v=0.25), Amplifier(offset_v=-1.0, limits_v=(-0.5, 3.0))
     computer = wired(Wiring(force=force, displacement=displacement, swapped=True))
     computer.generate(SQUARE)
@@ -82,14 +82,14 @@ def test_leads_have_gain_offset_and_limits_and_may_be_swapped() -> None:
     assert seen[:, 0].max() == 3.0 and seen[:, 0].min() == -0.5
 
 
-def test_the_booster_multiplies_shifts_and_limits_what_the_generator_gives() -> None:
+def test_booster_applies_gain_offset_and_limits() -> None:
     computer = wired(Wiring(generator=Booster(gain=8.0, offset_v=0.5, limits_v=(-1.0, 7.0))))
     computer.generate(SQUARE)
     assert sorted(set(np.round(computer.run(1000)[:, 0], 9))) == [0.58, 7.0]
 
 
-def test_another_rate_leaves_generator_pots_and_turns_as_they_are() -> None:
-    """The computer begins from rest: after 15 ms nothing is left of that."""
+def test_another_rate_keeps_generator_pots_and_schedule() -> None:
+    """The computer starts from rest; its transient is over after 15 ms."""
     computer = wired()
     computer.generate(SQUARE)
     computer.turn("B", 0.8)
@@ -104,7 +104,7 @@ def test_another_rate_leaves_generator_pots_and_turns_as_they_are() -> None:
     assert computer.dials["K"] == pytest.approx(0.6, abs=1e-3)
 
 
-def test_the_next_period_of_the_generator_is_known() -> None:
+def test_points_to_the_next_period_are_counted() -> None:
     computer = wired()
     assert computer.points_to_period() is None
     computer.generate(SQUARE)
@@ -115,7 +115,7 @@ def test_the_next_period_of_the_generator_is_known() -> None:
     assert computer.points_to_period() == 0
 
 
-def test_a_generator_that_is_too_fast_for_the_looks_is_refused_and_goes_on_as_it_was() -> None:
+def test_waveform_too_fast_for_the_rate_is_refused_and_the_generator_continues() -> None:
     computer = wired()
     computer.generate(SQUARE)
     with pytest.raises(EmulatorError, match="half the sample rate"):
@@ -129,6 +129,6 @@ def test_a_generator_that_is_too_fast_for_the_looks_is_refused_and_goes_on_as_it
     ("field", "value"),
     [("gain", 1e4), ("gain", float("nan")), ("offset_v", 2e3), ("limits_v", (1.0, 1.0)), ("limits_v", (0.0, 1e4))],
 )
-def test_a_stage_that_cannot_be_is_refused(field: str, value: object) -> None:
+def test_stage_out_of_range_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValueError, match=field):
         Amplifier(**{field: value})  # type: ignore[arg-type]

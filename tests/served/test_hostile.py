@@ -1,4 +1,4 @@
-"""Whatever comes in, the instrument answers by the rules of its language, and goes on; longer: `make fuzz-serve`."""
+"""Malformed input and hostile clients; `make fuzz-serve` runs longer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from analogrig.hardware.simulator.scpi import MOST_ERRORS
 from tests.harness.processes import LONG_S
-from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survived, warm
+from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survive, warm
 from tests.served.serving import Served, ended, serving
 from tests.served.talk import SEQUENCE, asking, interpreter, record, say
 
@@ -22,14 +22,14 @@ values = st.one_of(
     st.sampled_from(VALUES), st.floats().map(repr), st.integers().map(str), st.text(st.characters(codec="ascii"))
 )
 commands = st.builds(lambda word, value: f"{word} {value}".encode(), st.sampled_from(WORDS), values)
-"""What the instrument understands, or nearly."""
+"""Valid and almost valid commands."""
 right = st.sampled_from(RIGHT).map(lambda command: f":{command}".encode())
 lines = st.one_of(st.binary(max_size=300), right, st.lists(st.one_of(commands, right), max_size=8).map(b";".join))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(lines, max_size=12))
-def test_whatever_is_said_is_answered_with_whole_lines_or_an_error_and_the_next_record_is_right(
+def test_random_input_gets_whole_lines_or_errors_and_the_next_record_is_right(
     said: list[bytes],
 ) -> None:
     speaking = interpreter()
@@ -50,14 +50,14 @@ def served() -> Iterator[Served]:
         warm(served)
         yield served
         served.process.terminate()
-        assert ended(served) == "", "nothing is complained of"
+        assert ended(served) == "", "standard error is empty"
 
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
-def test_a_server_survives_with_bounded_memory_and_answers_others_meanwhile(served: Served, attack: Attack) -> None:
-    assert survived(served, attack, seed=1, seconds=0.5).times > 0
+def test_server_survives_with_bounded_memory_and_answers_other_clients(served: Served, attack: Attack) -> None:
+    assert survive(served, attack, seed=1, seconds=0.5).times > 0
     client = served.client()
     deadline_s = time.monotonic() + LONG_S
     while client.ask("*IDN?;OUTPUT1:STATE?") != f"{IDENTITY};OFF":
-        assert time.monotonic() < deadline_s, "whoever drove the generator is gone, and so are the lines it left"
+        assert time.monotonic() < deadline_s, "the output is off once its client is gone"
     client.close()

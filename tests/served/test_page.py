@@ -22,14 +22,14 @@ def block(language: str) -> str:
     return str(re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[0])
 
 
-def test_the_table_of_what_can_be_wrong_has_every_key_with_its_default() -> None:
+def test_table_of_faults_has_every_key_with_its_default() -> None:
     table = tomllib.loads(block("toml"))["instrument"]
     assert config.build(InstrumentDescription, table, "page") == InstrumentDescription()
     known = dataclasses.asdict(InstrumentDescription())
     assert {name: set(part) for name, part in table.items()} == {name: set(part) for name, part in known.items()}
 
 
-def test_the_example_runs_as_it_stands(tmp_path: Path) -> None:
+def test_example_runs_unchanged(tmp_path: Path) -> None:
     with serving("--rig", "emulator-ideal") as served:
         program = block("python").replace("5000", str(served.port))
         program += "assert len(force_v) == len(displacement_v) == 16384 and 9.8 < max(force_v) < 10.0\n"

@@ -1,4 +1,4 @@
-"""The instrument, by its commands: what it reads is what the emulator gives, within half a code of its 14 bits."""
+"""Commands of the instrument; its records are those of the emulator within half a code of 14 bits."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from analogrig_emulator import Excitation, PotChange, SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14
-"""Of +-20 V on 14 bits."""
+"""Resolution of +-20 V on 14 bits."""
 ROUNDED_V = 0.5 * LSB_V + 6e-5
 """Half a code, and six digits."""
 EXCITATION = Excitation("square", 0.1, 9.9, 100.0, clock="free")
@@ -33,7 +33,7 @@ def played(
     per_sample: int = 1,
     excitation: Excitation = EXCITATION,
 ) -> NDArray[np.float64]:
-    """Force and displacement of the emulator itself, so many times a sample of the instrument."""
+    """Force and displacement of the emulator itself, several points per sample of the instrument."""
     computer = front(RATE_HZ * per_sample)
     return np.concatenate(list(computer.play(excitation, samples * per_sample, tweaks)))[:, :2]
 
@@ -50,12 +50,12 @@ def error(ask: Ask) -> int:
 # ---- records
 
 
-def test_samples_at_instants_are_those_of_the_emulator_within_half_a_code(ask: Ask) -> None:
+def test_point_samples_are_those_of_the_emulator_within_half_a_code(ask: Ask) -> None:
     say(ask, POINT_SAMPLES)
     assert np.abs(record(ask) - played()).max() < ROUNDED_V
 
 
-def test_samples_that_are_averages_are_those_of_the_emulator_in_between(ask: Ask) -> None:
+def test_averaged_samples_are_means_of_the_emulator_in_between(ask: Ask) -> None:
     say(ask, SEQUENCE)
     mean = played(per_sample=8).reshape(BUFFER_N, 8, 2).mean(axis=1)
     assert np.abs(record(ask) - mean).max() < ROUNDED_V
@@ -86,7 +86,7 @@ def test_ascii_and_binary_raw_and_volts_are_the_same_record() -> None:
         assert np.array_equal(numbers(asking(speaking)(f"ACQ:SOUR{channel}:DATA?")), codes)
 
 
-def test_part_of_a_record_can_be_asked_for(ask: Ask) -> None:
+def test_part_of_a_record_can_be_read(ask: Ask) -> None:
     say(ask, SEQUENCE)
     whole = record(ask)
     assert np.array_equal(numbers(ask("ACQ:SOUR2:DATA:STA:N? 16000,384")), whole[16000:, 1])
@@ -95,19 +95,19 @@ def test_part_of_a_record_can_be_asked_for(ask: Ask) -> None:
     assert ask("ACQ:SOUR2:DATA:STArt:N? 16000,385") == "" and error(ask) == -222
 
 
-def test_the_trigger_is_in_the_middle_of_the_record_without_a_delay(ask: Ask) -> None:
+def test_trigger_is_in_the_middle_of_the_record_without_a_delay(ask: Ask) -> None:
     say(ask, [line.replace("DLY 8192", "DLY 0") for line in POINT_SAMPLES])
     volts = record(ask)
     assert np.abs(volts[:MIDDLE_N]).max() < ROUNDED_V
     assert np.abs(volts[MIDDLE_N:] - played(MIDDLE_N)).max() < ROUNDED_V
 
 
-def test_a_delay_beyond_the_buffer_skips_what_comes_first(ask: Ask) -> None:
+def test_delay_beyond_the_buffer_skips_the_first_samples(ask: Ask) -> None:
     say(ask, [line.replace("DLY 8192", "DLY 10000") for line in POINT_SAMPLES])
     assert np.abs(record(ask) - played(BUFFER_N + 1808)[1808:]).max() < ROUNDED_V
 
 
-def test_a_long_delay_is_waited_for_by_asking_whether_the_buffer_is_full(ask: Ask) -> None:
+def test_long_delay_passes_while_the_fill_state_is_polled(ask: Ask) -> None:
     """Five records beyond the first: 8192 + 81,920 samples are between trigger and the end."""
     say(ask, [line.replace("DLY 8192", f"DLY {MIDDLE_N + 5 * BUFFER_N}") for line in POINT_SAMPLES])
     assert ask("ACQ:TRig:STAT?") == "TD"
@@ -116,7 +116,7 @@ def test_a_long_delay_is_waited_for_by_asking_whether_the_buffer_is_full(ask: As
     assert np.abs(record(ask) - played(6 * BUFFER_N)[5 * BUFFER_N :]).max() < ROUNDED_V
 
 
-def test_a_record_that_is_being_taken_begins_anew_with_another_rate(ask: Ask) -> None:
+def test_another_rate_restarts_the_record(ask: Ask) -> None:
     say(ask, [line.replace("DLY 8192", "DLY 60000") for line in POINT_SAMPLES])
     say(ask, ["ACQ:DEC 625"])
     assert [ask("ACQ:TRig:STAT?") for _ in range(9)] == ["WAIT"] * 9
@@ -124,14 +124,14 @@ def test_a_record_that_is_being_taken_begins_anew_with_another_rate(ask: Ask) ->
     assert record(ask).shape == (BUFFER_N, 2)
 
 
-def test_a_generator_that_runs_triggers_with_its_next_period(ask: Ask) -> None:
+def test_running_generator_triggers_with_its_next_period(ask: Ask) -> None:
     say(ask, POINT_SAMPLES)
     say(ask, ["ACQ:START", "ACQ:TRig AWG_PE"])
     force = record(ask)[:, 0]
     assert np.abs(force - played()[:, 0]).max() < ROUNDED_V
 
 
-def test_a_period_longer_than_a_record_is_waited_for_by_asking_again(ask: Ask) -> None:
+def test_period_longer_than_a_record_passes_while_the_trigger_is_polled(ask: Ask) -> None:
     say(ask, [*POINT_SAMPLES, "SOUR1:FREQ:FIX 0.2", "ACQ:START", "ACQ:TRig:DLY 8192", "SOUR1:TRig:INT"])
     ask("ACQ:STOP")  # what has been in time is gone
     say(ask, ["ACQ:START", "ACQ:TRig NOW", "ACQ:START", "ACQ:TRig AWG_PE"])
@@ -146,14 +146,14 @@ def test_a_period_longer_than_a_record_is_waited_for_by_asking_again(ask: Ask) -
 @pytest.mark.parametrize(
     ("trigger", "rises"), [("CH1_PE", True), ("CH1_NE", False), ("CH2_PE", True), ("CH2_NE", False)]
 )
-def test_a_level_triggers_where_it_is_crossed(ask: Ask, trigger: str, *, rises: bool) -> None:
+def test_level_triggers_where_it_is_crossed(ask: Ask, trigger: str, *, rises: bool) -> None:
     say(ask, [*POINT_SAMPLES, "ACQ:TRig:LEV 3", "ACQ:TRig:DLY 0", "ACQ:START", f"ACQ:TRig {trigger}"])
     seen = record(ask)[:, int(trigger[2]) - 1]
     before, at = seen[MIDDLE_N - 1], seen[MIDDLE_N]
     assert (before < 3.0 <= at) if rises else (before > 3.0 >= at)
 
 
-def test_a_level_that_is_never_crossed_is_waited_for_and_given_up(ask: Ask) -> None:
+def test_level_that_is_never_crossed_never_triggers(ask: Ask) -> None:
     say(ask, [*POINT_SAMPLES, "ACQ:TRig:LEV 15", "ACQ:START", "ACQ:TRig CH2_PE"])
     assert [ask("ACQ:TRig:STAT?") for _ in range(3)] == ["WAIT"] * 3
     assert ask("ACQ:TRig:FILL?") == "0"
@@ -162,8 +162,8 @@ def test_a_level_that_is_never_crossed_is_waited_for_and_given_up(ask: Ask) -> N
     assert record(ask).shape == (BUFFER_N, 2)
 
 
-def test_a_delay_that_is_changed_while_a_trigger_is_awaited_counts(ask: Ask) -> None:
-    """8192 samples before the trigger are in the record although none were asked for when the wait began."""
+def test_delay_changed_before_the_trigger_applies(ask: Ask) -> None:
+    """The record has 8192 samples before the trigger, although the delay excluded them when the wait began."""
     lines = list(POINT_SAMPLES)
     lines.insert(lines.index("ACQ:TRig AWG_PE") + 1, "ACQ:TRig:DLY 0")
     say(ask, lines)
@@ -172,7 +172,7 @@ def test_a_delay_that_is_changed_while_a_trigger_is_awaited_counts(ask: Ask) -> 
     assert np.abs(volts[MIDDLE_N:] - played(MIDDLE_N)).max() < ROUNDED_V
 
 
-def test_a_trigger_without_a_start_is_a_conflict(ask: Ask) -> None:
+def test_trigger_without_a_start_is_a_conflict(ask: Ask) -> None:
     assert ask("ACQ:TRig NOW") == "" and error(ask) == -221
 
 
@@ -183,7 +183,7 @@ def test_ranges_clip_at_their_ends(ask: Ask) -> None:
     assert displacement.max() == pytest.approx(1.0 - 2.0 / 2**14, abs=1e-6)
 
 
-def test_a_record_keeps_the_range_with_which_it_was_taken(ask: Ask) -> None:
+def test_record_keeps_its_range(ask: Ask) -> None:
     say(ask, SEQUENCE)
     before = record(ask)
     say(ask, ["ACQ:SOUR1:GAIN LV"])
@@ -191,17 +191,17 @@ def test_a_record_keeps_the_range_with_which_it_was_taken(ask: Ask) -> None:
 
 
 @pytest.mark.parametrize(("decimation", "rate"), [(6250, "20000 Hz"), (125, "1000000 Hz"), (65536, "1907.34863 Hz")])
-def test_the_rate_is_125_mhz_through_the_decimation(ask: Ask, decimation: int, rate: str) -> None:
+def test_rate_is_125_mhz_divided_by_the_decimation(ask: Ask, decimation: int, rate: str) -> None:
     say(ask, [f"ACQ:DEC {decimation}"])
     assert ask("ACQ:SRATe?") == rate
 
 
-def test_a_faster_record_shows_the_same_computer(ask: Ask) -> None:
+def test_faster_record_shows_the_same_computer(ask: Ask) -> None:
     say(ask, [line.replace("6250", "625") for line in POINT_SAMPLES])
     assert np.abs(record(ask)[::10] - played(1639)).max() < ROUNDED_V
 
 
-def test_an_undriven_computer_comes_to_rest_before_the_next_record(ask: Ask) -> None:
+def test_computer_without_excitation_comes_to_rest_before_the_next_record(ask: Ask) -> None:
     say(ask, [*POINT_SAMPLES, *POINT_SAMPLES])
     assert np.abs(record(ask) - played()).max() < ROUNDED_V
 
@@ -216,18 +216,18 @@ def test_pulses_and_a_phase_are_those_of_the_emulators_generator(ask: Ask) -> No
     assert np.abs(record(ask) - played(excitation=excitation)).max() < ROUNDED_V
 
 
-def test_an_output_that_is_off_drives_nothing(ask: Ask) -> None:
+def test_output_that_is_off_drives_nothing(ask: Ask) -> None:
     say(ask, [*(line for line in SEQUENCE if not line.startswith("OUTPUT1"))])
     assert np.abs(record(ask)).max() < ROUNDED_V
     assert ask("OUTPUT1:STATE?") == "OFF"
 
 
-def test_settings_of_a_generator_that_runs_take_effect(ask: Ask) -> None:
+def test_settings_of_a_running_generator_take_effect(ask: Ask) -> None:
     say(ask, [*SEQUENCE, "SOUR1:VOLT 0.25", "ACQ:START", "ACQ:TRig NOW"])
     assert sorted(set(np.round(record(ask)[100:, 0], 1))) == [2.5, 7.5]
 
 
-def test_volts_and_hertz_may_have_a_suffix(ask: Ask) -> None:
+def test_volts_and_hertz_accept_a_suffix(ask: Ask) -> None:
     say(ask, ["SOUR1:VOLT 250 mV", "SOUR1:FREQ:FIX 0.2 kHz", "ACQ:TRig:LEV 125 mV"])
     assert (ask("SOUR1:VOLT?"), ask("SOUR1:FREQ?"), ask("ACQ:TRig:LEV?")) == ("0.25", "200", "0.125")
 
@@ -239,7 +239,7 @@ def test_levels_beyond_1_v_are_a_conflict_and_change_nothing(ask: Ask, line: str
     assert (ask("SOUR1:VOLT?"), ask("SOUR1:VOLT:OFFS?")) == ("0.5", "0.5")
 
 
-def test_a_frequency_that_the_looks_cannot_follow_is_a_conflict(ask: Ask) -> None:
+def test_frequency_too_high_for_the_rate_is_a_conflict(ask: Ask) -> None:
     say(ask, SEQUENCE)
     assert ask("SOUR1:FREQ:FIX 1e6") == "" and error(ask) == -221
     assert ask("SOUR1:FREQ?") == "100"
@@ -267,11 +267,11 @@ def test_a_frequency_that_the_looks_cannot_follow_is_a_conflict(ask: Ask) -> Non
         ("DIG:PIN LED1,1", -113),
     ],
 )
-def test_what_it_does_not_have_is_refused_with_the_number_of_the_standard(ask: Ask, line: str, number: int) -> None:
+def test_unknown_command_is_refused_with_the_standard_number(ask: Ask, line: str, number: int) -> None:
     assert ask(line) == "" and error(ask) == number
 
 
-def test_rst_is_the_state_in_which_it_begins(ask: Ask) -> None:
+def test_rst_restores_the_initial_state(ask: Ask) -> None:
     questions = [
         *(f"SOUR1:{name}?" for name in ("FUNC", "FREQ", "VOLT", "VOLT:OFFS", "PHAS", "DCYC")),
         *(f"ACQ:{name}?" for name in ("DEC", "AVG", "TRig:LEV", "TRig:DLY", "SOUR1:GAIN", "DATA:Units", "DATA:FORMAT")),
@@ -294,7 +294,7 @@ def test_pots_have_names_and_stand_where_the_program_has_them(ask: Ask) -> None:
     assert [float(ask(f"POT{n}:DIAL?")) for n in (1, 2, 3)] == pytest.approx(list(dials.values()), abs=1e-8)
 
 
-def test_turns_that_are_scheduled_come_so_long_after_each_trigger_of_the_generator(ask: Ask) -> None:
+def test_scheduled_changes_follow_each_trigger_of_the_generator(ask: Ask) -> None:
     say(ask, ["POT:SCHedule 3,0.638,0.1", "POT:SCH 2,0.8152,0.3"])
     say(ask, POINT_SAMPLES)
     assert ask("POT:SCH:COUN?") == "2"
@@ -304,7 +304,7 @@ def test_turns_that_are_scheduled_come_so_long_after_each_trigger_of_the_generat
     assert ask("POT:SCH:COUN?") == "0"
 
 
-def test_so_many_turns_can_be_scheduled_and_no_more(ask: Ask) -> None:
+def test_number_of_scheduled_changes_is_limited(ask: Ask) -> None:
     say(ask, [f"POT:SCH 1,0.5,{n}" for n in range(MOST_SCHEDULED)])
     assert ask("POT:SCH 1,0.5,1") == "" and error(ask) == -223
 
@@ -323,7 +323,7 @@ def defective(
 
 
 @pytest.mark.parametrize("skew_s", [5e-6, 10e-6, 20e-6, 60e-6])
-def test_a_skew_takes_in2_so_much_later_to_a_tenth_of_a_sample(skew_s: float) -> None:
+def test_skew_delays_in2_to_a_tenth_of_a_sample(skew_s: float) -> None:
     ask = defective(inputs=InputFaults(skew_s=skew_s))
     say(ask, POINT_SAMPLES)
     often = played(BUFFER_N + 2, per_sample=10)
@@ -332,14 +332,14 @@ def test_a_skew_takes_in2_so_much_later_to_a_tenth_of_a_sample(skew_s: float) ->
     assert np.abs(record(ask) - expected).max() < ROUNDED_V
 
 
-def test_a_skew_the_other_way_takes_in1_later() -> None:
+def test_negative_skew_delays_in1() -> None:
     ask = defective(inputs=InputFaults(skew_s=-10e-6))
     say(ask, POINT_SAMPLES)
     often = played(per_sample=5)
     assert np.abs(record(ask) - np.stack((often[1::5, 0], often[::5, 1]), axis=1)).max() < ROUNDED_V
 
 
-def test_noise_is_as_large_as_asked_and_independent_on_the_two_inputs() -> None:
+def test_noise_has_the_given_rms_and_is_independent_on_the_two_inputs() -> None:
     """16,384 samples: the standard error of an rms is 0.55 %, of a correlation 0.8 %; four of them. Quantisation adds
     LSB^2/12."""
     ask = defective(inputs=InputFaults(noise_v=(0.01, 0.03)))
@@ -350,8 +350,8 @@ def test_noise_is_as_large_as_asked_and_independent_on_the_two_inputs() -> None:
     assert abs(np.asarray(np.corrcoef(noise.T))[0, 1]) < 0.032
 
 
-def test_gain_and_offset_errors_are_those_of_wiring_and_inputs_one_after_the_other() -> None:
-    """The booster's offset is there before the generator is: in two periods nothing is left of that."""
+def test_gain_and_offset_errors_of_wiring_and_inputs_combine() -> None:
+    """The transient of the booster's offset is over after two periods."""
     wiring = Wiring(
         Booster(gain=9.5, offset_v=0.1), Amplifier(gain=-1.0), Amplifier(gain=1.02, offset_v=-0.2), swapped=True
     )
@@ -363,7 +363,7 @@ def test_gain_and_offset_errors_are_those_of_wiring_and_inputs_one_after_the_oth
 
 
 @pytest.mark.parametrize("clock_ppm", [50.0, -50.0])
-def test_a_clock_that_is_fast_takes_more_samples_in_the_generators_period(clock_ppm: float) -> None:
+def test_fast_clock_takes_more_samples_per_period_of_the_generator(clock_ppm: float) -> None:
     """Over a record of 16,384 samples 50 ppm are 0.82 samples: the last edges move by one."""
     ask = defective(acquisition=AcquisitionFaults(clock_ppm=clock_ppm))
     say(ask, POINT_SAMPLES)
@@ -373,7 +373,7 @@ def test_a_clock_that_is_fast_takes_more_samples_in_the_generators_period(clock_
     assert np.array_equal(edges, np.ceil(ideal - 1e-9))
 
 
-def test_a_half_filled_buffer_ends_with_zeros() -> None:
+def test_half_filled_buffer_ends_with_zeros() -> None:
     ask = defective(acquisition=AcquisitionFaults(half_filled=True))
     say(ask, POINT_SAMPLES)
     volts = record(ask)
@@ -381,14 +381,14 @@ def test_a_half_filled_buffer_ends_with_zeros() -> None:
     assert not volts[MIDDLE_N:].any()
 
 
-def test_a_buffer_that_is_never_filled_says_so() -> None:
+def test_buffer_that_is_never_filled_is_reported() -> None:
     ask = defective(acquisition=AcquisitionFaults(never_filled=True))
     say(ask, SEQUENCE)
     assert ask("ACQ:TRig:STAT?") == "TD"
     assert [ask("ACQ:TRig:FILL?") for _ in range(3)] == ["0"] * 3
 
 
-def test_a_record_with_a_drop_out_lacks_its_middle_and_the_others_do_not() -> None:
+def test_record_with_a_drop_out_lacks_its_middle_and_others_do_not() -> None:
     ask = defective(acquisition=AcquisitionFaults(drop_out="zeros", drop_out_record=2))
     say(ask, POINT_SAMPLES)
     assert np.abs(record(ask) - played()).max() < ROUNDED_V
@@ -400,7 +400,7 @@ def test_a_record_with_a_drop_out_lacks_its_middle_and_the_others_do_not() -> No
 
 
 @pytest.mark.parametrize("drop_out", ["hang up", "silence"])
-def test_an_instrument_drops_out_once_with_half_of_the_first_answer(drop_out: str) -> None:
+def test_drop_out_happens_once_in_the_first_answer(drop_out: str) -> None:
     faults = AcquisitionFaults(drop_out="hang up" if drop_out == "hang up" else "silence", drop_out_record=2)
     speaking = interpreter(InstrumentDescription(acquisition=faults))
     ask = asking(speaking)
@@ -419,7 +419,7 @@ def test_an_instrument_drops_out_once_with_half_of_the_first_answer(drop_out: st
 
 
 class Hands:
-    """A clock that goes when it is told to."""
+    """Clock that is set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -428,7 +428,7 @@ class Hands:
         return self.now_s
 
 
-def test_record_in_real_time_is_full_when_its_time_is_over_and_a_pot_turns_where_it_was_turned() -> None:
+def test_record_in_real_time_takes_its_time_and_shows_a_pot_set_meanwhile() -> None:
     hands = Hands()
     instrument = ServedRedPitaya(front, np.random.default_rng(0), clock=hands)
     ask = asking(Interpreter(instrument.commands))

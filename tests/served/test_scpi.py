@@ -1,4 +1,4 @@
-"""The language: program messages and errors of SCPI 1999, responses of IEEE 488.2."""
+"""SCPI interpreter: program messages and errors of SCPI 1999, responses of IEEE 488.2."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from analogrig.hardware.simulator.scpi import (
 
 
 class Lamp:
-    """An instrument of few words."""
+    """Interpreter with a few commands."""
 
     def __init__(self) -> None:
         self.level = 0.0
@@ -58,37 +58,37 @@ def ask(lamp: Interpreter, line: str | bytes) -> bytes:
 
 
 def error(lamp: Interpreter) -> int:
-    """The number of the oldest error."""
+    """Number of the oldest error."""
     return int(ask(lamp, "SYST:ERR?").split(b",")[0])
 
 
 @pytest.mark.parametrize(
     "header", ["lamp:lev", "LAMP:LEVEL", "Lamp:Level", ":LAMP:LEV", "LAMP:LEV:IMM", "lamp:level:immediate"]
 )
-def test_a_header_is_short_or_long_in_any_case_with_or_without_what_is_optional(lamp: Interpreter, header: str) -> None:
+def test_header_is_short_or_long_in_any_case_with_or_without_optional_words(lamp: Interpreter, header: str) -> None:
     assert ask(lamp, f"{header} 7.5") == b""
     assert ask(lamp, f"{header}?") == b"7.5\r\n"
 
 
 @pytest.mark.parametrize("header", ["LAMP:LEVE?", "LAMP:LE?", "LAMP?", "LEV?", "LAMP:LEV:IMM:NOW?", "LAMP::LEV?", "X?"])
-def test_a_header_that_is_neither_short_nor_long_is_undefined(lamp: Interpreter, header: str) -> None:
+def test_header_neither_short_nor_long_is_undefined(lamp: Interpreter, header: str) -> None:
     assert ask(lamp, header) == b""
     assert error(lamp) == -113
 
 
-def test_a_suffix_that_is_left_out_is_1(lamp: Interpreter) -> None:
+def test_missing_suffix_is_1(lamp: Interpreter) -> None:
     """SCPI 1999, 6.2.5.2."""
     assert ask(lamp, "LAMP:BULB:AGE?;BULB7:AGE?;BULB12:AGE?") == b"1\r\n"
     assert error(lamp) == -113
     assert ask(lamp, "LAMP:BULB7:AGE?") == b"7\r\n"
 
 
-def test_responses_of_a_line_come_in_a_line_between_semicolons(lamp: Interpreter) -> None:
+def test_responses_to_a_line_are_one_line_with_semicolons(lamp: Interpreter) -> None:
     """IEEE 488.2, 8.4."""
     assert ask(lamp, "*IDN?;LAMP:COL?;LAMP:LEV 2;LAMP:LEV?") == b"maker,lamp,0,1;red;2\r\n"
 
 
-def test_a_header_behind_a_semicolon_goes_on_where_the_one_before_it_left_off(lamp: Interpreter) -> None:
+def test_header_after_a_semicolon_continues_the_previous_path(lamp: Interpreter) -> None:
     """SCPI 1999, 6.2.4; a common command between them changes nothing, and a colon leads to the root."""
     assert ask(lamp, "LAMP:LEV 3;COL?;*IDN?;LEV?;:LAMP:LEV?") == b"red;maker,lamp,0,1;3;3\r\n"
     assert ask(lamp, "COL?") == b""
@@ -119,17 +119,15 @@ def test_a_header_behind_a_semicolon_goes_on_where_the_one_before_it_left_off(la
         (b"LAMP\x00:LEV 1", -102),
     ],
 )
-def test_what_is_wrong_is_an_error_of_the_standard_and_has_no_effect(
-    lamp: Interpreter, line: str | bytes, number: int
-) -> None:
+def test_wrong_command_is_a_standard_error_without_effect(lamp: Interpreter, line: str | bytes, number: int) -> None:
     assert ask(lamp, line) == b""
     assert error(lamp) == number
     assert error(lamp) == 0
     assert ask(lamp, "LAMP:LEV?") == b"0\r\n"
 
 
-def test_an_error_is_a_number_and_a_quoted_text_of_at_most_255_characters(lamp: Interpreter) -> None:
-    """SCPI 1999, 21.8.1: what is known of the case comes behind a semicolon."""
+def test_error_is_a_number_and_a_quoted_text_of_at_most_255_characters(lamp: Interpreter) -> None:
+    """SCPI 1999, 21.8.1: details follow a semicolon."""
     ask(lamp, 'FOO:"BAR"')
     assert ask(lamp, "SYST:ERR?") == b"-102,\"Syntax error;FOO:'BAR'\"\r\n"
     ask(lamp, "F" * 4000)
@@ -139,7 +137,7 @@ def test_an_error_is_a_number_and_a_quoted_text_of_at_most_255_characters(lamp: 
     assert len(str(ScpiError(-221, "x" * 400))) == len('-221,""') + 255
 
 
-def test_errors_are_told_in_their_order_and_an_overflow_takes_the_last_place(lamp: Interpreter) -> None:
+def test_errors_are_queued_in_order_and_an_overflow_replaces_the_last(lamp: Interpreter) -> None:
     """SCPI 1999, 21.8.1."""
     ask(lamp, "LAMP:LEV")
     for _ in range(2 * MOST_ERRORS):
@@ -152,20 +150,20 @@ def test_errors_are_told_in_their_order_and_an_overflow_takes_the_last_place(lam
 @pytest.mark.parametrize(
     ("said", "meant"), [("0.25", "0.25"), ("250mV", "0.25"), ("250 MV", "0.25"), (".25 v", "0.25")]
 )
-def test_a_suffix_multiplies_its_number(lamp: Interpreter, said: str, meant: str) -> None:
+def test_suffix_multiplies_its_number(lamp: Interpreter, said: str, meant: str) -> None:
     """IEEE 488.2, 7.7.3."""
     ask(lamp, f"LAMP:SUPP {said}")
     assert f"it has no {meant} V".encode() in ask(lamp, "SYST:ERR?")
 
 
-def test_the_status_byte_says_whether_there_are_errors(lamp: Interpreter) -> None:
+def test_status_byte_shows_queued_errors(lamp: Interpreter) -> None:
     """SCPI 1999, 9: bit 2."""
     assert ask(lamp, "*STB?") == b"0\r\n"
     ask(lamp, "FOO")
     assert ask(lamp, "*STB?;SYST:ERR?;*STB?") == b'4;-113,"Undefined header;FOO";0\r\n'
 
 
-def test_cls_forgets_the_errors(lamp: Interpreter) -> None:
+def test_cls_clears_the_error_queue(lamp: Interpreter) -> None:
     ask(lamp, "FOO")
     ask(lamp, "*CLS")
     assert error(lamp) == 0
@@ -174,17 +172,17 @@ def test_cls_forgets_the_errors(lamp: Interpreter) -> None:
 @pytest.mark.parametrize(
     ("length", "head"), [(0, b"#10"), (1, b"#11"), (9, b"#19"), (10, b"#210"), (32768, b"#532768"), (65536, b"#565536")]
 )
-def test_a_block_is_of_definite_length(length: int, head: bytes) -> None:
-    """IEEE 488.2, 8.7.9: #, how many digits follow, the length in these, and the bytes."""
+def test_block_has_definite_length(length: int, head: bytes) -> None:
+    """IEEE 488.2, 8.7.9: #, the number of digits, the length in these digits, and the bytes."""
     assert block(b"x" * length) == head + b"x" * length
 
 
-def test_bytes_are_answered_as_a_block_whatever_they_are(lamp: Interpreter) -> None:
+def test_bytes_are_sent_as_a_block(lamp: Interpreter) -> None:
     assert ask(lamp, "LAMP:SPEC?") == b"#14\x00\n;\xff\r\n"
 
 
 @pytest.mark.parametrize("hangs_up", [True, False])
-def test_an_instrument_that_drops_out_has_said_half(lamp: Interpreter, *, hangs_up: bool) -> None:
+def test_drop_out_sends_half_of_the_response(lamp: Interpreter, *, hangs_up: bool) -> None:
     parts = lamp.enter(b"LAMP:FLIC? %d" % hangs_up)
     assert next(parts) == b"01234"
     with pytest.raises(DropOut) as drop_out:
@@ -193,6 +191,6 @@ def test_an_instrument_that_drops_out_has_said_half(lamp: Interpreter, *, hangs_
 
 
 @pytest.mark.parametrize("line", ["", " ", ";", " ; ;", "\t"])
-def test_an_empty_line_is_no_error(lamp: Interpreter, line: str) -> None:
+def test_empty_line_is_no_error(lamp: Interpreter, line: str) -> None:
     assert ask(lamp, line) == b""
     assert error(lamp) == 0

@@ -1,4 +1,4 @@
-"""`analogrig serve`: the instrument in another process, by TCP, for clients that others wrote."""
+"""`analogrig serve`: the instrument in another process, over TCP, with third-party clients."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ LSB_V = 40.0 / 2**14
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    """The ideal rig."""
+    """Server of the ideal rig."""
     with serving("--rig", "emulator-ideal") as served:
         yield served
 
 
 @pytest.fixture
 def visa(served: Served) -> Iterator[pyvisa.resources.MessageBasedResource]:
-    """As programs for the real instrument open it."""
+    """PyVISA resource, opened as programs for the real instrument do."""
     manager = pyvisa.ResourceManager("@py")
     address = f"TCPIP::127.0.0.1::{served.port}::SOCKET"
     opened = manager.open_resource(address, read_termination="\r\n", write_termination="\r\n", timeout=1e3 * LONG_S)
@@ -76,7 +76,7 @@ def test_pyvisa_turns_pots(visa: pyvisa.resources.MessageBasedResource) -> None:
 
 @pytest.mark.parametrize("rig", ["emulator", "emulator-real"])
 @pytest.mark.parametrize("plant", ["front", "shock"])
-def test_the_served_computer_has_the_components_that_the_rig_draws_from_the_seed(rig: str, plant: str) -> None:
+def test_served_computer_has_the_components_of_the_emulated_rig_with_the_same_seed(rig: str, plant: str) -> None:
     scenario = Scenario.load("shock" if plant == "shock" else "healthy")
     with open_rig(rig) as opened:
         assert isinstance(opened, EmulatorRig)
@@ -87,7 +87,7 @@ def test_the_served_computer_has_the_components_that_the_rig_draws_from_the_seed
     assert served[0].elements != served[1].elements
 
 
-def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> None:
+def test_noise_depends_on_the_seed_alone() -> None:
     description = ServedDescription.load("emulator-ideal", ["inputs.noise_v=[0.01,0.01]"])
 
     def noisy(seed: int) -> np.ndarray:
@@ -99,8 +99,8 @@ def test_a_seed_gives_the_same_noise_again_and_another_gives_other_noise() -> No
     assert not np.array_equal(noisy(1), noisy(2))
 
 
-def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named() -> None:
-    """Of emulator-skewed: displacement 10 us after force; 1 LSB rms of 12 V and of 10 V on 12 bits."""
+def test_faults_of_the_card_are_added_to_the_instrument_and_others_are_named() -> None:
+    """Faults of emulator-skewed: displacement 10 us after force; 1 LSB rms of 12 V and of 10 V on 12 bits."""
     description = ServedDescription.load("emulator-skewed", ["inputs.skew_s=2e-6", "inputs.noise_v=[0.0,0.004]"])
     inputs = description.combined_instrument().inputs
     assert inputs.skew_s == pytest.approx(12e-6)
@@ -112,7 +112,7 @@ def test_a_cards_faults_become_those_of_the_instrument_and_the_others_are_named(
 # ---- the command
 
 
-def test_the_line_says_what_is_served_and_where() -> None:
+def test_first_line_names_rig_and_address() -> None:
     command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--plant", "shock", "--seed", "7"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -123,7 +123,7 @@ def test_the_line_says_what_is_served_and_where() -> None:
 
 
 @pytest.mark.parametrize("sign", ENDING)
-def test_a_server_ends_when_it_is_told_to_and_hangs_up(sign: signal.Signals) -> None:
+def test_signal_ends_the_server_and_closes_connections(sign: signal.Signals) -> None:
     with serving() as served:
         client = served.client()
         client.say(*SEQUENCE)
@@ -134,13 +134,13 @@ def test_a_server_ends_when_it_is_told_to_and_hangs_up(sign: signal.Signals) -> 
         client.close()
 
 
-def test_json_says_the_same(served: Served) -> None:
+def test_json_has_the_same_content(served: Served) -> None:
     address = f"127.0.0.1:{served.port}"
     place = {"host": "127.0.0.1", "port": served.port, "address": address}
     assert served.said == {"rig": "emulator-ideal", "plant": "front", "seed": 1995, **place}
 
 
-def test_it_listens_on_this_machine_alone(served: Served) -> None:
+def test_server_listens_on_the_loopback_interface_only(served: Served) -> None:
     """/proc/net/tcp: 0100007F is 127.0.0.1, state 0A is listening."""
     rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     assert [row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{served.port:04X}")] == [
@@ -148,7 +148,7 @@ def test_it_listens_on_this_machine_alone(served: Served) -> None:
     ]
 
 
-def test_a_file_says_what_is_wrong_with_the_instrument(tmp_path: Path) -> None:
+def test_faults_of_the_instrument_can_be_given_in_a_file(tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     ideal = (Path(__file__).parents[2] / "fixtures" / "rigs" / "emulator-ideal.toml").read_text()
     path.write_text(f"{ideal}\n[instrument.wiring]\nswapped = true\nforce = {{ gain = -1.0 }}\n")
@@ -162,7 +162,7 @@ def test_a_file_says_what_is_wrong_with_the_instrument(tmp_path: Path) -> None:
 
 
 def status_of(*options: str) -> int:
-    """In this process, of a server that does not come to serve."""
+    """Run the command in this process; it fails before it serves."""
     try:
         return main(["serve", *options])
     except SystemExit as usage:
@@ -184,7 +184,7 @@ def status_of(*options: str) -> int:
         (["--plant", "rear"], "argument --plant: invalid choice: 'rear'"),
     ],
 )
-def test_what_cannot_be_served_is_one_line_and_status_2(
+def test_unusable_description_is_one_line_and_status_2(
     options: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert status_of("--port", "0", *options) == 2
@@ -192,7 +192,7 @@ def test_what_cannot_be_served_is_one_line_and_status_2(
     assert out == "" and wrong.count("\n") == 1 and said in wrong
 
 
-def test_a_port_that_is_taken_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+def test_port_in_use_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,4 @@
-"""The server, in this process: places, turns, and a bench that is left safe."""
+"""Server in this process: places, turns, and outputs that are switched off."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LARGE_BYTES = 1_000_000
 
 
 class Counter:
-    """An instrument that counts what it is told."""
+    """Instrument that counts its commands."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -46,7 +46,7 @@ class Counter:
 
 
 class Client:
-    """One that means well."""
+    """Well-behaved client."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -66,7 +66,7 @@ class Client:
 
 
 class Bench:
-    """A server, and how to reach it."""
+    """Server and its address."""
 
     def __init__(self, server: Server, port: int) -> None:
         self.server = server
@@ -108,7 +108,7 @@ def in_time(course: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
 
 async def until(holds: Callable[[], bool]) -> None:
-    """The server has had its turns; one that never gets there runs out of time."""
+    """Await a state of the server; time out if it never comes."""
     while not holds():  # noqa: ASYNC110 - each turn of the loop is one
         await asyncio.sleep(0)
 
@@ -116,7 +116,7 @@ async def until(holds: Callable[[], bool]) -> None:
 # ---- safe
 
 
-def test_a_bench_is_left_safe_by_who_switched_it_on_however_it_goes() -> None:
+def test_output_is_off_after_its_client_is_gone() -> None:
     async def course() -> None:
         instrument = red_pitaya()
         async with bench(instrument) as served:
@@ -139,7 +139,7 @@ def test_a_bench_is_left_safe_by_who_switched_it_on_however_it_goes() -> None:
     in_time(course)
 
 
-def test_a_client_that_only_looked_on_leaves_the_generator_alone() -> None:
+def test_client_that_did_not_switch_the_output_on_does_not_switch_it_off() -> None:
     async def course() -> None:
         instrument = red_pitaya()
         async with bench(instrument) as served:
@@ -156,7 +156,7 @@ def test_a_client_that_only_looked_on_leaves_the_generator_alone() -> None:
     in_time(course)
 
 
-def test_a_server_that_is_closed_leaves_the_bench_safe() -> None:
+def test_closed_server_switches_the_output_off() -> None:
     async def course() -> None:
         instrument = red_pitaya()
         async with bench(instrument) as served:
@@ -168,7 +168,7 @@ def test_a_server_that_is_closed_leaves_the_bench_safe() -> None:
     in_time(course)
 
 
-def test_a_server_that_is_closed_leaves_a_bench_safe_that_was_live_before_it_served() -> None:
+def test_closed_server_switches_off_an_output_that_was_on_before() -> None:
     async def course() -> None:
         counter = Counter()
         counter.live = True
@@ -182,7 +182,7 @@ def test_a_server_that_is_closed_leaves_a_bench_safe_that_was_live_before_it_ser
 # ---- drop-outs
 
 
-def test_an_instrument_that_hangs_up_has_sent_half_and_answers_the_next_client() -> None:
+def test_instrument_that_hangs_up_has_sent_half_and_answers_the_next_client() -> None:
     async def course() -> None:
         async with bench(red_pitaya(AcquisitionFaults(drop_out="hang up"))) as served:
             client = await served.client()
@@ -197,7 +197,7 @@ def test_an_instrument_that_hangs_up_has_sent_half_and_answers_the_next_client()
     in_time(course)
 
 
-def test_an_instrument_that_falls_silent_takes_what_is_said_and_answers_nothing() -> None:
+def test_silent_instrument_reads_on_and_answers_nothing() -> None:
     async def course() -> None:
         async with bench(red_pitaya(AcquisitionFaults(drop_out="silence"))) as served:
             client, another = await served.client(), await served.client()
@@ -217,8 +217,8 @@ def test_an_instrument_that_falls_silent_takes_what_is_said_and_answers_nothing(
 # ---- turns and places
 
 
-def test_a_long_line_of_one_client_does_not_make_another_wait() -> None:
-    """What is said in between is answered after a few commands, and not after all the thousand."""
+def test_long_line_of_one_client_does_not_delay_another() -> None:
+    """A query is answered after a few commands, and not after all thousand."""
 
     async def course() -> None:
         counter = Counter()
@@ -233,7 +233,7 @@ def test_a_long_line_of_one_client_does_not_make_another_wait() -> None:
     in_time(course)
 
 
-def test_a_client_that_takes_nothing_is_dropped() -> None:
+def test_client_that_reads_nothing_is_dropped() -> None:
     async def course() -> None:
         async with bench(Counter(), slow_s=0.1) as served:
             deaf = await served.client()
@@ -244,8 +244,8 @@ def test_a_client_that_takes_nothing_is_dropped() -> None:
     in_time(course)
 
 
-def test_a_client_that_takes_a_little_now_and_then_gets_all() -> None:
-    """The answer takes three seconds, longer than the server waits for a client that takes nothing."""
+def test_client_that_reads_slowly_gets_the_whole_response() -> None:
+    """The answer takes three seconds, longer than the server waits for a client that reads nothing."""
 
     async def course() -> None:
         async with bench(Counter(), slow_s=2.0) as served:
@@ -264,7 +264,7 @@ def test_a_client_that_takes_a_little_now_and_then_gets_all() -> None:
     in_time(course)
 
 
-def test_a_server_keeps_no_more_than_an_answer_that_is_not_taken() -> None:
+def test_server_buffers_at_most_one_unread_response() -> None:
     async def course() -> None:
         async with bench(Counter()) as served:
             deaf = await served.client()
@@ -280,7 +280,7 @@ def test_a_server_keeps_no_more_than_an_answer_that_is_not_taken() -> None:
     in_time(course)
 
 
-def test_when_all_places_are_taken_a_newcomer_is_turned_away() -> None:
+def test_newcomer_is_turned_away_when_all_places_are_taken() -> None:
     async def course() -> None:
         async with bench(Counter()) as served:
             clients = [await served.client() for _ in range(MOST_CLIENTS)]
@@ -294,7 +294,7 @@ def test_when_all_places_are_taken_a_newcomer_is_turned_away() -> None:
     in_time(course)
 
 
-def test_a_newcomer_gets_the_place_of_who_has_been_silent_for_longest_but_not_of_who_drives() -> None:
+def test_newcomer_replaces_the_longest_silent_client_unless_its_output_is_on() -> None:
     async def course() -> None:
         instrument = red_pitaya()
         async with bench(instrument, idle_s=0.0) as served:
@@ -314,7 +314,7 @@ def test_a_newcomer_gets_the_place_of_who_has_been_silent_for_longest_but_not_of
     in_time(course)
 
 
-def test_a_client_whose_machine_vanishes_is_asked_whether_it_lives() -> None:
+def test_connections_have_keepalive() -> None:
     """Within half a minute: 15 s of silence, three questions of 5 s."""
 
     async def course() -> None:
@@ -336,7 +336,7 @@ def test_a_client_whose_machine_vanishes_is_asked_whether_it_lives() -> None:
 # ---- lines
 
 
-def test_a_line_that_is_too_long_is_refused_and_the_next_is_understood() -> None:
+def test_line_that_is_too_long_is_refused_and_the_next_is_executed() -> None:
     async def course() -> None:
         async with bench(Counter()) as served:
             client = await served.client()
@@ -350,8 +350,8 @@ def test_a_line_that_is_too_long_is_refused_and_the_next_is_understood() -> None
     in_time(course)
 
 
-def test_what_is_asked_before_the_connection_is_closed_one_way_is_answered() -> None:
-    """As by `printf '*IDN?' | nc`; a line without an end is none."""
+def test_queries_before_a_half_close_are_answered() -> None:
+    """A half-closed connection, as `printf '*IDN?' | nc` makes it; an unfinished line is ignored."""
 
     async def course() -> None:
         async with bench(Counter()) as served:
@@ -365,7 +365,7 @@ def test_what_is_asked_before_the_connection_is_closed_one_way_is_answered() -> 
     in_time(course)
 
 
-def test_errors_are_those_of_a_connection_and_the_state_is_that_of_the_instrument() -> None:
+def test_connections_share_the_state_but_not_the_error_queue() -> None:
     async def course() -> None:
         async with bench(Counter()) as served:
             one, other = await served.client(), await served.client()

@@ -199,8 +199,8 @@ class ServedRedPitaya:
             "ACQ:START": (0, lambda _: acquisition.start()),
             "ACQ:STOP": (0, lambda _: acquisition.stop()),
             "ACQ:TRig": (1, lambda call: acquisition.arm(call.word(0, TRIGGERS))),
-            "ACQ:TRig:STAT?": (0, lambda _: self._triggered()),
-            "ACQ:TRig:FILL?": (0, lambda _: self._filled()),
+            "ACQ:TRig:STAT?": (0, lambda _: self._trigger_state()),
+            "ACQ:TRig:FILL?": (0, lambda _: self._fill_state()),
             "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
             "ACQ:SRATe?": (0, lambda _: f"{_number(CLOCK_HZ / acquisition.settings.decimation)} Hz"),
             "ACQ:SOUR#:GAIN": (1, self._set_range),
@@ -236,11 +236,11 @@ class ServedRedPitaya:
         switches[_channel(call)] = call.word(0, tuple(RANGES_V))
         self._acquisition.change(dataclasses.replace(settings, switches=tuple(switches)))
 
-    def _triggered(self) -> str:
+    def _trigger_state(self) -> str:
         self._acquisition.wait()
         return "TD" if self._acquisition.triggered else "WAIT"
 
-    def _filled(self) -> str:
+    def _fill_state(self) -> str:
         self._acquisition.wait()
         return str(int(self._acquisition.filled))
 
