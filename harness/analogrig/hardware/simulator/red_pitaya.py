@@ -1,8 +1,8 @@
 """Simulated instrument: a Red Pitaya STEMlab 125-14 behind its SCPI server, with a box of digital pots beside it.
 
-Generator and acquisition of two channels follow https://redpitaya.readthedocs.io (SCPI commands, OS 2.0): 125 MHz
-through a decimation, records of 16,384 samples with the trigger in their middle plus a delay, +-1 V (LV) or +-20 V (HV)
-on 14 bits. Numbers come in braces, or as float32 and int16 in a block, most significant byte first unless
+Generator and acquisition of two channels follow https://redpitaya.readthedocs.io (SCPI commands, OS 2.0). The rate is
+125 MHz divided by a decimation. Records have 16,384 samples, with the trigger in their middle plus a delay. Ranges are
++-1 V (LV) or +-20 V (HV) on 14 bits. Numbers come in braces, or as float32 and int16 in a block, most significant byte first unless
 ACQ:DATA:BYTE:ORDER LEND is set. Unknown commands are refused; a real instrument has many more.
 
     GEN:RST  ACQ:RST  SOUR1:FUNC SQUARE  SOUR1:FREQ:FIX 100  SOUR1:VOLT .5  SOUR1:VOLT:OFFS .5  ACQ:DEC:Factor 6250

@@ -3,8 +3,8 @@
 A program message is a line. A command is a header and its arguments, `ACQ:DEC 8`. Semicolons separate several commands
 in a line, and their responses in one line (IEEE 488.2, 8.4). Words of a header may be short or long, in either case:
 the pattern `SYSTem:ERRor` matches `syst:err` and `SYSTEM:ERROR`. In a pattern, `#` stands for a number, 1 if it is
-missing, and `[...]` for optional words. After a semicolon, a header may continue the path of the previous one (SCPI
-1999, 6.2.4), or start at the root, with or without a colon.
+missing, and `[...]` for optional words. After a semicolon, a header may continue the previous path (SCPI 1999, 6.2.4),
+or start at the root, with or without a colon.
 
 Errors go into the queue that `SYST:ERR?` reads, and have no other effect.
 """
