@@ -2,8 +2,8 @@
 
 Generator and acquisition of two channels follow https://redpitaya.readthedocs.io (SCPI commands, OS 2.0). The rate is
 125 MHz divided by a decimation. Records have 16,384 samples, with the trigger in their middle plus a delay. Ranges are
-+-1 V (LV) or +-20 V (HV) on 14 bits. Numbers come in braces, or as float32 and int16 in a block, most significant byte first unless
-ACQ:DATA:BYTE:ORDER LEND is set. Unknown commands are refused; a real instrument has many more.
++-1 V (LV) or +-20 V (HV) on 14 bits. Numbers come in braces, or as float32 and int16 in a block, most significant byte
+first unless ACQ:DATA:BYTE:ORDER LEND is set. Unknown commands are refused; a real instrument has many more.
 
     GEN:RST  ACQ:RST  SOUR1:FUNC SQUARE  SOUR1:FREQ:FIX 100  SOUR1:VOLT .5  SOUR1:VOLT:OFFS .5  ACQ:DEC:Factor 6250
     ACQ:AVG ON  ACQ:DATA:Units VOLTS  ACQ:DATA:FORMAT ASCII  ACQ:SOUR1:GAIN HV  ACQ:TRig:DLY 8192  ACQ:START
