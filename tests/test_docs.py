@@ -16,8 +16,8 @@ import pytest
 
 from analogrig import cli, config
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.registry import from_table
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.hardware.simulator.rig import ServedDescription
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import described

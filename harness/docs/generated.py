@@ -20,8 +20,8 @@ import cantools
 import analogrig
 from analogrig import cli, errors
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.devices.estimator_config import EstimatorConfig
 from analogrig.devices.registry import KINDS
+from analogrig.estimator_config import EstimatorConfig
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.emulator import EmulatorDescription
 from analogrig.scenario import Scenario

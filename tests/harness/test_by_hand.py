@@ -42,7 +42,7 @@ def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = Fals
     return by_hand
 
 
-def taken(samples: int, *changes: Tweak) -> Signals:
+def taken(samples: int, *changes: PotChange) -> Signals:
     """Signals of a machine of real components."""
     return play(dataclasses.replace(scenario_of(samples, "card", 200.0), tweaks=changes), 3)
 
