@@ -30,6 +30,7 @@ APT_GET = "apt-get install --no-install-recommends"
 PACKAGES = {
     "gcc": "gcc",
     "gcov": "gcc",
+    "bash": "bash",
     "clang": "clang libclang-rt-dev",
     "clang-format-14": "clang-format-14",
     "clang-tidy": "clang-tidy",

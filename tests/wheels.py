@@ -20,13 +20,14 @@ CHECKOUT = Path(__file__).parents[1]
 NOT_SOURCES = (".*", "__pycache__", "*.egg-info", "*.so", "_catalogue.py", "bin", "build", "dist", "uPlot*", "venv*")
 """Files of a working checkout that are no sources: the build under test must make its products itself."""
 
-INHERITED = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "CFLAGS", "LDFLAGS", "CC")
-"""Variables that would let a build or an installed program depend on this checkout."""
+INHERITED = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "CFLAGS", "LDFLAGS", "CC", "ANALOGRIG", "PYTEST_")
+"""Beginnings of the variables that would let a build or an installed program depend on this checkout or session."""
 
 
 def run(*command: str | Path, cwd: Path | None = None, status: int = 0, **variables: str) -> str:
     """Run a command that must end with ``status``; return its output and error output."""
-    environment = {name: value for name, value in os.environ.items() if name not in INHERITED} | variables
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(INHERITED)}
+    environment = kept | variables
     done = subprocess.run(
         command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
     )

@@ -98,15 +98,28 @@ def names(kind: Kind) -> list[str]:
     return sorted(path.stem for path in (fixtures() / kind).glob("*.toml"))
 
 
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Contents of a regular file of at most ``most_bytes``.
+
+    :raises ConfigurationError: it is a directory, FIFO or device, or larger.
+    :raises OSError: it cannot be read.
+    """
+    if path.exists() and not path.is_file():
+        raise ConfigurationError(f"{_brief(str(path))}: not a file")
+    with path.open("rb") as file:
+        data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise ConfigurationError(f"{_brief(str(path))}: larger than {most_bytes} bytes")
+    return data
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as plain values.
 
     :raises ConfigurationError: it cannot be read, is too large, or is not TOML.
     """
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ConfigurationError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, MAX_FILE_BYTES).decode("utf-8")
         _check_nesting(text)
         return tomllib.loads(text)
     except OSError as error:

@@ -33,8 +33,7 @@ class DeviceFile:
     @classmethod
     def of(cls, device: str, path: Path) -> DeviceFile:
         try:
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            digest = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
         except OSError:
             digest = ""
         return cls(device, str(path), digest)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 from analogrig.cli import main
 from analogrig.cli.completion import SHELLS
 
-pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash: apt-get install bash")
+pytestmark = pytest.mark.tools("bash")
 
 COMMAND = Path(sys.executable).with_name("analogrig")
 

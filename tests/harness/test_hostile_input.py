@@ -25,6 +25,7 @@ from analogrig.campaigns.trial import play_chunk
 from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.recordings.files import CapturedFrames
 from analogrig.scenario import Scenario
 from analogrig.wording import MOST_MESSAGE, number_named, number_of, one_line
 
@@ -485,3 +486,35 @@ def test_message_of_any_length_is_one_printable_line() -> None:
     assert len(said) <= MOST_MESSAGE
     assert said.isprintable()
     assert one_line(said) == said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "--scenario", "pipe.toml"],
+        ["run", "--rig", "pipe.toml"],
+        ["run", "--dut", "inproc:./pipe.so"],
+        ["judge", "pipe.log", "--scenario", "thesis"],
+        ["judge", "frames.log", "--scenario", "thesis", "--dbc", "pipe.dbc"],
+        ["campaign", "pipe.toml"],
+    ],
+    ids=" ".join,
+)
+def test_pipe_in_the_place_of_a_file_is_refused_and_not_waited_for(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for suffix in ("toml", "so", "log", "dbc"):
+        os.mkfifo(f"pipe.{suffix}")
+    (tmp_path / "frames.log").write_text("(0.0) can0 010#0000000000000000\n")
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pipe." in line
+
+
+def test_line_without_end_of_a_log_is_read_in_parts(tmp_path: Path) -> None:
+    path = tmp_path / "long.log"
+    path.write_text("x" * 100_000)
+    frames = CapturedFrames(path)
+    assert list(frames) == []
+    assert frames.damaged

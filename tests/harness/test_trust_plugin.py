@@ -62,6 +62,21 @@ def by_addopts(bait: Bait, user: pytest.Pytester) -> list[str]:
     return []
 
 
+def by_file_of_addopts(bait: Bait, user: pytest.Pytester) -> list[str]:
+    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
+    user.makepyfile(PLAYS)
+    (user.path / "words").write_text(f"--hil-dut={name}\n")
+    user.makeini("[pytest]\naddopts = @words\n")
+    return []
+
+
+def by_addopts_that_hide(bait: Bait, user: pytest.Pytester) -> list[str]:
+    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
+    user.makepyfile(PLAYS)
+    user.makeini(f"[pytest]\naddopts = --hil-dut={name} -o addopts=\n")
+    return []
+
+
 def by_device_file(bait: Bait, user: pytest.Pytester) -> list[str]:
     user.makepyfile(PLAYS)
     return ["--hil-dut", device_file(bait)]
@@ -101,7 +116,16 @@ def check(user: pytest.Pytester, bait: Bait, arguments: list[str]) -> None:
     assert bait.witness.happened()
 
 
-DEVICE_ROUTES = (by_ini, by_ini_and_file, by_addopts, by_device_file, by_scenario, by_scenario_and_file)
+DEVICE_ROUTES = (
+    by_ini,
+    by_ini_and_file,
+    by_addopts,
+    by_file_of_addopts,
+    by_addopts_that_hide,
+    by_device_file,
+    by_scenario,
+    by_scenario_and_file,
+)
 RIG_ROUTES = (by_rig_file, by_ini_of_rig, by_scenario_on_rig)
 
 
@@ -160,9 +184,11 @@ def test_conftest_allows_what_the_ini_file_names(user: pytest.Pytester, bait: Ba
     assert bait.witness.happened()
 
 
-def test_ini_file_allows_nothing(user: pytest.Pytester, bait: Bait) -> None:
+@pytest.mark.parametrize("addopts", ["--hil-allow {}", "--hil-allow={} -o addopts=", "@words"])
+def test_ini_file_allows_nothing(addopts: str, user: pytest.Pytester, bait: Bait) -> None:
     user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\naddopts = --hil-allow {bait.allow}\n")
+    (user.path / "words").write_text(f"--hil-allow={bait.allow}\n")
+    user.makeini(f"[pytest]\naddopts = {addopts.format(bait.allow)}\n")
     result = run(user, "--hil-dut", device_file(bait))
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines(["*addopts: --hil-allow is for the command line or conftest.py*"])

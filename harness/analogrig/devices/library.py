@@ -43,6 +43,8 @@ def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
     :raises LinkError: the project's library was not built.
     :raises ConfigurationError: the user's library cannot be loaded, or lacks a function.
     """
+    if library.exists() and not library.is_file():
+        raise ConfigurationError(f"{library}: not a file")
     try:
         c = ctypes.CDLL(str(library))
     except OSError as error:

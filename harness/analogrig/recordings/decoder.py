@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig import catalogue
+from analogrig import catalogue, config
 from analogrig.catalogue import (
     CATALOGUE_HASH,
     INDICES,
@@ -65,16 +65,22 @@ class FrameDecoder:
 _IDENTIFIERS = {layout.id for layout in LAYOUTS.values()}
 
 
+MAX_DBC_BYTES = 16_000_000
+
+
 def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     import cantools
 
     try:
         with silence_logger("cantools"):
-            database: Any = cantools.database.load_file(str(dbc), database_format="dbc")
+            text = config.read_bounded(dbc, MAX_DBC_BYTES).decode("cp1252", "replace")  # as cantools reads files
+            database: Any = cantools.database.load_string(text, database_format="dbc")
     except OSError as error:
         raise ConfigurationError(f"--dbc {dbc}: {error.strerror or error}") from error
+    except ConfigurationError as error:
+        raise ConfigurationError(f"--dbc {error}") from error
     except Exception as error:
-        cause = " ".join(str(error).split())
+        cause = " ".join(str(error).split()) or type(error).__name__
         raise ConfigurationError(f"--dbc {dbc}: not a DBC: {cause}") from error
     known = [message for message in database.messages if message.name in LAYOUTS]
     if not known:

@@ -101,15 +101,19 @@ READ = (*WRITTEN, "trc")
 """Formats that can be read, as file suffixes."""
 
 
+LONGEST_LINE = 4096
+"""Characters of a line of a candump log that are read at once; a frame has at most 200."""
+
+
 class _CountedLines(io.TextIOBase):
-    """Text file that counts the lines read."""
+    """Text file that counts the lines read, and cuts those that are longer than ``LONGEST_LINE``."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
         self.number = 0
 
     def readline(self, _size: int | None = -1, /) -> str:  # type: ignore[override]
-        line = self._file.readline()
+        line = self._file.readline(LONGEST_LINE)
         self.number += line != ""
         return line
 
@@ -131,6 +135,8 @@ class CapturedFrames:
         """
         if self.path.suffix[1:].lower() not in READ:
             raise RecordingError(f"{self.path}: not a CAN log: the suffix must be one of .{', .'.join(READ)}")
+        if self.path.exists() and not self.path.is_file():
+            raise RecordingError(f"{self.path}: not a file")
         try:
             with self.path.open("rb"):
                 pass

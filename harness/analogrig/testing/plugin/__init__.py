@@ -19,7 +19,7 @@ import pytest
 
 from analogrig.rigs import CAPABILITIES
 from analogrig.testing import profiles
-from analogrig.testing.plugin import devices, options, playing, provenance, scenarios
+from analogrig.testing.plugin import devices, options, playing, provenance, scenarios, trusting
 from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, Option, time_limit_s
 
 if TYPE_CHECKING:
@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     options.add(parser)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
+    trusting.check(early_config, early_config.known_args_namespace.hil_allow)
 
 
 _PROFILE = pytest.StashKey[Callable[[], str]]()

@@ -187,8 +187,7 @@ def add(parser: pytest.Parser) -> None:
 
 
 def check_command_line(config: pytest.Config) -> None:
-    """:raises pytest.UsageError: a value on the command line is empty or wrong, or the ini file allows something."""
-    trusting.check(config)
+    """:raises pytest.UsageError: a value on the command line is empty or wrong."""
     for option in OPTIONS:
         option.check_command_line(config)
 

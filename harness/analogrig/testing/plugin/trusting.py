@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -23,9 +28,13 @@ def add(group: pytest.OptionGroup) -> None:
     )
 
 
-def check(config: pytest.Config) -> None:
-    """:raises pytest.UsageError: the ini file allows something."""
-    if any(word.partition("=")[0] == FLAG for word in _addopts(config)):
+def check(config: pytest.Config, given: Sequence[str]) -> None:
+    """Refuse values of --hil-allow that nobody typed, before conftest.py may add its own.
+
+    :raises pytest.UsageError: the ini file allows something.
+    """
+    untyped = [value for value in given if not _is_typed(config, FLAG, value)]
+    if untyped:
         raise pytest.UsageError(f"{config.inipath}: addopts: {FLAG} is for the command line or conftest.py")
 
 
@@ -42,9 +51,8 @@ def trust_of(config: pytest.Config, dut: str | None) -> Trust:
 
 
 def from_command_line(config: pytest.Config, flag: str, value: str) -> str:
-    """The value of an option; one that the ini file's addopts give is the file's."""
-    words = _addopts(config)
-    if value not in words and f"{flag}={value}" not in words:
+    """The value of an option; one that nobody typed is the ini file's, whatever way addopts gave it."""
+    if _is_typed(config, flag, value):
         return value
     from analogrig.trust import FiledName
 
@@ -60,5 +68,21 @@ def from_ini(config: pytest.Config, value: str, *, is_name: bool) -> str:
     return beside(config.inipath, value)
 
 
-def _addopts(config: pytest.Config) -> list[str]:
-    return list(map(str, config.getini("addopts")))
+def _is_typed(config: pytest.Config, flag: str, value: str) -> bool:
+    """True if the command line or PYTEST_ADDOPTS holds the flag with this value, also in a file named by @FILE."""
+    words = _typed_words(config)
+    return f"{flag}={value}" in words or (flag, value) in itertools.pairwise(words)
+
+
+def _typed_words(config: pytest.Config) -> list[str]:
+    in_worker = getattr(config, "workerinput", {}).get("mainargv")  # of pytest-xdist: the words of its main process
+    words = [str(word) for word in (in_worker or config.invocation_params.args)]
+    words += shlex.split(os.environ.get("PYTEST_ADDOPTS", ""))
+    return [each for word in words for each in (_lines_of(word[1:]) if word.startswith("@") else [word])]
+
+
+def _lines_of(file: str) -> list[str]:
+    try:
+        return Path(file).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
