@@ -13,9 +13,9 @@ import pytest
 import analogrig
 
 PUBLIC = """
-    AnalogrigError Bench Conditions ConfigurationError DeviceError Dut EmulatorError EstimatorConfig Excitation
-    Expectations Finding LinkError LinkTimeout Plant PlantChoice Play Played RecordingError Rig RigError Run Scenario
-    PotChange ChangeVerdict Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
+    AnalogrigError Bench ChangeVerdict Conditions ConfigurationError DeviceError Dut EmulatorError EstimatorConfig
+    Excitation Expectations Finding LinkError LinkTimeout Plant PlantChoice Play Played PotChange RecordingError Rig
+    RigError Run Scenario Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
     write_report
 """.split()
 
