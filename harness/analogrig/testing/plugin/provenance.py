@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import time
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.identity import DeviceFile, Identity, now
+if TYPE_CHECKING:
+    from analogrig.identity import DeviceFile, Identity
 
 _STARTED = pytest.StashKey[str]()
 
@@ -18,12 +20,14 @@ _PLAYED = "analogrig_commit"
 
 def begin(config: pytest.Config) -> None:
     """Note when the session has started, and have its test suite named in JUnit."""
-    config.stash[_STARTED] = now()
+    config.stash[_STARTED] = time.strftime("%Y-%m-%dT%H:%M:%S+00:00", time.gmtime())
     config.pluginmanager.register(_Suite())
 
 
 def identity(config: pytest.Config, devices: Sequence[DeviceFile] = ()) -> Identity:
     """Identity of what the session makes."""
+    from analogrig.identity import Identity
+
     told = getattr(config, "workerinput", {}).get("mainargv")  # pytest-xdist: the command of the controller
     words = list(told)[1:] if told else config.invocation_params.args
     return Identity.here(shlex.join(["pytest", *map(str, words)]), config.stash[_STARTED], devices)
