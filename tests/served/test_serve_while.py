@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from analogrig.cli import main
+from tests.harness.processes import ends
 
 SERVE = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--"]
 
@@ -59,6 +60,16 @@ def test_termination_ends_the_command_too(tmp_path: Path) -> None:
         assert process.wait() == 130
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+def test_command_ends_with_a_server_that_is_killed(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pid")
+    ask = f"import os, signal; open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); signal.pause()"
+    with subprocess.Popen([*SERVE, sys.executable, "-c", ask], stdout=subprocess.DEVNULL) as process:
+        pid = int((tmp_path / "pid").read_text())
+        process.kill()
+        process.wait()
+    assert ends(pid)
 
 
 def test_command_that_cannot_be_started_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

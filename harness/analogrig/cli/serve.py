@@ -102,17 +102,28 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
         await server.close()
 
 
+_PR_SET_PDEATHSIG = 1
+"""Of prctl(2): the signal that a process gets when its parent ends, by SIGKILL too."""
+
+
 async def _client(command: Sequence[str], signalled: asyncio.Future[int]) -> int:
     """Run a command to its end, or terminate it at a signal. Return its exit status as a shell does.
 
     :raises ConfigurationError: it cannot be started.
     """
     import asyncio
+    import ctypes
+    import signal
 
     from analogrig.errors import ConfigurationError
 
+    libc = ctypes.CDLL(None)
+
+    def end_with_parent() -> None:
+        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
     try:
-        process = await asyncio.create_subprocess_exec(*command)
+        process = await asyncio.create_subprocess_exec(*command, preexec_fn=end_with_parent)
     except OSError as error:
         raise ConfigurationError(f"{command[0]}: cannot be started: {error.strerror or error}") from error
     ended = asyncio.ensure_future(process.wait())
