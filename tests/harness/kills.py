@@ -170,7 +170,7 @@ def kill(case: Case, number: signal.Signals, before: Path, after_s: float) -> st
                 process.send_signal(number)
             _, said = process.communicate(timeout=LONG_S)
             assert gone(mark), "processes are left"
-        # -number: before the command has begun to handle signals, or after its end; status 1: Python had not started yet.
+        # -number: the command does not handle signals yet, or no longer. Status 1: Python itself had not started.
         not_started = process.returncode == 1 and said.startswith(b"Fatal Python error: init_import_site")
         assert not_started or process.returncode in {0, 130, -number}, f"ended with {process.returncode}: {said!r}"
         case.check(now, before)
