@@ -1,7 +1,7 @@
-"""Typed configuration: TOML files into frozen dataclasses, and the places where the named ones live.
+"""Typed configuration: TOML files into frozen dataclasses, and the locations of the shipped files.
 
-Every key is checked against the dataclass: an unknown key, a wrong type or a value out of range is one line that names
-the file, the table and the key. Nothing read from a file is ever executed.
+Every key is checked against the dataclass. An unknown key, a wrong type or a value out of range is a one-line error
+with file, table and key. Nothing read from a file is ever executed.
 """
 
 from __future__ import annotations
@@ -27,27 +27,28 @@ Kind = Literal["scenarios", "rigs", "devices", "campaigns"]
 MAX_FILE_BYTES = 1_000_000
 
 MOST_NUMBER = 1e30
-"""Of any quantity in any unit; beyond it even a product overflows."""
+"""Largest magnitude of any quantity in any unit; beyond it even a product overflows."""
 
 MOST_INTEGER = 2**63 - 1
 
 MOST_SHOWN = 200
 
 MAX_DEPTH = 32
-"""Of tables and arrays in a file."""
+"""Largest nesting depth of tables and arrays in a file."""
 
 MAX_WORD = 2_000
-"""Characters of a bare key or a number in a file."""
+"""Most characters of a bare key or a number in a file."""
 
 _QUOTES = "\"'#"
-"""Strings and comments, which may be long, begin with one of these."""
+"""First characters of strings and comments, which may be long."""
 
 _TOKENS = re.compile(
     r"""\"{3}(?:[^"\\]|\\.|"(?!""))*+(?:\"{3}|\Z) | '{3}(?:[^']|'(?!''))*+(?:'{3}|\Z)
     | "(?:[^"\\\n]|\\.)*+"? | '[^'\n]*+'? | \#[^\n]*+ | [][{}.,=\n] | [\w+:-]++""",
     re.DOTALL | re.VERBOSE,
 )
-"""What nests in TOML, its bare words, and the strings and comments in which the same characters mean nothing."""
+"""Tokens of TOML: brackets and other nesting characters, bare words, and strings and comments, which may contain
+either."""
 
 
 def fixtures() -> Path:
@@ -129,7 +130,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _check_nesting(text: str) -> None:
-    """Refuse what takes tomllib memory and time out of proportion.
+    """Reject text for which tomllib would need excessive memory and time.
 
     :raises ValueError: brackets or dots of a key are nested too deep, or a bare word is too long.
     """
@@ -180,7 +181,7 @@ def _toml_key(key: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Strings, numbers, truth values and arrays of them; what JSON writes of them is TOML too."""
+    """TOML of strings, numbers, booleans and arrays of them, for which JSON text is valid TOML."""
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml_value, value))}]"
     if isinstance(value, float) and not math.isfinite(value):
@@ -252,7 +253,7 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
 
 
 def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
-    """The tables of a union by what their ``kind`` must be; empty if that does not tell them apart."""
+    """Tables of a union by the required value of their ``kind``; empty if that does not distinguish them."""
     hints = [typing.get_type_hints(each).get("kind") for each in arguments if dataclasses.is_dataclass(each)]
     if len(hints) < len(arguments) or not all(typing.get_origin(hint) is Literal for hint in hints):
         return {}

@@ -56,7 +56,7 @@ class _Device:
 
 @dataclass(frozen=True)
 class _Line:
-    """``Conditions.line``."""
+    """Counters of the line, as ``Conditions.line`` holds them."""
 
     bitrate: int = 1
     data_bitrate: int = 1

@@ -28,7 +28,7 @@ class DeviceFile:
     device: str
     path: str
     sha256: str
-    """Empty if the file could not be read."""
+    """SHA-256 of the file; empty if it could not be read."""
 
     @classmethod
     def of(cls, device: str, path: Path) -> DeviceFile:
@@ -44,17 +44,17 @@ class Identity:
     """Provenance of one result. No verdict and no hash of estimates depends on it."""
 
     analogrig: str
-    """Version."""
+    """Version of analogrig."""
     commit: str
-    """Of analogrig's own repository, with ``+dirty`` if tracked files differ from it; empty if unknown."""
+    """Commit of analogrig's own repository, with ``+dirty`` if tracked files differ from it; empty if unknown."""
     command: str
     """Command line, quoted for a shell."""
     started: str
-    """UTC, ISO 8601."""
+    """Start time in UTC, ISO 8601."""
     host: str
     python: str
     devices: tuple[DeviceFile, ...] = ()
-    """Empty if the device runs elsewhere."""
+    """Files that the devices run; empty if a device runs on another machine."""
 
     @classmethod
     def here(cls, command: str, started: str, devices: Sequence[DeviceFile] = ()) -> Identity:
@@ -67,7 +67,7 @@ class Identity:
 
 
 def now() -> str:
-    """UTC in ISO 8601, to the second."""
+    """Current time in UTC, ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 

@@ -1,7 +1,7 @@
-"""Where results go: a folder that holds one run, whole or marked INCONCLUSIVE; files that are no older result.
+"""Output folders and files: a folder holds one run, complete or marked INCONCLUSIVE; older results are moved aside.
 
-From the start of a command to its end ``verdict.json`` and the page in its folder say INCONCLUSIVE, so that a command
-that is killed leaves no older verdict. The result takes their place at the end: recording, page, and last the verdict.
+While a command runs, ``verdict.json`` and the page in its folder say INCONCLUSIVE. A command that is killed therefore
+leaves no older verdict. The result replaces them at the end: recording, page, and last the verdict.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from analogrig.signals import held
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
 
 RUN_FILES = (RUN_FILE, *(f"{CAN_LOG}.{suffix}" for suffix in ("log", "blf", "asc", "mf4")))
-"""What a run may leave beside its page and its verdict."""
+"""Files that a run may leave beside its page and its verdict."""
 
 FORMAT, FORMAT_VERSION = "analogrig-verdict", 1
-"""Of ``verdict.json``."""
+"""Format name and version of ``verdict.json``."""
 
 NOT_ENDED = "the run has not ended: it is still going on, or was killed"
 
 _PREVIOUS = ".previous"
 _PARTS = ".analogrig-parts"
-"""Folder of what is being written."""
+"""Folder of unfinished files."""
 
 _PAGE = Path(__file__).parent / "reporting" / "status.html"
 
@@ -105,8 +105,9 @@ class OutputFolder:
             raise ConfigurationError(f"--out {self.path}: cannot be written to: {error.strerror or error}") from error
 
     def conclude(self, write: Callable[[Path], None], verdict: Mapping[str, Any]) -> None:
-        """Replace the mark by a result: what ``write`` puts into the folder it is given, what is in ``parts``, and
-        ``verdict.json``, which comes last. A signal that ends the command waits until all of it is there.
+        """Replace the mark by a result: the files that ``write`` creates, those in ``parts``, then ``verdict.json``.
+
+        ``write`` receives the folder to write to. A signal that ends the command is held until the result is complete.
 
         :raises RecordingError: not all of it can be written; the folder then says so.
         """
@@ -173,7 +174,10 @@ class OutputFolder:
                 )
 
     def _move_aside(self) -> None:
-        """A verdict without a recording is not kept: it would push the last recording out of ``.previous``."""
+        """Move the earlier result to ``.previous``.
+
+        A verdict without a recording is not kept: it would push the last recording out of ``.previous``.
+        """
         results = [name for name in self._holds if (self.path / name).is_file()]
         if not results:
             return
@@ -208,7 +212,7 @@ class OutputFolder:
         (self.parts / VERDICT_FILE).write_text(f"{text}\n", encoding="utf-8")
 
     def _put_in_place(self) -> None:
-        """Each file whole, the verdict last: what it says is in the folder when it says it."""
+        """Move each finished file into place, the verdict last: everything that it refers to is then in the folder."""
         for name in (*self._holds, self.page.name, VERDICT_FILE):
             if (self.parts / name).is_file():
                 (self.path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -231,13 +235,13 @@ def move_aside(path: Path, reads: Iterable[Path] = ()) -> None:
 
 
 def previous_of(path: Path) -> Path:
-    """Where an earlier result goes."""
+    """Path to which an earlier result is moved."""
     whole = path.resolve()
     return whole.with_name(f"{whole.name}{_PREVIOUS}") if whole.name else whole / _PREVIOUS
 
 
 def make_folder(out: Path) -> None:
-    """Find out before the work whether its results can be kept.
+    """Create the folder, and check before the work that results can be written to it.
 
     :raises ConfigurationError: the folder cannot be made, or cannot be written to.
     """

@@ -1,6 +1,6 @@
-"""Signals that end a command: SIGINT, SIGTERM and SIGHUP all take the road of Ctrl-C.
+"""Signals that end a command: SIGINT, SIGTERM and SIGHUP are all handled like Ctrl-C.
 
-Only the command line installs handlers (``ending``); as a library analogrig leaves the signals of its host alone.
+Only the command line installs handlers (``ending``). As a library, analogrig leaves the signals of its host alone.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 AGAIN_S = 1.0
-"""Within this time a signal repeats the first one: ``timeout`` and shells send the same request twice."""
+"""Time within which a signal repeats the first one: ``timeout`` and shells send the same request twice."""
 
 
 class Interrupted(KeyboardInterrupt):
     """A signal that ends the command; its text is the name of the signal.
 
-    A class of its own: once a KeyboardInterrupt proper has passed through code that was compiled from text, such as a
-    dataclass that is being defined, Python ends itself by SIGINT, whatever the exit status.
+    A subclass, because a plain KeyboardInterrupt can make Python end itself by SIGINT, regardless of the exit status.
+    It does so once the exception has passed through code compiled from text, such as a dataclass being defined.
     """
 
 
@@ -63,7 +63,7 @@ class _Handler:
 
 
 _handlers: list[_Handler] = []
-"""That of ``ending``, while it is in force."""
+"""Handler installed by ``ending``, while it is in force."""
 
 
 @contextlib.contextmanager
@@ -91,7 +91,7 @@ def ending() -> Iterator[None]:
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """Let the block finish before a first signal takes effect: what is being written is written in full."""
+    """Delay a first signal until the block ends, so that a file being written is written in full."""
     handler = _handlers[-1] if _handlers and threading.current_thread() is threading.main_thread() else None
     if handler is None:
         yield
@@ -106,7 +106,7 @@ def held() -> Iterator[None]:
 def awaited() -> asyncio.Future[int]:
     """In a running event loop: a future that raises Interrupted at a signal that ends the command.
 
-    There, a handler that raises would end the task of whoever is served at that moment.
+    There, a handler that raises would end the task that happens to run at that moment.
     """
     import asyncio
 

@@ -64,7 +64,7 @@ def placed(path: str, folder: Path) -> str:
 
 
 def placed_port(url: str, folder: Path) -> str:
-    """As ``placed``, for a serial port; a URL stays as it is."""
+    """Serial port as an absolute path, like ``placed``; a URL stays as it is."""
     return url if "://" in url else placed(url, folder)
 
 
@@ -118,7 +118,7 @@ class Trust:
         return allow if isinstance(allow, Trust) else cls(allow)
 
     def also(self, things: Iterable[Thing]) -> Trust:
-        """The same, and things that the user names otherwise, as with ``--dut``."""
+        """Trust extended by things that the user names otherwise, as with ``--dut``."""
         return Trust((*self._names, *(thing.name for thing in things)), option=self._option)
 
     def check(self, things: Iterable[Thing], file: str, where: str = "") -> None:

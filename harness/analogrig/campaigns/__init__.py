@@ -1,1 +1,1 @@
-"""Many trials of a device over plants, changes and noise: what is played, who works, the file of results, its page."""
+"""Campaigns: many trials of a device over plants, changes and noise. Plan, workers, results file and page."""

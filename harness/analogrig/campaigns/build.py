@@ -1,7 +1,7 @@
-"""What plays, by its contents: two builds never play the trials of one campaign.
+"""Build identity by file contents: the trials of one campaign all come from one build.
 
-A name says nothing of what stands behind it: a firmware, a library or analogrig itself may be another by the time that
-a campaign goes on, or elsewhere.
+A name does not identify a build. The firmware, library or analogrig behind it may differ on another machine, or when a
+campaign resumes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 
 DIGITS = 16
-"""Of a SHA-256, which tell builds apart."""
+"""Hex digits of a SHA-256 that identify a build."""
 
 _PACKAGES = tuple(Path(str(package.__file__)).parent for package in (analogrig_emulator, analogrig))
 
 
 @functools.cache
 def of_analogrig() -> str:
-    """Its version and, behind a space, the contents of what decides what is played."""
+    """Version of analogrig and, after a space, the hash of all files that decide what is played."""
     sources = sorted(path for folder in _PACKAGES for kind in ("py", "so") for path in folder.rglob(f"*.{kind}"))
     whole = hashlib.sha256()
     for path in sources:
@@ -38,7 +38,7 @@ def _version() -> str:
 
 
 def of_device(device: DeviceDescription) -> str:
-    """The contents of the file that it runs; "" if that is not of this computer.
+    """Hash of the file that the device runs; "" if that file is not on this computer.
 
     :raises ConfigurationError: the file cannot be read.
     """

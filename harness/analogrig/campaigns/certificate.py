@@ -1,10 +1,9 @@
-"""Whether a device raises false alarms rarely enough: the one question that every owner asks, with its error stated.
+"""Certificate of a device's false-alarm rate against a limit, with a stated error probability.
 
-A plant that does not change is played in runs of one length, with seeds in order. What counts as a trial is a sample in
-which the trigger was armed (analogrig.judging.exposure); every alarm is a false one. Rates for which that would take
-too long are
-estimated by branches with louder noise instead (analogrig.campaigns.rare), so many times over, each time off a play of
-its own.
+A plant that does not change is played in runs of one length, with consecutive seeds. The unit of exposure is a sample
+in which the trigger was armed (analogrig.judging.exposure). Every alarm is a false one. Rates that would take too long
+to observe are estimated by branches with louder noise (analogrig.campaigns.rare). Each of these estimates comes from a
+play of its own.
 """
 
 from __future__ import annotations
@@ -40,45 +39,48 @@ from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
 IN_PROCESS_RUN_N, BENCH_RUN_N = 100_000, 20_000
-"""About so many samples in a run: in this process, or over a line."""
+"""Approximate samples in a run: in this process, or over a line."""
 
 WORTH_A_WORKER_N = 500_000
 """Samples that a process plays in about the time that another takes to start."""
 
 WORTH_A_WORKER_ESTIMATES = 16
-"""As many of a rare rate."""
+"""Estimates of a rare rate that a process plays in about the time that another takes to start."""
 
 APART = 10.0
-"""The sequential test certifies quickest where the true rate is so many times below the limit."""
+"""Ratio of limit to true rate at which the sequential test certifies quickest."""
 
 MOST_LONGER = 3.0
-"""A sequential test gives up after so many times the length of a fixed one."""
+"""Largest length of a sequential test, as a multiple of the length of a fixed one."""
 
 LEAST_ESTIMATES, MOST_ESTIMATES = 64, 10_000
-"""Of a rare rate: the bounds of the mean of 8 are wrong 0.55 % of the time where 0.1 % is said, of 64 0.18 %."""
+"""Fewest and most estimates of a rare rate.
+
+At a nominal error of 0.1 %, bounds of a mean of 8 estimates are wrong 0.55 % of the time; of 64, 0.18 %.
+"""
 
 IN_PROCESS_YEAR_N, BENCH_YEAR_N = 1e14, 3e11
-"""About so many samples are played in a year, in this process by one processor, or over a line."""
+"""Approximate samples played in a year: in this process by one processor, or over a line."""
 
 Answer = Literal["certified", "refuted", "inconclusive"]
 
 
 @dataclass(frozen=True)
 class Question:
-    """Whether the rate of false alarms is below ``far`` per sample."""
+    """Test of the hypothesis that the false-alarm rate is below ``far`` per sample."""
 
     far: float
     confidence: float
     rig: Any
-    """In plain values, as ``campaign.plan.open_table`` takes it."""
+    """Rig as plain values, as ``campaign.plan.open_table`` takes it."""
     device: Any
     scenario: Any
     first_seed: int = 0
     allowed: int = 5
-    """For a fixed length: with more alarms it is not certified."""
+    """Most alarms with which a test of fixed length certifies."""
     sequential: bool = False
     rare: int | None = None
-    """So many estimates of a rare rate; None: alarms are waited for."""
+    """Number of estimates of a rare rate; None: count alarms as they occur."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.far * APART < 1.0:
@@ -122,7 +124,7 @@ class Question:
             )
 
     def as_json(self) -> str:
-        """The same question gives the same text."""
+        """Question as JSON text; equal questions give equal text."""
         table = {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
         return json.dumps(table, sort_keys=True)
 
@@ -132,14 +134,14 @@ class Question:
 
     @property
     def useful_workers(self) -> int:
-        """More would take longer to start than to play."""
+        """Largest useful number of workers; more would take longer to start than to play."""
         if self.rare is not None:
             return max(1, self.rare // WORTH_A_WORKER_ESTIMATES)
         return max(1, self.design_n // WORTH_A_WORKER_N) if self.is_in_process else self.design_n
 
     @functools.cached_property
     def is_in_process(self) -> bool:
-        """Whether it is played without a line."""
+        """True if the trials are played within this process, without a line."""
         with open_table(self.rig) as rig:
             return are_possible(rig, device_of(self.device))
 
@@ -151,25 +153,25 @@ class Question:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The answer."""
+    """Answer to a ``Question``."""
 
     outcome: Answer
     reason: str
     alarms: int
-    """For a rare rate, branches that came to one."""
+    """Number of alarms; for a rare rate, of branches that ended in one."""
     samples: int
-    """That counted; for a rare rate, that were played."""
+    """Number of samples in which the trigger was armed; for a rare rate, of samples played."""
     rate: tuple[float, float]
-    """One-sided bounds: exact for a fixed length, of a mean for a rare rate; (0, 1) for a sequential test, which says
-    no more than its outcome."""
+    """One-sided bounds: exact for a fixed length, of a mean for a rare rate. (0, 1) for a sequential test, which
+    yields only its outcome."""
 
 
 def certify(
     question: Question, workers: Workers, progress: Callable[[int, int, int], None] | None = None
 ) -> Certificate:
-    """Play until the answer is there. It does not depend on the number of workers.
+    """Play until the question is answered. The answer does not depend on the number of workers.
 
-    ``progress`` is called with the samples that have counted, those that may be needed, and the alarms among them.
+    ``progress`` is called with the samples counted, the samples that may be needed, and the alarms counted.
 
     :raises ConfigurationError: the scenario cannot be played, or the device refuses its configuration.
     :raises WorkerError, LinkError, DeviceError, RigError: they cannot be had or kept.
@@ -198,7 +200,7 @@ def certify(
 
 
 def count_run(question: str, run_n: int, seed: int) -> Count:
-    """The alarms of one run."""
+    """Alarms and exposure of one run."""
     asked = Question.from_json(question)
     scenario = dataclasses.replace(Scenario.from_table(asked.scenario, "the scenario"), samples=run_n)
     return count_alarms(Case(asked.rig, asked.device, scenario, seed))
@@ -239,7 +241,7 @@ def _answer(far: float, low: float, high: float) -> Answer:
 
 
 def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
-    """The counts by seed, whichever is there first."""
+    """Yield the counts in order of their seeds, whatever the order of arrival."""
     early: dict[int, Count] = {}
     expected = first_seed
     for seed, count in workers.play(work, itertools.count(first_seed)):
@@ -250,7 +252,7 @@ def _in_order(workers: Workers, work: Any, first_seed: int) -> Iterator[Count]:
 
 
 def _run_n(question: Question, most: int) -> int:
-    """Such a length that a whole number of runs makes up a test of fixed length."""
+    """Run length of which a whole number makes up a test of fixed length."""
     about = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
     runs = math.ceil(most / about)
     return math.ceil(most / runs) + device_of(question.device).estimator.warm_up_n + LEAD_IN_N
@@ -267,7 +269,10 @@ def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
 
 
 def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:
-    """Wald's test certifies; a confidence sequence refutes, which it does in the end for any rate above the limit."""
+    """Outcome of the sequential tests; None while undecided.
+
+    Wald's test certifies. A confidence sequence refutes; it eventually does so for any rate above the limit.
+    """
     error, far = 1.0 - question.confidence, question.far
     said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and no more were needed"
     better = SequentialTest(far / APART, far, error, error, trials=samples, events=alarms)

@@ -1,11 +1,10 @@
-"""Two sets of results against each other: what has become worse, or better, beyond chance.
+"""Comparison of two sets of results: which quantities are significantly worse or better.
 
-The unit is the seed: under one seed the two sides saw the same noise and the same draws, whatever else, and so did all
-cells of a campaign. So every quantity becomes one number a seed, its mean over all that was played with that seed, and
-the differences of the seeds that both sides have are tested by exchanging the sides (a sign-flip permutation test,
-exact for any distribution). Sides without a seed in common are tested by permuting which seed was whose. The
-probabilities of all quantities are adjusted together (Holm 1979), so that the chance of any wrong word is at most
-``alpha``.
+The unit is the seed: with one seed both sides, and all cells of a campaign, saw the same noise and the same draws. Each
+quantity is reduced to one number a seed: its mean over all trials with that seed. Differences at common seeds are
+tested by a sign-flip permutation test, which is exact for any distribution. Sides without a common seed are tested by
+permuting the seeds between them. The p-values of all quantities are adjusted together (Holm 1979), so that the
+family-wise error rate is at most ``alpha``.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from analogrig.campaigns.sides import Observation, valid
 from analogrig.plant import PARAMETERS
 
 EXACT_UP_TO = 14
-"""With so many differences or fewer all ways to exchange them are gone through."""
+"""Largest number of differences for which all sign patterns are enumerated."""
 
 LOST_ESTIMATE = 1.0
-"""The relative error of a trial that ended without an estimate of M, B, K where the other side's has one."""
+"""Relative error assigned to a trial without a final estimate of M, B, K where the other side's has one."""
 
 RESAMPLES, _AT_ONCE = 99_999, 1_000
 
@@ -39,17 +38,17 @@ Word = Literal["worse", "better", "no difference shown"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something of which less is better."""
+    """Quantity to compare; smaller is better."""
 
     name: str
     unit: str
     of: Callable[[Row, Row | None], Sequence[float]]
-    """The values of a trial; only those that the other side's trial has too, if there is one."""
+    """Values of a trial, limited to those that the other side's trial has too, if there is one."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One quantity on both sides."""
+    """Difference in one quantity between the two sides."""
 
     quantity: str
     unit: str
@@ -64,7 +63,7 @@ class Difference:
 
     @property
     def shown(self) -> bool:
-        """Whether there is a difference beyond chance."""
+        """True if the difference is statistically significant."""
         return self.word != "no difference shown"
 
 
@@ -73,21 +72,21 @@ class Comparison:
     differences: tuple[Difference, ...]
     alpha: float
     trials: tuple[int, int]
-    """Valid ones of each side."""
+    """Number of valid trials on each side."""
     inconclusive: tuple[int, int]
-    """... and those that were not: nothing is said of them."""
+    """Number of inconclusive trials on each side; they are not compared."""
     identical: tuple[int, int]
-    """Of so many trials that both sides played, so many (first) have the same estimates to the bit."""
+    """Trials with bit-identical estimates on both sides, and trials that both sides played."""
 
     @property
     def is_same(self) -> bool:
-        """Both sides played the same, and estimated the same to the bit."""
+        """True if both sides played the same trials with bit-identical estimates."""
         same, both = self.identical
         return same == both > 0
 
     @property
     def least_seeds(self) -> int:
-        """With fewer that both sides have, nothing could be called worse, however much it was."""
+        """Smallest number of common seeds with which any difference can be significant."""
         return 1 + math.ceil(math.log2(max(1, len(self.differences)) / self.alpha))
 
     @property
@@ -96,7 +95,7 @@ class Comparison:
 
 
 def compare(a: Sequence[Observation], b: Sequence[Observation], alpha: float = 0.01) -> Comparison:
-    """``b`` against ``a``. The same two sides give the same answer."""
+    """Comparison of ``b`` with ``a``. The same two sides give the same result."""
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"alpha must be between 0 and 1, not {alpha:g}")
     ours, theirs = valid(a), valid(b)
@@ -168,7 +167,7 @@ def _by_seed(quantity: Quantity, side: Mapping[Any, Row], other: Mapping[Any, Ro
 
 
 def sign_flip_p(differences: NDArray[np.float64]) -> float:
-    """How probable so large a mean, either way, is if each difference might as well have the other sign."""
+    """Two-sided p-value of the mean difference under random exchange of signs."""
     moved = differences[differences != 0.0]
     observed = abs(moved.sum())
     if not len(moved):
@@ -185,7 +184,7 @@ def sign_flip_p(differences: NDArray[np.float64]) -> float:
 
 
 def permutation_p(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """How probable means so far apart, either way, are if it were chance which value is on which side."""
+    """Two-sided p-value of the difference of means under random permutation of the sides."""
     pooled, n = np.concatenate((x, y)), len(x)
     pooled = pooled - pooled.mean()
     observed = abs(pooled[:n].sum())
@@ -204,7 +203,7 @@ def _portions() -> list[int]:
 
 
 def _worded(found: Sequence[Difference], alpha: float) -> tuple[Difference, ...]:
-    """With Holm's adjustment, and what may be said then."""
+    """Differences with Holm-adjusted p-values, and the conclusion from each."""
     adjusted: dict[int, float] = {}
     floor = 0.0
     for rank, i in enumerate(sorted(range(len(found)), key=lambda i: found[i].p)):

@@ -1,7 +1,7 @@
-"""A campaign: many trials, played by whoever is there, to one file of results.
+"""Campaign execution: many trials, played by the available workers, to one results file.
 
-The results are a function of the plan alone: neither the number of workers, nor the order in which they are done, nor
-how often the campaign was interrupted changes a byte of them.
+The results are a function of the plan alone. The number of workers, the order of their work, and interruptions do not
+change a byte.
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ from analogrig.judging.statistics import Decision
 
 @dataclass
 class Tally:
-    """What has come, in any order, and what of it counts: of each cell the rounds without a gap, up to its end."""
+    """Chunks received so far, in any order, and the rows that count.
+
+    In each cell, consecutive rounds without a gap count, up to the cell's end.
+    """
 
     plan: Plan
     cells: int
@@ -43,7 +46,7 @@ class Tally:
         self.counts = [counts([]) for _ in range(self.cells)]
 
     def add(self, chunk: Chunk, rows: list[Row]) -> None:
-        """Count it, and what it completes."""
+        """Add the rows of a chunk, and count every round that is now without a gap."""
         self.came[chunk] = rows
         cell = chunk.cell
         while not self.ended[cell]:
@@ -64,7 +67,7 @@ class Tally:
             self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
 
     def total(self) -> dict[str, int]:
-        """The counts of all cells together."""
+        """Total counts over all cells."""
         return {name: sum(each[name] for each in self.counts) for name in counts([])}
 
 
@@ -72,7 +75,7 @@ Progress = Callable[[Tally], None]
 
 
 def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None = None) -> Results:
-    """Play the plan to ``out``. Interrupted by whatever, it goes on where it was when it is asked for again.
+    """Play the plan to ``out``. After any interruption, another call resumes it.
 
     :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
     :raises RecordingError: ``out`` cannot be written.
@@ -103,7 +106,9 @@ def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None =
 
 
 def unreachable(plan: Plan) -> dict[str, str]:
-    """Why devices cannot be had from here, by their names. Those within a process are not tried: a library may end it.
+    """Reasons why devices cannot be reached from this machine, by device name.
+
+    In-process devices are not tried: loading a library may crash this process.
 
     :raises ConfigurationError: a device refuses its configuration.
     """
@@ -118,12 +123,12 @@ def unreachable(plan: Plan) -> dict[str, str]:
 
 
 def journal_of(out: Path) -> Path:
-    """Where a campaign that has not ended keeps what it has got."""
+    """Path of the journal in which an unfinished campaign keeps its rows."""
     return out.with_name(f"{out.name}.journal")
 
 
 def _open_chunks(plan: Plan, tally: Tally) -> Iterator[Chunk]:
-    """What is still to be played, at the time it is asked."""
+    """Yield the chunks still to be played; evaluated at each step."""
     for chunk in plan.chunks():
         if chunk not in tally.came and not tally.ended[chunk.cell]:
             yield chunk

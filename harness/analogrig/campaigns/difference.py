@@ -1,4 +1,4 @@
-"""What two plans differ in, by the names that their files have for it."""
+"""Differences between two plans, by the key names of their files."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 SHOWN, LONGEST = 3, 60
-"""So many differences are named in one line, and so much of each value."""
+"""Number of differences named in one line, and characters shown of each value."""
 
 _ABSENT = object()
 
 
 def differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
-    """Each value that is not the same in two tables of plain values: its dotted name, and what it is in either."""
+    """Yield each value that differs between two tables of plain values: its dotted name and both values."""
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         for key in sorted(a.keys() | b.keys()):
             yield from differences(a.get(key, _ABSENT), b.get(key, _ABSENT), f"{name}.{key}" if name else key)
@@ -24,7 +24,7 @@ def differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, str, str]
 
 
 def named(found: Sequence[tuple[str, str, str]], sides: tuple[str, str]) -> str:
-    """The first of them, in part of a line."""
+    """First few differences, as part of a line."""
     more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
     return ", ".join(f"{name} is {a} {sides[0]} and {b} {sides[1]}" for name, a, b in found[:SHOWN]) + more
 

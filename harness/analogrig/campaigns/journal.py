@@ -1,7 +1,7 @@
-"""What a campaign has got so far, in a file that survives whatever ends the campaign.
+"""Journal of an unfinished campaign: a file that survives any interruption.
 
-A line for the plan, and one for each chunk, on the disk before the next is asked for: JSON, and its CRC in front. A
-line that was being written when the power went, or the disk was full, is not there; everything before it is.
+It has one line for the plan and one for each chunk: JSON, preceded by its CRC. Each line is on the disk before the next
+chunk is requested. A line cut short by a power failure or a full disk is ignored; every earlier line is valid.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ FORMAT, FORMAT_VERSION = "analogrig-campaign-journal", 2
 
 
 class Journal:
-    """Of one plan, beside its results."""
+    """Journal of one plan, beside its results."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
-        """Open or create it; ``rows`` is what it holds.
+        """Open or create the journal; ``rows`` holds its contents.
 
         :raises ConfigurationError: it is that of another campaign, or none, or another process has it.
         :raises RecordingError: it cannot be read or written.
@@ -41,7 +41,7 @@ class Journal:
             opened.pop_all()
 
     def add(self, chunk: Chunk, rows: list[Row]) -> None:
-        """It is on the disk when this returns.
+        """Append the rows of a chunk; they are on the disk when this returns.
 
         :raises RecordingError: it cannot be written.
         """
@@ -49,7 +49,7 @@ class Journal:
             self._write(_line({"chunk": list(chunk), "rows": rows}))
 
     def remove(self) -> None:
-        """All of it is elsewhere.
+        """Delete the journal, once the results file holds all of its rows.
 
         :raises RecordingError: the folder does not let it go.
         """
@@ -107,7 +107,7 @@ class Journal:
         plan.check_same(entry.get("plan"), f"{self.path}: what was kept there is of another campaign")
 
     def _read(self, lines: Iterator[bytes], whole: int, plan: Plan) -> int:
-        """Takes in all whole lines; the number of bytes up to their end."""
+        """Read all whole lines; return the number of bytes up to the end of the last one."""
         chunks = set(plan.chunks())
         for line in lines:
             entry = _entry(line)
@@ -145,7 +145,7 @@ def _line(entry: dict[str, Any]) -> bytes:
 
 
 def _entry(line: bytes) -> dict[str, Any] | None:
-    """None: damaged, or not all there."""
+    """Contents of a journal line; None if it is damaged or incomplete."""
     check, _, text = line.rstrip(b"\n").partition(b" ")
     if not line.endswith(b"\n") or check != b"%08x" % zlib.crc32(text):
         return None

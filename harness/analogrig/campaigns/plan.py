@@ -1,4 +1,4 @@
-"""What the trials of a campaign are: its file with everything that it names read in.
+"""Plan of a campaign: its file, with all the files that it names read in.
 
 A *cell* is one combination of rig, device and values of the grid. Each cell has the same number of trials, with the
 same seeds, so that cells and campaigns can be compared seed by seed. A *chunk* is some consecutive trials of one cell.
@@ -34,7 +34,7 @@ from analogrig.trust import Trust
 from analogrig.wording import number_of
 
 _DRAWS = 20_000
-"""Of the seeds: the stream of the campaign's own draws, apart from those of the rig."""
+"""Random stream of the campaign's own draws, separate from the rig's streams of the same seed."""
 
 _CHANGES = {
     "mass_factor": "mass_kg",
@@ -45,13 +45,13 @@ _CHANGES = {
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination."""
+    """Combination of rig, device and grid values."""
 
     rig: int
-    """Index in ``Plan.rigs``."""
+    """Index of the rig in ``Plan.rigs``."""
     device: int
     values: Mapping[str, float]
-    """Of the grid's axes."""
+    """Values of the grid's axes, by axis name."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Case:
 
 
 class Chunk(tuple[int, int]):
-    """(round, cell): the trials of one cell that are given to a worker at a time."""
+    """Pair (round, cell): the trials of one cell that a worker receives at a time."""
 
     __slots__ = ()
 
@@ -83,13 +83,13 @@ class Chunk(tuple[int, int]):
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign with everything that its file names read in: plain values, which any worker anywhere understands."""
+    """Campaign with the contents of all files that it names, as plain values that any worker can read."""
 
     spec: CampaignSpec
     scenario: Mapping[str, Any]
     rigs: tuple[Mapping[str, Any], ...]
     devices: tuple[Mapping[str, Any], ...]
-    """With the ``build`` of each."""
+    """Devices as plain values, each with its ``build``."""
     analogrig: str
     """The build of analogrig itself."""
 
@@ -100,13 +100,13 @@ class Plan:
 
     @property
     def size(self) -> int:
-        """The number of cells."""
+        """Number of cells."""
         combinations = math.prod(len(values) for values in self.spec.grid.axes().values())
         return len(self.rigs) * len(self.devices) * combinations
 
     @classmethod
     def of(cls, spec: CampaignSpec, allow: Trust | Iterable[str] = ()) -> Plan:
-        """The plan of a campaign; its rigs and devices are checked here, so that workers need not.
+        """Plan of a campaign. Its rigs and devices are checked here, so that workers need not check them.
 
         :param allow: things that a file may name (``analogrig.trust``).
         :raises ConfigurationError: a rig, device or scenario is absent or wrong, or a cell cannot be played; or a file
@@ -130,13 +130,13 @@ class Plan:
         return config.build(cls, json.loads(text), "the plan of the campaign")
 
     def as_table(self) -> dict[str, Any]:
-        """In plain values: all that decides the results, and nothing else."""
+        """Plan as plain values: everything that decides the results, and nothing else."""
         table = dataclasses.asdict(self)
         table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
         return table
 
     def as_json(self) -> str:
-        """The same plan gives the same text."""
+        """Plan as JSON text; equal plans give equal text."""
         return json.dumps(self.as_table(), sort_keys=True, separators=(",", ":"))
 
     def check_same(self, table: Any, where: str) -> None:
@@ -146,7 +146,7 @@ class Plan:
             raise ConfigurationError(f"{where} ({named(found, ('there', 'here'))}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
-        """In the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
+        """Cells in the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
         axes = self.spec.grid.axes()
         combinations = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
         return [
@@ -155,7 +155,7 @@ class Plan:
         ]
 
     def chunks(self) -> Iterator[Chunk]:
-        """Round by round, so that all cells progress together."""
+        """Yield the chunks round by round, so that all cells progress together."""
         rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
         return (Chunk((number, cell)) for number in range(rounds) for cell in range(cells))
 
@@ -166,7 +166,7 @@ class Plan:
         )
 
     def drawn(self, seed: int) -> dict[str, float]:
-        """The values of a trial that are drawn, by their axes."""
+        """Drawn values of a trial, by axis name."""
         rng = np.random.default_rng([seed, _DRAWS])
         return {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
 
@@ -202,7 +202,7 @@ class Plan:
                     raise ConfigurationError(f"{where}: {self._blamed(cell, drawn, opposite)}{problem}")
 
     def _problem(self, cell: Cell, drawn: Mapping[str, float]) -> str:
-        """Why such a trial cannot be set up on an emulated rig; empty if it can."""
+        """Reason why such a trial cannot be set up on an emulated rig; empty if it can."""
         try:
             case = self.case(cell, self.spec.first_seed, drawn)
             rig = open_table(case.rig) if "card" in case.rig else None
@@ -213,8 +213,11 @@ class Plan:
         return ""
 
     def _blamed(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
-        """Of the values at the ends of what is drawn, that which is wrong by itself; all, if none is; empty, if the
-        others are wrong as well."""
+        """Error prefix with the drawn value at fault.
+
+        It names the one value that is wrong by itself, or all values if none is. It is empty if the opposite corner
+        fails as well.
+        """
         if not opposite or self._problem(cell, opposite):
             return ""
         alone = ({axis: value} for axis, value in corner.items())
@@ -222,7 +225,7 @@ class Plan:
 
 
 def open_table(table: Mapping[str, Any]) -> Rig:
-    """The rig of a plan's table.
+    """Rig described by a plan's table.
 
     :raises ConfigurationError: it is wrong.
     """
@@ -232,7 +235,7 @@ def open_table(table: Mapping[str, Any]) -> Rig:
 
 
 def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
-    """A device by its name, as plain values that ``device_of`` takes, with its ``build``.
+    """Device ``name`` as plain values that ``device_of`` takes, with its ``build``.
 
     :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read or is not allowed.
     """
@@ -241,12 +244,12 @@ def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, A
 
 
 def device_of(table: Mapping[str, Any]) -> DeviceDescription:
-    """The device of such a table, whatever its build is by now."""
+    """Device of such a table; its current build is not checked."""
     return from_table({key: value for key, value in table.items() if key != "build"}, f"device {table['name']}")
 
 
 def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
-    """As ``device_of``; of the build that the table names, if it does.
+    """Device of such a table, after a check of its build if the table names one.
 
     :raises ConfigurationError: it is another by now.
     """
@@ -257,8 +260,7 @@ def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
 
 
 def one_worker_only(*tables: Mapping[str, Any]) -> str:
-    """Of rigs and devices the name of the first of which there is only one, so that two workers cannot both have it; ""
-    if there is none."""
+    """Name of the first rig or device that only one worker can use at a time; "" if there is none."""
     return next(filter(None, map(_only_one, tables)), "")
 
 
@@ -269,7 +271,7 @@ def _only_one(table: Mapping[str, Any]) -> str:
 
 
 def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
-    """A rig by its name, as plain values that ``open_table`` takes.
+    """Rig ``name`` as plain values that ``open_table`` takes.
 
     :raises ConfigurationError: there is none, or it can play but one scenario, or it names what is not allowed.
     """
@@ -292,7 +294,7 @@ def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -
 
 
 def _given(value: Any) -> Any:
-    """Plain values, without what is not given."""
+    """Plain values without the entries that are None."""
     if isinstance(value, Mapping):
         return {key: _given(item) for key, item in value.items() if item is not None}
     return [_given(item) for item in value] if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""The rigs and devices that a worker has open, each once, and how a case is played on them."""
+"""Rigs and devices that a worker has open, each once, and how a case is played on them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from analogrig.run import Run
 Held = TypeVar("Held")
 
 Table = Mapping[str, Any]
-"""What a rig or a device is, in plain values."""
+"""Description of a rig or a device, as plain values."""
 
 
 class _Kept(Generic[Held]):
-    """The last few of what was opened, by what they are: cells come in turn."""
+    """Cache of the most recently opened rigs or devices, by description: a worker gets cells in turn."""
 
     MOST = 64
 
@@ -36,7 +36,7 @@ class _Kept(Generic[Held]):
         self._held: dict[str, tuple[Held, ExitStack]] = {}
 
     def get(self, table: Table) -> Held:
-        """Opened now, unless it is open."""
+        """Return the open object for this description; open it first if necessary."""
         key = _key(table)
         if key not in self._held:
             while len(self._held) >= self.MOST:
@@ -47,7 +47,7 @@ class _Kept(Generic[Held]):
         return self._held[key][0]
 
     def drop(self, table: Table) -> None:
-        """What hung must not hang the next: it is opened anew."""
+        """Close the device so that the next trial reopens it."""
         if _key(table) in self._held:
             self._close(_key(table))
 
@@ -66,7 +66,7 @@ def _key(table: Table) -> str:
 
 @dataclass
 class _OpenRig:
-    """A rig, and of each device its trials within this process; None: it is not played there."""
+    """Open rig, with the in-process trials of each device; None: the device is not played in this process."""
 
     rig: Rig
     trials: dict[str, Trials | None] = field(default_factory=dict)
@@ -87,13 +87,13 @@ def _open_device(table: Table) -> Dut:
 
 
 class Players(threading.local):
-    """Of each thread its own."""
+    """Open rigs and devices of one thread."""
 
     def __init__(self) -> None:
         self._rigs, self._devices = _Kept(_open_rig), _Kept(_open_device)
 
     def trials(self, case: Case) -> Trials | None:
-        """None: the case is not played within this process.
+        """In-process trials for a case; None if the case is not played in this process.
 
         :raises ConfigurationError: the device refuses its configuration, or is another build than was planned.
         :raises LinkError: its library cannot be loaded.
@@ -105,7 +105,7 @@ class Players(threading.local):
         return opened.trials[key]
 
     def play(self, case: Case) -> Run:
-        """Within this process or on a bench. After a run that was not valid the device is reached anew.
+        """Play a case in this process or on a bench. After an invalid run the device is reopened.
 
         :raises ConfigurationError, RigError: as ``trials``, or the case cannot be played.
         :raises LinkError, DeviceError: the device cannot be had.
@@ -127,6 +127,6 @@ class Players(threading.local):
         return raise_if_interrupted(run)
 
     def close(self) -> None:
-        """Let go of all that this thread has opened."""
+        """Close everything that this thread has opened."""
         self._devices.close()
         self._rigs.close()

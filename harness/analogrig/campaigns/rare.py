@@ -1,19 +1,19 @@
-"""False alarms too rare to be waited for: branches off a play, with louder noise, each weighed by how likely it was.
+"""Rate of rare false alarms, by importance sampling: branches off a play with louder noise, weighted by likelihood.
 
-Between two false alarms the trigger's statistic comes back to the ground, 0, again and again, and every alarm ends one
-climb from there. So the rate of alarms is the mean, over the samples of a play, of the chance that the statistic is on
-the ground, and climbs to an alarm from there without coming back. Branches find that chance: from states of the play in
-which the statistic is on the ground, drawn evenly, each goes on with noise of its own on the displacement, a few times
-as strong as the card's, up to an alarm or back to the ground. One that ends in an alarm counts as much as its noise
-was likelier to come from the card than from the louder ones. The mean is unbiased, however loud they are (importance
-sampling; Siegmund, Annals of Statistics 4, 1976, did so for sequential tests). With twice the noise the ratio of
+Between two false alarms the trigger's statistic returns to the ground, 0, many times. Every alarm ends one climb from
+there. The rate of alarms is therefore a mean over the samples of a play: the probability that the statistic is on the
+ground and climbs to an alarm without returning. Branches estimate that probability. They start from states of the play
+with the statistic on the ground, drawn uniformly. Each continues up to an alarm or back to the ground. Its displacement
+has noise of its own, a few times as strong as the card's. A branch that ends in an alarm is weighted by the likelihood
+ratio of its noise, the card's against the louder ones. The mean is unbiased for any loudness (importance sampling;
+Siegmund, Annals of Statistics 4, 1976, for sequential tests). With twice the noise the ratio of
 likelihoods is nearly the statistic itself, a CUSUM of "the variance has grown fourfold": all weights are about
 exp(-ceiling), and the mean of few branches is good, however rare the alarms are. A mixture of LOUDER keeps single
-weights from being large (the balance heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000). How
-good the mean is, plays of other seeds tell: ``statistics.mean_bounds``.
+weights from being large (the balance heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000).
+Plays of other seeds give the bounds of the mean: ``statistics.mean_bounds``.
 
-Splitting by levels of the statistic is unbiased too, and was given up: one reading far off lifts the statistic by many
-levels at once, which a play of some thousand samples hardly ever sees (harness/docs/background/campaigns.md).
+Splitting by levels of the statistic is unbiased too, but unsuitable: one outlier lifts the statistic by many levels at
+once, and a play of some thousand samples rarely has one (harness/docs/background/campaigns.md).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from analogrig.run import CHANNELS
 from analogrig.scenario import Scenario
 
 BRANCHES_N = 2_000
-"""Off each play."""
+"""Number of branches off each play."""
 
 PLAY_N, TAIL_N = 20_000, 2_000
 """Samples of a play from which branches go off; and after them, into which they may go."""
 
 LOUDER = np.array([1.6, 2.0, 2.6])
-"""How many times as strong the noise of the branches is, in turn."""
+"""Factors on the standard deviation of the branches' noise, used in turn."""
 
 _DISPLACEMENT = CHANNELS.index("displacement")
 
@@ -51,41 +51,41 @@ LEAD_IN_N = 16
 """Samples that fill the regressors before the first equation, for any model that a device can have."""
 
 _STRETCH_N = 32
-"""Samples that all branches go on at a time."""
+"""Number of samples by which all branches advance at a time."""
 
 _BRANCHES = 1_000_003
-"""Sets the chance of branches apart from whatever else a seed gives."""
+"""Random stream of the branches, separate from all other streams of the same seed."""
 
 
 class Estimate(NamedTuple):
-    """What one play gives."""
+    """Estimate from one play."""
 
     rate: float
-    """Alarms per sample; 0 if no branch came to one."""
+    """Alarms per sample; 0 if no branch ended in one."""
     alarms: int
-    """Branches that came to one."""
+    """Number of branches that ended in an alarm."""
     samples: int
-    """That the estimator took in."""
+    """Number of samples that the estimator processed."""
 
 
 class _Branches(NamedTuple):
-    """Branches on their way; a row for each."""
+    """Branches in progress, one row each."""
 
     kept: NDArray[np.uint8]
-    """(b, size): what the estimator knows."""
+    """(b, size): saved states of the estimator."""
     following: NDArray[np.int64]
     """(b,): the index of its next sample."""
     louder: NDArray[np.float64]
-    """(b,): how many times as strong its noise is."""
+    """(b,): noise factor of each branch."""
     log_ratios: NDArray[np.float64]
-    """(b, len(LOUDER)): how much likelier its noise is to come from each of the louder ones than from the card."""
+    """(b, len(LOUDER)): log-likelihood ratios of the branch's noise, each of the louder noises against the card's."""
 
     def at(self, rows: NDArray[np.bool_]) -> _Branches:
         return _Branches(self.kept[rows], self.following[rows], self.louder[rows], self.log_ratios[rows])
 
     @property
     def weights(self) -> list[float]:
-        """How much each counts: 1 over the mean of the ratios."""
+        """Weight of each branch: 1 over the mean of its likelihood ratios."""
         weights: list[float] = (1.0 / np.exp(self.log_ratios).mean(axis=1)).tolist()
         return weights
 
@@ -93,9 +93,9 @@ class _Branches(NamedTuple):
 def false_alarm_rate(
     rig: EmulatorRig, device: DeviceDescription, scenario: Scenario, seed: int, branches: int = BRANCHES_N
 ) -> Estimate:
-    """An estimate without bias of first alarms per sample of a warm estimator, from one play.
+    """Unbiased estimate of first alarms per sample of a warm estimator, from one play.
 
-    For rates well below 1 / PLAY_N: a play ends with its first alarm.
+    Valid for rates well below 1 / PLAY_N: a play ends with its first alarm.
 
     :param scenario: one without changes; its number of samples does not matter.
     :raises ConfigurationError: the trigger has no ground to come back to; or as Trials.
@@ -115,7 +115,7 @@ def false_alarm_rate(
 
 
 class _Climbs:
-    """From the ground of one play."""
+    """Climbs of the statistic from the ground, in one play."""
 
     def __init__(
         self,
@@ -148,7 +148,8 @@ class _Climbs:
         return Estimate(rate, len(weights), self._samples)
 
     def _ground(self, first: int) -> tuple[NDArray[np.intp], int]:
-        """The samples after which the statistic is on the ground, up to the first alarm; and of how many that is."""
+        """Samples after which the statistic is on the ground, up to the first alarm, and the number of samples
+        searched."""
         end = first + PLAY_N
         self._estimator.restart()
         steps = self._estimator.run(*(signal[:end] for signal in entered(self._play)))
@@ -163,7 +164,7 @@ class _Climbs:
         return first + np.flatnonzero(steps.statistic[first:end] <= 0.0), end - first
 
     def _kept_at(self, samples: NDArray[np.intp]) -> NDArray[np.uint8]:
-        """What the estimator knows after each of these samples, in rising order."""
+        """Saved states of the estimator after each of these samples, which must be in rising order."""
         signals = entered(self._play)
         kept, before = [], 0
         self._estimator.restart()
@@ -175,7 +176,10 @@ class _Climbs:
         return np.stack(kept)
 
     def _go_on(self, going: _Branches) -> tuple[_Branches, _Branches]:
-        """A stretch further: those that came to an alarm, and those that are neither there nor back on the ground."""
+        """Advance the branches by a stretch.
+
+        Return those that ended in an alarm, and those that neither ended in one nor came back to the ground.
+        """
         (u, y, valid), drawn = self._louder(going)
         statistic, alarm, kept = self._estimator.branch(going.kept, u, y, valid)
         self._samples += u.size
@@ -189,8 +193,11 @@ class _Climbs:
         return after.at(arrived), after.at(still)
 
     def _louder(self, going: _Branches) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
-        """Force, displacement and what is valid of the next samples of each, and the numbers, normal for the card, of
-        which the noise of the displacement is made: (b, _STRETCH_N)."""
+        """Estimator inputs of each branch's next samples, and the random numbers behind them.
+
+        The inputs are force, displacement and validity. The numbers, (b, _STRETCH_N), are standard normal for the card
+        and make up the noise of the displacement.
+        """
         index = going.following[:, None] + np.arange(-1, _STRETCH_N)  # the card holds part of the sample before
         if index[:, -1].max() >= len(self._play.volts):
             raise DeviceError(f"the statistic neither came to an alarm nor back to zero within {TAIL_N} samples")
@@ -203,6 +210,6 @@ class _Climbs:
 
 
 def _first_true(found: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Of each row; its length if there is none."""
+    """Index of the first true element in each row; the row's length if there is none."""
     first: NDArray[np.intp] = np.where(found.any(axis=1), found.argmax(axis=1), found.shape[1])
     return first

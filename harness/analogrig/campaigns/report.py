@@ -1,4 +1,4 @@
-"""The page of a campaign: its table, and maps of latency and miss rate over two axes of the grid."""
+"""Page of a campaign: its table, and maps of latency and miss rate over two axes of the grid."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from analogrig.storage import replacing
 _TEMPLATE = FOLDER / "campaign.html"
 
 _MARK = b'data-page="analogrig-campaign"'
-"""By which a page is known for one of a campaign."""
+"""Marker that identifies the page of a campaign."""
 
 _WIDTH, _HEIGHT, _LEFT, _TOP = 74, 34, 110, 26
 _DEEPEST = (0, 114, 178)
-"""The blue of Okabe and Ito; a value of zero is white."""
+"""Blue of Okabe and Ito for the largest value; a value of zero is white."""
 
 MOST_MAPS = 40
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a map shows."""
+    """Quantity that a map shows."""
 
     title: str
     of: Callable[[Summary], float | None]
@@ -43,7 +43,7 @@ QUANTITIES = (
 
 
 def page_of(out: Path) -> Path:
-    """The place of the page beside the results.
+    """Path of the page beside the results.
 
     :raises ConfigurationError: something else stands there, or the results themselves would.
     """
@@ -94,7 +94,7 @@ def render(results: Results, played_by: Sequence[Identity] = ()) -> str:
 
 
 def _maps(results: Results) -> str:
-    """One map of each quantity for every combination of what is not on the axes."""
+    """Maps of each quantity, one for every combination of the values that are not on the axes."""
     axes = [axis for axis, values in results.plan.spec.grid.axes().items() if len(values) > 1][:2]
     if not axes:
         return ""

@@ -1,4 +1,4 @@
-"""The results of a campaign: one JSON file without dates, and what it says in tables."""
+"""Results of a campaign: one JSON file without dates, and its tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 MAX_FILE_BYTES = 4_000_000_000
 
 CONFIDENCE = 0.95
-"""Of the bounds in the tables, which hold whenever a campaign was ended."""
+"""Confidence level of the bounds in the tables; they hold at any stopping time of a campaign."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Results:
         return results
 
     def of_plan(self, plan: Plan, path: Path) -> Results:
-        """These, if they are that plan's.
+        """Return these results if they belong to the plan.
 
         :raises ConfigurationError: they are another's.
         """
@@ -74,7 +74,7 @@ class Results:
         return self
 
     def cells(self) -> list[tuple[Cell, Summary]]:
-        """What each cell gave."""
+        """Cells, each with the summary of its trials."""
         return [(cell, Summary.of(rows)) for cell, rows in zip(self.plan.cells(), self.rows, strict=True)]
 
     def total(self) -> Summary:
@@ -100,7 +100,7 @@ class Results:
 
 @dataclass(frozen=True)
 class Summary:
-    """Of some trials; inconclusive ones are counted, and nothing of them is."""
+    """Summary of some trials; inconclusive ones are only counted."""
 
     trials: int
     passed: int
@@ -108,23 +108,23 @@ class Summary:
     inconclusive: int
     samples: int
     armed: int
-    """Those in which the trigger was armed."""
+    """Exposure: samples in which the trigger was armed."""
     false_alarms: int
     false_alarm_rate: tuple[float, float]
-    """Bounds, per sample in which the trigger was armed."""
+    """Bounds per sample in which the trigger was armed."""
     visible: int
     missed: int
     late: int
     miss_rate: tuple[float, float]
     latency_n: float | None
-    """Mean; None: nothing was detected."""
+    """Mean detection delay; None: nothing was detected."""
     latency_p95_n: float | None
     bound_n: float | None
-    """Mean information bound of the changes that were detected and could be."""
+    """Mean information bound of the changes that were detected and detectable."""
     error: Mapping[str, float]
     """rms relative error of M, B and K at the end."""
     doubt: str
-    """The seed of the first inconclusive trial, and why it is that; empty: there is none."""
+    """Seed of the first inconclusive trial, with the reason; empty if there is none."""
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
@@ -157,7 +157,7 @@ class Summary:
 
 
 def label(plan: Plan, cell: Cell) -> dict[str, str]:
-    """What tells a cell from the others: rig and device where there are several, and the values of the grid."""
+    """Labels that identify a cell: rig and device where there are several, and the values of the grid."""
     out = {}
     if len(plan.rigs) > 1:
         out["rig"] = str(plan.rigs[cell.rig]["name"])
@@ -167,7 +167,7 @@ def label(plan: Plan, cell: Cell) -> dict[str, str]:
 
 
 def anytime_text(counted: Mapping[str, int]) -> str:
-    """What ``rows.counts`` has counted, with bounds, in one line."""
+    """Rates of the events that ``rows.counts`` counts, with bounds, in one line."""
     parts = []
     for name, rate in RATES.items():
         if counted[rate.exposure]:
@@ -179,11 +179,11 @@ def anytime_text(counted: Mapping[str, int]) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """Of the tables."""
+    """Column of the tables."""
 
     title: str
     short: str
-    """The same where there is little room."""
+    """Title where there is little room."""
     form: str
     of: Callable[[Summary], float | None]
 
@@ -213,7 +213,7 @@ COLUMNS = (
 
 
 def text(results: Results) -> str:
-    """Several lines, without a final newline."""
+    """Results as several lines of text, without a final newline."""
     spec, total = results.plan.spec, results.total()
     cells = results.cells()
     labels = [label(results.plan, cell) for cell, _ in cells]
@@ -237,7 +237,7 @@ def text(results: Results) -> str:
 
 
 def as_json(results: Results) -> dict[str, Any]:
-    """In plain values; rates as [low, high]."""
+    """Results as plain values; rates as [low, high]."""
     cells = [{**label(results.plan, cell), **vars(summary)} for cell, summary in results.cells()]
     return {
         "campaign": results.plan.spec.name,

@@ -1,4 +1,4 @@
-"""What is kept of a trial, in plain values, and what is counted in many of them."""
+"""Rows: the record of each trial in plain values, and counts over many of them."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from analogrig.plant import PARAMETERS
 from analogrig.run import MAX_SAMPLES, Run
 
 Row = dict[str, Any]
-"""Of one trial, in plain values; see ``row``."""
+"""Record of one trial, in plain values; see ``row``."""
 
 
 class Change(NamedTuple):
-    """One change of the plant, and how it was noticed; samples from it."""
+    """Change of the plant, and its detection; samples are relative to the change."""
 
     latency_n: int | None
     bound_n: int | None
-    """None: it could not be seen."""
+    """Information bound; None: the change was not detectable."""
     missed: bool
     late: bool
 
     @classmethod
     def of(cls, tweak: ChangeVerdict) -> Change:
-        """At its likeliest instant; one that was not found in the samples is as one that nobody could see."""
+        """Change at its likeliest instant; one that was not found in the samples is recorded as not detectable."""
         if tweak.unseen:
             return cls(None, None, missed=False, late=False)
         return cls(tweak.latency_n, tweak.bound_n, tweak.missed, tweak.late)
 
 
 def changes(row: Row) -> list[Change]:
-    """Of a trial."""
+    """Changes of a trial."""
     return [Change(*each) for each in row["changes"]]
 
 
 def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) -> Row:
-    """What is kept of a trial.
+    """Record of a trial.
 
     ``armed``: the samples in which the trigger was armed. ``changes``: the fields of ``Change`` of each. ``errors``:
     relative errors of M, B, K at the end, or none. ``theta``: the first digits of the hash of all estimates, which
-    tells builds apart. ``why``: the first reason why it has not passed.
+    identifies the build. ``why``: the first reason why the trial has not passed.
     """
     return _row(
         run.conditions.seed,
@@ -61,7 +61,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
 
 
 def row_of_none(seed: int, drawn: Mapping[str, float], why: str) -> Row:
-    """Of a trial that could not be played."""
+    """Record of a trial that could not be played."""
     return _row(seed, "inconclusive", drawn, why=why)
 
 
@@ -74,7 +74,7 @@ def _row(seed: int, outcome: str, drawn: Mapping[str, float] | None, *, why: str
 
 
 def _errors(verdict: Verdict) -> list[float]:
-    """Of the last estimate; one of numbers beyond all measure is none."""
+    """Relative errors of the last estimate; empty if there is none or one is non-finite."""
     found = list(verdict.estimates[-1].error.values()) if verdict.estimates else []
     return found if all(map(math.isfinite, found)) else []
 
@@ -111,17 +111,17 @@ def _is_change(change: Change) -> bool:
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of what could happen did; by their names in ``counts``."""
+    """Rate of events per exposure; both are keys of ``counts``."""
 
     events: str
     exposure: str
     unit: str
-    """Of the exposure, in words."""
+    """Unit of the exposure, in words."""
     expected: float
-    """Where bounds of it are tightest."""
+    """Rate at which the bounds are tightest."""
 
     def known(self, counted: Mapping[str, int], confidence: float, around: float | None = None) -> ConfidenceSequence:
-        """What is known of it; ``around``: where the bounds shall be tightest instead."""
+        """Confidence sequence for the rate; ``around`` overrides the rate at which its bounds are tightest."""
         expected = self.expected if around is None else around
         return ConfidenceSequence(confidence, expected, trials=counted[self.exposure], events=counted[self.events])
 
@@ -133,8 +133,11 @@ RATES = {
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """Of the valid trials: ``samples``, those in which the trigger was ``armed``, ``false_alarms``, ``visible``
-    changes, ``missed`` ones."""
+    """Counts over the valid trials.
+
+    ``samples``, ``armed`` (samples in which the trigger was armed), ``false_alarms``, ``visible`` (detectable changes)
+    and ``missed`` (of those).
+    """
     sound = valid(rows)
     visible = [change for each in sound for change in changes(each) if change.bound_n is not None]
     return {
@@ -145,10 +148,10 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def valid(rows: Sequence[Row]) -> list[Row]:
-    """Those that are."""
+    """Valid rows."""
     return list(filter(is_valid, rows))
 
 
 def is_valid(row: Row) -> bool:
-    """Whether it says anything."""
+    """True if the trial is not inconclusive."""
     return bool(row["outcome"] != "inconclusive")

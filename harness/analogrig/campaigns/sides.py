@@ -1,4 +1,4 @@
-"""The two sides of a comparison: their trials, and whether they played the same."""
+"""Sides of a comparison: their trials, and a check that both played the same."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from analogrig.judging.verdict import judge
 from analogrig.run import Run
 
 Observation = tuple[tuple[object, ...], Row]
-"""What was played, seed included, and what came of it."""
+"""Key of a trial, seed included, and its row."""
 
 
 @dataclass(frozen=True)
 class Side:
-    """What is set against another."""
+    """One side of a comparison."""
 
     trials: tuple[Observation, ...]
-    """Valid or not."""
+    """Trials, valid or not."""
     plan: Plan | None = None
-    """None: recordings."""
+    """Plan of the campaign; None: the trials come from recordings."""
 
 
 def load(path: Path) -> Side:
-    """The trials of a results file, of a recording, or of all recordings below a folder.
+    """Trials of a results file, of a recording, or of all recordings below a folder.
 
     :raises RecordingError: it cannot be read, or there is nothing valid in it.
     :raises ConfigurationError: two recordings are of one play; names them.
@@ -52,7 +52,7 @@ def load(path: Path) -> Side:
 
 
 def matched(a: Side, b: Side) -> tuple[Sequence[Observation], Sequence[Observation]]:
-    """What of both sides played the same; the devices may be others.
+    """Trials of both sides that played the same; the devices may differ.
 
     :raises ConfigurationError: they are of different campaigns, or played nothing in common; names what differs.
     """
@@ -75,12 +75,12 @@ def _check_same(otherwise: str, ours: Any, theirs: Any) -> None:
 
 
 def _names(plan: Plan) -> list[str]:
-    """Of the devices."""
+    """Names of the devices."""
     return [str(device["name"]) for device in plan.devices]
 
 
 def _in_order(side: Side, wanted: Sequence[str], names: Sequence[str]) -> Sequence[Observation]:
-    """With the devices numbered as on the other side, if they are the same by name; else each is that in its place."""
+    """Trials with the devices numbered as on the other side, if their names match; else numbered by position."""
     if set(wanted) != set(names):
         return side.trials
     return [((key[0], wanted.index(names[int(str(key[1]))]), *key[2:]), each) for key, each in side.trials]
@@ -92,7 +92,7 @@ def _recorded_play(trial: Observation) -> dict[str, Any]:
 
 
 def _played(plan: Plan) -> dict[str, Any]:
-    """What a campaign played, whatever device it had, and whatever it was called."""
+    """Settings that decide what a campaign played, without its devices and names."""
     table = plan.as_table()
     spec = {key: value for key, value in table["spec"].items() if key not in _NAMES}
     if "stop" not in spec:
@@ -106,17 +106,17 @@ def _played(plan: Plan) -> dict[str, Any]:
 
 
 _NAMES = frozenset({"name", "description", "scenario", "rigs", "devices", "samples"})
-"""In a campaign's file: of no consequence, or what they name is in the plan."""
+"""Keys of a campaign's file that are irrelevant, or whose contents are in the plan."""
 
 
 def _unnamed(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Without what it is called, unless it is nothing but a name."""
+    """Table without its name and description, unless it has nothing else."""
     rest = {key: value for key, value in table.items() if key not in {"name", "description"}}
     return rest or dict(table)
 
 
 def valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
-    """By what was played; without those of which nothing is said."""
+    """Rows of the valid trials, by key."""
     return {key: each for key, each in trials if is_valid(each)}
 
 

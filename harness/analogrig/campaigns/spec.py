@@ -1,4 +1,4 @@
-"""The file of a campaign: TOML that says what shall be played."""
+"""File of a campaign: TOML that defines what is played."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AXES = (
     *("mass_factor", "damping_factor", "stiffness_factor"),
     "noise_lsb",
 )
-"""What can be varied. The plant at the start; by what it is multiplied at the change; rms noise of the card."""
+"""Axes that can be varied: plant at the start, factors at the change, rms noise of the card."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Grid:
                 raise ValueError(f"{axis} has a value twice")
 
     def axes(self) -> dict[str, tuple[float, ...]]:
-        """Those that are given."""
+        """Axes that are given, with their values."""
         return {axis: values for axis, values in vars(self).items() if values}
 
 
 @dataclass(frozen=True)
 class Draw:
-    """The ``[draw]`` table: values drawn for each trial from its seed, evenly between the ends."""
+    """The ``[draw]`` table: values drawn for each trial from its seed, uniformly between the ends."""
 
     mass_kg: tuple[float, float] | None = None
     damping_n_s_per_m: tuple[float, float] | None = None
@@ -61,25 +61,28 @@ class Draw:
                 raise ValueError(f"{axis} must be (low, high), not ({ends[0]:g}, {ends[1]:g})")
 
     def axes(self) -> dict[str, tuple[float, float]]:
-        """Those that are given."""
+        """Axes that are given, with both ends."""
         return {axis: ends for axis, ends in vars(self).items() if ends is not None}
 
     def corners(self) -> tuple[dict[str, float], ...]:
-        """All at their low ends, and all at their high ones: each pot, and the noise, are within what they are there,
-        for a parameter and its factor turn the same pot the same way."""
+        """Low ends of all axes, and high ends of all axes.
+
+        Every pot and the noise stay between their values at these two corners: a parameter and its factor move the same
+        pot in the same direction.
+        """
         axes = self.axes()
         return tuple({axis: ends[i] for axis, ends in axes.items()} for i in range(2 if axes else 0))
 
 
 @dataclass(frozen=True)
 class Stop:
-    """The ``[stop]`` table: a cell ends when it is certain on which side of ``rate`` it is.
+    """The ``[stop]`` table: a cell ends once its rate is certain to be above or below ``rate``.
 
-    Certain in the sense of a confidence sequence, which may be looked at after every trial.
+    The decision comes from a confidence sequence, which may be evaluated after every trial.
     """
 
     quantity: Literal["missed", "false_alarms"]
-    """``missed``: changes missed of those that could be seen; ``false_alarms``: per sample."""
+    """``missed``: missed fraction of the detectable changes; ``false_alarms``: false alarms per sample."""
     rate: float
     confidence: float = 0.99
 
@@ -91,20 +94,20 @@ class Stop:
 
 @dataclass(frozen=True)
 class CampaignSpec:
-    """A campaign's file."""
+    """File of a campaign."""
 
     scenario: str = "healthy"
     rigs: tuple[str, ...] = ("emulator",)
     devices: tuple[str, ...] = ("inproc",)
     trials: int = 100
-    """Of each cell, with the seeds from ``first_seed`` on."""
+    """Number of trials of each cell, with consecutive seeds from ``first_seed`` on."""
     first_seed: int = 0
     chunk: int = 10
-    """Trials that a worker is given at a time."""
+    """Number of trials that a worker receives at a time."""
     samples: int | None = None
-    """Of each trial, instead of the scenario's."""
+    """Number of samples of each trial; overrides the scenario's."""
     change_at: int = 1000
-    """The sample at which what a factor multiplies changes."""
+    """Sample at which the factors take effect."""
     grid: Grid = field(default_factory=Grid)
     draw: Draw = field(default_factory=Draw)
     stop: Stop | None = None
@@ -129,7 +132,7 @@ class CampaignSpec:
 
     @classmethod
     def load(cls, name: str) -> CampaignSpec:
-        """A shipped campaign by name, or a user's .toml file.
+        """Shipped campaign by name, or a user's .toml file.
 
         :raises ConfigurationError: absent, not TOML, or no campaign; names the file and the key.
         """

@@ -1,4 +1,4 @@
-"""What a worker does: play the trials of one chunk, and say of each what came of it."""
+"""Work of a worker: play the trials of one chunk, and return a row for each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _players = Players()
 
 
 def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
-    """The rows of a chunk of the plan (``Plan.as_json``): the same in every process on every machine.
+    """Rows of a chunk of the plan (``Plan.as_json``): the same in every process on every machine.
 
     :raises ConfigurationError: the build here is another, or a device refuses its configuration; names cell and seed.
     """
@@ -37,7 +37,7 @@ def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
 
 
 def _played(plan: Plan, cell: Cell, seed: int) -> Row:
-    """A trial that cannot be played is inconclusive: the next may be none the worse for it."""
+    """Row of a trial. One that cannot be played is inconclusive: the next one may succeed."""
     drawn = plan.drawn(seed)
     try:
         run = _players.play(plan.case(cell, seed))
@@ -48,17 +48,17 @@ def _played(plan: Plan, cell: Cell, seed: int) -> Row:
 
 @dataclass(frozen=True)
 class Count:
-    """The alarms of a trial in which nothing changes."""
+    """Alarms and exposure of a trial in which nothing changes."""
 
     alarms: int
     armed: int
     """Samples in which the trigger was armed."""
     fault: str = ""
-    """Why the trial is no evidence."""
+    """Reason why the trial is no evidence; empty if it is."""
 
 
 def count_alarms(case: Case) -> Count:
-    """As fast as it goes.
+    """Count the alarms of a case by the fastest available way.
 
     :raises ConfigurationError: it cannot be played.
     :raises LinkError, DeviceError, RigError: the device or the rig cannot be had.
@@ -91,5 +91,5 @@ def _plan(text: str) -> tuple[Plan, list[Cell]]:
 
 
 def close_devices() -> None:
-    """Let go of the devices and rigs that this thread's chunks have opened."""
+    """Close the devices and rigs that this thread's chunks have opened."""
     _players.close()

@@ -1,7 +1,7 @@
 """Closed-loop trials without a line: circuit, card and the C estimator in this process, whole blocks at a time.
 
-A trial is what Bench plays with the device ``inproc``, to the bit: the same codes, the same estimates, the same alarms.
-Only what the messages around them say is lacking: isolation's diagnoses, and the flags RESTARTED and IDLE.
+A trial is bit-identical to the one that Bench plays with the device ``inproc``: codes, estimates and alarms. It lacks
+only what other messages carry: the diagnoses of isolation, and the flags RESTARTED and IDLE.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from analogrig.run import CHANNELS, Conditions, Run, missing_samples
 from analogrig.scenario import Scenario
 
 BLOCK_SAMPLES = 16_384
-"""Samples that pass from the circuit to the card and on to the estimator at a time: they stay within the cache."""
+"""Block length in samples from the circuit to the card and the estimator; such blocks fit in the cache."""
 
 _FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
@@ -35,23 +35,23 @@ _FLAGS[StepStatus.GATHERING] = SteppedFlag.GATHERING
 
 
 def are_possible(rig: Rig, device: DeviceDescription) -> bool:
-    """Whether trials give what Bench gives: an emulated rig, and a device whose line does nothing to the samples."""
+    """True if trials match Bench: the rig is emulated, and the device's line does not alter the samples."""
     return is_emulated(rig) and device.can_run_in_blocks
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """Of a trial the alarms, and what their number is worth."""
+    """Alarms of a trial, with the exposure that they are to be judged by."""
 
     alarms: NDArray[np.int64]
-    """(a,) samples."""
+    """(a,): samples with an alarm."""
     exposure: Exposure
     missing: int
     refused: int
 
 
 class Trials:
-    """An emulated rig and an estimator, for any number of trials, one after the other."""
+    """Emulated rig and estimator, for any number of consecutive trials."""
 
     def __init__(self, rig: EmulatorRig, device: DeviceDescription) -> None:
         """:raises ConfigurationError: the estimator refuses its configuration.
@@ -66,7 +66,7 @@ class Trials:
         self._scenario_table: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def alarms(self, scenario: Scenario, seed: int) -> NDArray[np.int64]:
-        """The samples with an alarm, (a,), and nothing else: the fastest way.
+        """Samples with an alarm, (a,), and nothing else: the fastest way.
 
         :raises ConfigurationError: the scenario cannot be played on this rig.
         :raises RigError: the emulator failed.
@@ -77,7 +77,7 @@ class Trials:
         return np.concatenate(found)
 
     def watched(self, scenario: Scenario, seed: int) -> Watched:
-        """As ``alarms``, with what they are worth."""
+        """Alarms as from ``alarms``, with their exposure."""
         self._estimator.restart()
         n = scenario.samples
         force, status = np.empty(n, np.uint16), np.empty(n, np.uint8)
@@ -104,7 +104,7 @@ class Trials:
         return Watched(alarms, shown, missing, refused)
 
     def run(self, scenario: Scenario, seed: int) -> Run:
-        """One trial, for ``judge``; errors as ``alarms``."""
+        """Play one trial, for ``judge``; errors as ``alarms``."""
         self._estimator.restart()
         performance = self._rig.perform(scenario, seed, BLOCK_SAMPLES)
         blocks: list[Block] = []
@@ -156,10 +156,10 @@ class Trials:
 
 
 def entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
-    """What of a block goes to the estimator: force, displacement, and which samples are not missing; (n,) each."""
+    """Estimator inputs of one block: force, displacement, and True for each sample that is not missing; (n,) each."""
     return block.codes[:, _FORCE], block.codes[:, _DISPLACEMENT], ~missing_samples(block.clipped)
 
 
 def flags_of(status: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """StepStatus as the flags of a Run; (n,) each."""
+    """Flags of a Run for each StepStatus; (n,) each."""
     return _FLAGS.take(status)

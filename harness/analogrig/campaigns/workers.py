@@ -1,7 +1,7 @@
-"""Who plays the chunks of a campaign: this process, processes of this machine, or a cluster of Dask.
+"""Workers that play the chunks of a campaign: this process, processes of this machine, or a cluster of Dask.
 
-Each takes tasks as it has hands free and yields what came of them, in whatever order. What a worker that was killed had
-in hand is given to another, nothing else; a task that is the end of ``MOST_DEATHS`` workers ends the campaign.
+Each takes tasks when it has capacity, and yields results in any order. Only the tasks in flight on a killed worker are
+given to another. A task that has killed ``MOST_DEATHS`` workers ends the campaign.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _LOADED = ("analogrig.campaigns.trial", "analogrig.campaigns.certificate")
-"""What a worker is made of. The process that they are forked from loads it once, while this one reads its orders."""
+"""Modules that every worker needs. The fork server loads them once, while this process reads its arguments."""
 
 MOST_DEATHS = 3
 """Workers that may be lost over one task."""
@@ -37,19 +37,19 @@ _DESCRIPTORS, _DESCRIPTORS_EACH = 48, 8
 """Files that must be allowed to be open at once, and those for each worker."""
 
 _IN_HAND = 2
-"""Tasks for each worker of a cluster, so that none waits for the way there and back."""
+"""Tasks in flight for each worker of a cluster, so that none waits for a round trip."""
 
 _ANSWER_S = 10
-"""A scheduler that does not answer within so long is not there."""
+"""Time-out in seconds for an answer of the scheduler."""
 
 _TALKATIVE = ("distributed", "distributed.client", "tornado.application", "asyncio")
-"""Loggers that print tracebacks of a connection that is lost, which the WorkerError reports in one line."""
+"""Loggers that print tracebacks of a lost connection, which the WorkerError reports in one line."""
 
 
 def prepare() -> None:
-    """Begin to load, in the process that the workers of this machine are forked from, what they need.
+    """Preload the modules that workers need, in the process from which they are forked.
 
-    Worth a call before all else that takes long.
+    Call it before anything else that takes long.
 
     :raises ConfigurationError: too few files may be open.
     """
@@ -66,7 +66,7 @@ def prepare() -> None:
 
 
 def _check_descriptors(workers: int) -> None:
-    """Refuse what would end halfway: the processes that fork workers report it by a traceback of their own.
+    """Check the limit on open files in advance: the fork server would report its lack by a traceback of its own.
 
     :raises ConfigurationError: too few files may be open.
     """
@@ -79,17 +79,17 @@ def _check_descriptors(workers: int) -> None:
 
 
 class Workers(Protocol):
-    """Play tasks."""
+    """Interface of all workers: play tasks."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
-        """Each task with its result. Tasks are taken one by one, when somebody can begin with them.
+        """Yield each task with its result. A task is taken only when a worker can start it.
 
         :raises WorkerError: workers keep dying over a task, or cannot be reached.
         """
 
 
 class ThisProcess:
-    """One after the other, here."""
+    """Worker that plays the tasks one after the other in this process."""
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
         for task in tasks:
@@ -97,7 +97,8 @@ class ThisProcess:
 
 
 class Processes:
-    """Worker processes of this machine, each in a pool of its own: the end of one is not that of the others."""
+    """Worker processes of this machine, each in a pool of its own, so that the end of one does not affect the
+    others."""
 
     def __init__(self, count: int) -> None:
         if count < 1:
@@ -133,7 +134,7 @@ class Processes:
 
 
 class Dask:
-    """The workers of a cluster, by the address of its scheduler, such as ``tcp://host:8786``."""
+    """Workers of a Dask cluster, by the address of its scheduler, such as ``tcp://host:8786``."""
 
     def __init__(self, address: str) -> None:
         """:raises ConfigurationError: Dask is not installed.
@@ -191,7 +192,7 @@ class Dask:
 def _submit(
     pools: list[ProcessPoolExecutor], number: int, work: Callable[[Task], Result], task: Task
 ) -> Future[Result]:
-    """To the pool of that number, or to a new one in its place if its worker has died, be it while it had no task."""
+    """Submit a task to the pool of that number; replace the pool first if its worker has died, even while idle."""
     try:
         return pools[number].submit(work, task)
     except BrokenProcessPool:
@@ -205,7 +206,7 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
-    """In a worker: signals are for the parent, and without a parent there is nothing to do."""
+    """Initialise a worker process: leave signals to the parent, and exit when the parent has gone."""
     leave_to_parent()
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -218,7 +219,7 @@ def _end_with(sentinel: int) -> None:
 
 
 def _end(pool: ProcessPoolExecutor) -> None:
-    """At once, whatever it is doing."""
+    """End the worker of a pool at once, even in the middle of a task."""
     for process in list((getattr(pool, "_processes", None) or {}).values()):
         with contextlib.suppress(OSError, ValueError):
             process.kill()

@@ -1,4 +1,4 @@
-"""Rigs: what plays a scenario and yields samples."""
+"""Rigs: instruments that play a scenario and yield samples."""
 
 CAPABILITIES = ("excite", "tweak")
-"""What a rig may be able to do beyond sampling, for ``Rig.capabilities``."""
+"""Optional capabilities of a rig beyond sampling, for ``Rig.capabilities``."""

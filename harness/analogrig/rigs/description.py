@@ -19,18 +19,18 @@ from analogrig.rigs.rig import Rig
 from analogrig.trust import Trust
 
 DEFAULT_RIG = "emulator"
-"""When neither the user nor the scenario says another."""
+"""Rig used if neither the user nor the scenario names one."""
 
 RIGS_VARIABLE, RIGS_FILE = "ANALOGRIG_RIGS", "rigs.toml"
-"""The rigs of a laboratory: the file that the variable names, else that of the folder one is in."""
+"""Environment variable that names the rigs file of a laboratory, and the default file name in the working directory."""
 
 
 def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] = ()) -> Rig:
     """Open a rig by name. Use it in a ``with`` statement: leaving it switches outputs off and closes connections.
 
-    ``recording:FILE`` replays a recording. A name stands for a table ``[rig.NAME]`` of the file that ANALOGRIG_RIGS
-    names, of rigs.toml in this folder, or for a shipped rig, in this order. FILE.toml stands for the rig described
-    there, FILE.toml:NAME for one of several.
+    ``recording:FILE`` replays a recording. Other names stand for a table ``[rig.NAME]`` of the rigs file, or else
+    for a shipped rig. The rigs file is the one that ANALOGRIG_RIGS names, or else rigs.toml in this folder. FILE.toml
+    stands for the rig described there, FILE.toml:NAME for one of several.
 
     :param self_test: False: skip the self-test that the description of a real rig may ask for.
     :param allow: addresses, ports and commands that a description may name (``analogrig.trust``).
@@ -41,7 +41,7 @@ def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] 
 
 
 def looked_at(name: str) -> Rig:
-    """As ``open_rig``, for a rig that shall not be played on; whatever a file names is accepted."""
+    """Rig as from ``open_rig``, for inspection only; every name in a file is accepted."""
     return _made(name, None)
 
 
@@ -64,7 +64,7 @@ def _made(name: str, trust: Trust | None, *, self_test: bool = True) -> Rig:
 
 @contextlib.contextmanager
 def _names(where: str) -> Iterator[None]:
-    """Have errors begin with the place."""
+    """Prefix errors with the place."""
     try:
         yield
     except ConfigurationError as error:
@@ -75,7 +75,7 @@ class Described(NamedTuple):
     """A rig as a file describes it."""
 
     table: Mapping[str, Any]
-    """With its name."""
+    """Table of the rig, with its name."""
     where: str
     """File and table, for errors."""
     file: Path
@@ -121,7 +121,7 @@ def _rigs_file() -> Path | None:
 
 
 def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The rigs of a rigs file by name.
+    """Rigs of a rigs file, by name.
 
     :raises ConfigurationError: it is none.
     """

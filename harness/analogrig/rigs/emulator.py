@@ -1,4 +1,4 @@
-"""The emulated analogue computer and its card, as a rig; its description."""
+"""Emulated analogue computer and its card, as a rig, and its description."""
 
 from __future__ import annotations
 
@@ -53,20 +53,20 @@ MOST_DEVIATION = 0.9
 
 @dataclass(frozen=True)
 class MeasuredValues:
-    """The ``[computer.values]`` table: one machine as it was measured, by the names of its elements.
+    """The ``[computer.values]`` table: measured values of one machine, by the names of its elements.
 
-    What is not named is as the diagram and the amplifiers' datasheet say; nothing is drawn. ``analogrig calibrate``
-    writes it.
+    Elements that are not named have the values of the diagram and the amplifiers' datasheet; nothing is drawn.
+    ``analogrig calibrate`` writes this table.
     """
 
     deviation: Mapping[str, float] = field(default_factory=dict)
-    """Of a resistor, capacitor or track of a pot from the diagram's value, a fraction."""
+    """Relative deviation of a resistor, capacitor or pot track from the diagram's value."""
     offset_v: Mapping[str, float] = field(default_factory=dict)
-    """Of an amplifier."""
+    """Input offset of an amplifier."""
     bandwidth: Mapping[str, float] = field(default_factory=dict)
-    """By which fraction an amplifier's is more than the model's."""
+    """Relative deviation of an amplifier's bandwidth from the model's."""
     slew: Mapping[str, float] = field(default_factory=dict)
-    """Likewise."""
+    """Relative deviation of an amplifier's slew rate from the model's."""
 
     def __post_init__(self) -> None:
         parts, amplifiers = _element_names()
@@ -83,7 +83,7 @@ class MeasuredValues:
                     raise ValueError(f"{table}.{name} must be within +-{most:g}, not {value:g}")
 
     def put_in(self, stock: Components) -> Components:
-        """The machine, of components that are otherwise those of the stock."""
+        """Components of the machine: the stock's, overridden by the measured values."""
         given = {**self.deviation, **self.offset_v}
         return dataclasses.replace(
             stock.without_draws(), given=given, given_bandwidth=self.bandwidth, given_slew=self.slew
@@ -92,7 +92,7 @@ class MeasuredValues:
 
 @functools.cache
 def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Of the resistors, capacitors and pots, and of the amplifiers, of all programs, in the order of their diagrams."""
+    """Names of the resistors, capacitors and pots, and names of the amplifiers, of all programs, in diagram order."""
     programs = PROGRAMS.values()
     parts = [name for program in programs for name in program.element_names(Resistor, Capacitor, Pot)]
     amplifiers = [name for program in programs for name in program.element_names(OpAmp)]
@@ -101,29 +101,33 @@ def _element_names() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class ComputerDescription:
-    """The ``[computer]`` table: what the machine is built of, and how warm and old that is."""
+    """The ``[computer]`` table: components of the machine, its temperature and its age."""
 
     op_amp: str = "tl07x"
     offset_v: float = 0.0
     """Each amplifier's input offset is drawn from the seed, within plus and minus this."""
     components: Literal["nominal", "polyester", "polypropylene"] = "nominal"
-    """Real ones are drawn from the seed, the amplifiers' own grade (offset, drift, bias, bandwidth) included."""
+    """Kind of components. Real ones are drawn from the seed, as is the amplifiers' grade: offset, drift, bias,
+    bandwidth."""
     specimen: int | None = None
-    """The seed from which the machine is drawn, whatever that of a run: all runs are of the same machine then."""
+    """Seed from which the machine is drawn, instead of the run's: all runs then use the same machine."""
     pots: Literal["coefficient", "dial"] = "coefficient"
-    """To what they are set: to the coefficient, read under the real load (pot-set mode), or to the dial at which those
-    of a nominal machine would pass it (digital pots)."""
+    """Quantity to which the pots are set.
+
+    ``coefficient``: the coefficient, read under the real load (pot-set mode). ``dial``: the dial at which a nominal
+    machine would have that coefficient (digital pots).
+    """
     values: MeasuredValues | None = None
-    """What was measured of the machine; then nothing of it is drawn."""
+    """Measured values of the machine; if given, no component is drawn."""
     temperature_c: float = 25.0
     age_h: float = 0.0
     wiper_noise_ohm: float = 0.0
-    """By how much the resistance of a wiper rises at most while its pot is turned (``ramp_n``)."""
+    """Largest rise of a wiper's resistance while its pot is turned (``ramp_n``)."""
     noise: bool = False
-    """Thermal noise of resistors and that of the amplifiers; about 8 us a sample and instant of the card."""
+    """Thermal noise of resistors and noise of the amplifiers; costs about 8 us a sample and instant of the card."""
 
     def fitted(self, seed: int) -> Components:
-        """The components of the machine: as measured, or those that the seed gives.
+        """Components of the machine: as measured, or drawn from the seed.
 
         :raises CircuitError: a value is out of range.
         """
@@ -139,7 +143,7 @@ class ComputerDescription:
         return stock if self.values is None else self.values.put_in(stock)
 
     def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
-        """The machine that the seed of a run gives, wired as a program, its pots as that has them.
+        """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
         """
@@ -170,7 +174,7 @@ class CardDescription:
     bits: int = 12
     rate_hz: float = 20e3
     noise_lsb: float | Mapping[str, float] | None = None
-    """rms before quantisation, on every channel or by the channel's name; that of the model when it is not given."""
+    """Noise before quantisation, rms, on every channel or by channel name; by default the model's."""
     model: Literal["ideal", "dt2821", "skewed"] = "ideal"
     faults: Mapping[str, Any] = field(default_factory=dict)
     """Fields of ``analogrig_emulator.Card`` that differ from the model's: ``skew_s``, ``stuck_high``,
@@ -206,7 +210,7 @@ class CardDescription:
         return {name: config.converted(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
 
     def _noises_lsb(self) -> tuple[float, ...] | None:
-        """Of each channel, if given."""
+        """Noise of each channel in LSB; None if not given."""
         if isinstance(self.noise_lsb, Mapping):
             return tuple(self.noise_lsb[channel] for channel in CHANNELS)
         return None if self.noise_lsb is None else (self.noise_lsb,) * len(CHANNELS)
@@ -236,7 +240,7 @@ class EmulatorDescription:
 
 
 class Stream(enum.IntEnum):
-    """Independent streams of random numbers that one seed gives: to draw more of one changes none of the others."""
+    """Independent random streams of one seed: drawing more from one changes none of the others."""
 
     EXCITATION = 0
     COMPONENTS = 1
@@ -249,7 +253,7 @@ class Stream(enum.IntEnum):
 
 
 class SetUp(NamedTuple):
-    """A computer, and what is to be played on it."""
+    """Computer, with the excitation and changes to play on it."""
 
     computer: SuspensionComputer
     excitation: Excitation
@@ -257,17 +261,17 @@ class SetUp(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """What the plays of one scenario share, whatever the seed."""
+    """Data that all plays of one scenario share, for every seed."""
 
     scenario: Scenario
     computer: SuspensionComputer
     play: RepeatedPlay | None
-    """None where more than offsets and phase depends on the seed."""
+    """Repeated play; None where more than offsets and phase depends on the seed."""
     channels: Mapping[str, Channel]
     segments: tuple[Segment, ...]
 
     def serves(self, scenario: Scenario) -> bool:
-        """Whether another scenario differs in nothing that was worked out."""
+        """True if another scenario has the same prepared data."""
         own = self.scenario
         return scenario is own or (
             (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
@@ -292,16 +296,16 @@ class EmulatorRig:
 
     @property
     def force_zero(self) -> float:
-        """The code of no force; it may lie outside the range."""
+        """Code at zero force; it may lie outside the range."""
         channel = CHANNELS.index("force")
         return -self._card.ranges_v[channel][0] / float(self._card.lsb_v[channel])
 
     def sampler(self, rng: np.random.Generator) -> Sampler:
-        """Its card, with noise of its own: to convert once more what the circuit has played."""
+        """Sampler of the rig's card with its own noise, to convert again what the circuit has played."""
         return Sampler(self._card, rng)
 
     def set_up(self, scenario: Scenario, seed: int) -> SetUp:
-        """The machine as the scenario starts it, and what will be played on it.
+        """Machine as the scenario starts it, with the excitation and the changes to play on it.
 
         :raises ConfigurationError: the scenario cannot be played on this rig.
         """
@@ -317,9 +321,9 @@ class EmulatorRig:
         return SetUp(computer, excitation, tuple(changes))
 
     def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
-        """As Rig.perform; the length of the blocks changes nothing but speed.
+        """Play a scenario, as Rig.perform does; the length of the blocks affects only speed.
 
-        What a scenario that fits in one block needs is prepared once for all seeds.
+        Data for a scenario that fits in one block are prepared once for all seeds.
         """
         if scenario.samples <= block_samples:
             prepared = self._prepared(scenario, seed)
@@ -343,7 +347,7 @@ class EmulatorRig:
         )
 
     def _prepared(self, scenario: Scenario, seed: int) -> _Prepared:
-        """The last one, if it serves."""
+        """Prepared data of the scenario; the last set is reused if it serves."""
         if self._last_prepared is None or not self._last_prepared.serves(scenario):
             computer, excitation, changes = self.set_up(scenario, seed)
             with emulator_errors(f"scenario {scenario.name}: "):
@@ -390,7 +394,7 @@ class EmulatorRig:
         return self._turned(settings_of(computer, given), computer.program.name)
 
     def _turned(self, settings: dict[str, float], program: str) -> dict[str, float]:
-        """What an operator turns the pots to who wants those settings."""
+        """Pot settings for these parameters, as coefficients or as dials."""
         if self._description.computer.pots == "coefficient":
             return settings
         dials = _nominal(program).dials_for(**settings)
@@ -427,7 +431,7 @@ def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
 
 
 def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
-    """Lamps that are lit, with the card's sample; the machine takes `probes` for each of those."""
+    """Lit lamps, with the card's sample; the machine takes `probes` for each of those."""
     return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
 
 
@@ -442,7 +446,7 @@ def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator
 
 @contextlib.contextmanager
 def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = ConfigurationError) -> Iterator[None]:
-    """What the emulator raises becomes an error of the harness, here and nowhere else."""
+    """Convert errors of the emulator to errors of the harness; no other code does so."""
     try:
         yield
     except EmulatorError as error:
@@ -451,12 +455,12 @@ def emulator_errors(prefix: str = "", as_error: type[AnalogrigError] = Configura
 
 @functools.cache
 def _nominal(program: str) -> SuspensionComputer:
-    """To be asked for dials, and never played."""
+    """Nominal machine, used only to compute dials."""
     return SuspensionComputer(program, opamp="ideal")
 
 
 def settings_of(computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
-    """The scenario's names of the parameters as the program has them."""
+    """Parameter settings, renamed from the scenario's names to the program's."""
     names = {
         field.name: setting for field, setting in zip(dataclasses.fields(Plant), computer.program.values, strict=False)
     }

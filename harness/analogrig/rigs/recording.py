@@ -1,4 +1,4 @@
-"""A recorded run, played again."""
+"""Rig that replays a recorded run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from analogrig.trust import FiledName
 
 
 class RecordingRig:
-    """A recorded run, played again; it knows one scenario, its own."""
+    """Recorded run as a rig; it plays only its own scenario."""
 
     capabilities: frozenset[str] = frozenset()
 
@@ -34,7 +34,7 @@ class RecordingRig:
 
     @classmethod
     def of(cls, run: Run, path: Path) -> RecordingRig:
-        """As ``open``, of what was read from ``path``."""
+        """Rig of a run that was read from ``path``."""
         if run.samples == 0:
             raise RecordingError(f"{path}: holds no samples: the run failed before the first block was complete")
         return cls(run, path)
@@ -43,8 +43,7 @@ class RecordingRig:
         return {**self.run.conditions.rig, "name": self._name}
 
     def scenario(self) -> Scenario:
-        """The scenario that was recorded. If the recording ended before its time, so does what is played of it: its run
-        is then not valid either."""
+        """Recorded scenario. If the recording ended early, so does the replay: its run is then not valid either."""
         scenario = Scenario.from_table(self.run.conditions.scenario, self._name)
         dut = FiledName(scenario.dut, str(self.path))
         return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked, dut=dut)
@@ -71,7 +70,7 @@ class RecordingRig:
                 yield Block(first, self._volts(codes), codes, self.run.clipped[samples], record)
 
     def _volts(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
-        """(n, 4), of codes of that shape."""
+        """Volts that codes stand for; both are (n, 4)."""
         channels = self.run.conditions.channels
         unmeasured = np.full(len(codes), np.nan)
         volts = [

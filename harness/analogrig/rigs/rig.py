@@ -1,8 +1,8 @@
-"""What a rig is to everything behind it: it performs a scenario and yields blocks of samples.
+"""Interface of a rig: it performs a scenario and yields blocks of samples.
 
-A rig is opened by name, performs scenarios, and is closed. The emulated computer, a recording and a real one are
-classes with these methods. Whoever plays on a rig needs no more, and asks not which one it has; who wants what only one
-of them has, the circuit of the emulated computer or the file of a recording, asks for that class.
+A rig is opened by name, performs scenarios, and is closed. The emulated computer, a recording and a real computer are
+classes with these methods. Callers do not depend on the class of a rig. Code that needs a particular one, such as the
+emulator's circuit or the file of a recording, asks for that class.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from analogrig.run import Channel, Segment
 from analogrig.scenario import Scenario
 
 BLOCK_SAMPLES = 256
-"""Samples that pass from rig to device at a time: enough to be fast, few enough to show progress and to lose little."""
+"""Block length in samples from rig to device: long enough to be fast, short enough to show progress and lose little."""
 
 CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
 
@@ -31,27 +31,27 @@ class Block:
     first: int
     """Index of the first sample."""
     volts: NDArray[np.float64]
-    """(n, 4): at the computer's outputs; NaN in channels that are not measured, whose codes are 0."""
+    """(n, 4): volts at the computer's outputs; NaN in channels that are not measured, whose codes are 0."""
     codes: NDArray[np.uint16]
-    """(n, 4)"""
+    """(n, 4): codes of the card."""
     clipped: NDArray[np.bool_]
-    """(n, 4): the code is the end of the range, not a measurement."""
+    """(n, 4): True if the code is the end of the range, not a measurement."""
     record: int = 0
-    """Number of the gap-free record that it is of: between two of them there was time in which nobody looked."""
+    """Number of the gap-free record that holds the block; nothing was sampled between two records."""
 
 
 @dataclass(frozen=True)
 class Hindsight:
-    """What is known of a performance when its blocks have been taken."""
+    """Facts about a performance that are known once its blocks have been taken."""
 
     segments: tuple[Segment, ...]
-    """The truth; empty if the rig does not know it."""
+    """True parameters; empty if the rig does not know them."""
     lamps: Mapping[str, int] = field(default_factory=dict)
-    """Of each amplifier whose overload lamp is lit, the first sample that was taken with it lit."""
+    """First sample with the overload lamp lit, for each amplifier whose lamp was lit."""
     caveats: tuple[str, ...] = ()
-    """Why what was played cannot be judged; none if it can."""
+    """Reasons why the performance cannot be judged; empty if it can."""
     noise_lsb: Mapping[str, float] = field(default_factory=dict)
-    """rms on a channel before quantisation, by its name, where it was measured."""
+    """Noise before quantisation, rms, by channel name, where it was measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +61,10 @@ class Performance:
     sample_period_s: float
     time_scale: float
     channels: Mapping[str, Channel]
-    """Those that are measured: force and displacement at least."""
+    """Channels that are measured: force and displacement at least."""
     blocks: Iterator[Block]
     hindsight: Callable[[], Hindsight]
-    """Asked when the blocks have been taken, or no more of them come."""
+    """Function to call when the blocks have been taken, or no more of them come."""
 
 
 class Rig(Protocol):
@@ -75,21 +75,21 @@ class Rig(Protocol):
     """
 
     capabilities: frozenset[str]
-    """What it can do beyond sampling, of ``analogrig.rigs.CAPABILITIES``."""
+    """Capabilities beyond sampling, of ``analogrig.rigs.CAPABILITIES``."""
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
-        """Begin to play; the blocks are produced as they are asked for.
+        """Begin to play; blocks are produced on demand.
 
         :raises ConfigurationError: the scenario cannot be played on this rig.
         :raises RigError: the rig failed; also while the blocks are taken.
         """
 
     def description(self) -> Mapping[str, Any]:
-        """Its name and settings in plain values, for the record."""
+        """Name and settings in plain values, for the record."""
 
     def __enter__(self) -> Self: ...
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave it safe: outputs off, connections closed."""
+        """Leave the rig safe: outputs off, connections closed."""
