@@ -49,9 +49,9 @@ class Field:
     name: str
     start_byte: int
     code: str
-    """As in the module struct."""
+    """Format letter of the module struct."""
     bits: tuple[tuple[str, int, int], ...] = ()
-    """Of the signals of a shared byte: name, first bit, number of bits."""
+    """Signals of a shared byte: name, first bit, number of bits."""
 
 
 def main(arguments: list[str]) -> int:
@@ -141,7 +141,7 @@ def fields(message: Message) -> list[Field]:
 
 
 def is_plain(conversion: BaseConversion) -> bool:
-    """The number on the wire is the number that is meant."""
+    """True if the number on the wire is the number that is meant."""
     return conversion.scale == 1 and conversion.offset == 0
 
 
@@ -180,7 +180,7 @@ def enums(database: Database) -> dict[str, dict[str, int]]:
 
 
 def is_seeded(message: Message) -> bool:
-    """Whether the checksum of its serial frame starts from the hash of the catalogue."""
+    """True if the checksum of the message's serial frame starts from the hash of the catalogue."""
     attributes = message.dbc.attributes if message.dbc is not None else {}
     return "FrameSeed" not in attributes
 

@@ -1,4 +1,4 @@
-"""Whether the estimates are the same bits with every compiler and on every target. `make bit-exact`.
+"""Bit-exactness of the estimates over all compilers and targets. `make bit-exact`.
 
 Builds bit_exact.c in each way, runs it (foreign code in QEMU's user mode) and compares what it prints. x87 is none of
 the targets: it computes in another precision.
@@ -82,7 +82,7 @@ QUICK = tuple(build for build in BUILDS if not build.runner or "-O2" in build.co
 
 
 def run(command: Sequence[str | Path]) -> str:
-    """What a program prints; SystemExit with its complaint if it fails."""
+    """Output of a program; SystemExit with its error message if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     if done.returncode != 0:
         raise SystemExit(f"bit-exact: {command[0]} ended with status {done.returncode}:\n{done.stdout}{done.stderr}")
@@ -90,7 +90,7 @@ def run(command: Sequence[str | Path]) -> str:
 
 
 def outcome(build: Build, *, contraction: str = EXACT) -> str:
-    """What the program prints when it is built in this way."""
+    """Output of the program built in the given way."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "bit_exact")
         sources = [HERE / "bit_exact.c", *sorted(CORE.glob("*.c")), *sorted(ISOLATION.glob("*.c"))]

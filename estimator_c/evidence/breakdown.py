@@ -1,4 +1,4 @@
-"""Where the instructions of a step go on a Cortex-M4F, by function of the source and by kind; and the bytes of code.
+"""Breakdown of a step's instructions on a Cortex-M4F, by function of the source and by kind; and the bytes of code.
 
 python -m estimator_c.evidence.breakdown
 
@@ -35,7 +35,7 @@ from estimator_c.evidence.cost import (
 __all__ = ["bytes_by_function", "instructions", "least", "main"]
 
 STEPS_N = 600
-"""Of image.c."""
+"""Steps of image.c."""
 
 KINDS = (
     ("arithmetic", r"v(add|sub|mul|div|neg|nmul|abs|sqrt|cvt|ml|fm|nml)"),
@@ -45,11 +45,11 @@ KINDS = (
     ("move", r"v?mov"),
     ("whole numbers", r""),
 )
-"""By the beginning of the mnemonic; the first that fits."""
+"""Kinds of instruction by the beginning of the mnemonic; the first match counts."""
 
 
 def least(orders: Orders) -> dict[str, int]:
-    """What the algebra of a plain step needs: whitening with the gains settled, prediction, update, cumulative sum."""
+    """Least operations of a plain step: whitening with the gains settled, prediction, update, cumulative sum."""
     n, na = orders.count, orders.na
     whiten = (n + 1) * na * 2  # a multiplication and a subtraction for each past value of each element
     predict = 2 * n
@@ -67,7 +67,7 @@ def _kind(mnemonic: str) -> str:
 
 
 def _counted(image: Path) -> Counter[int]:
-    """How often each instruction was executed, by address."""
+    """Number of executions of each instruction, by address."""
     blocks: dict[int, list[int]] = {}
     runs: Counter[int] = Counter()
     block = 0

@@ -1,4 +1,4 @@
-"""What the estimator costs on a Cortex-M: instructions per step, bytes of code, bytes of state. `make cost`.
+"""Cost of the estimator on a Cortex-M: instructions per step, bytes of code, bytes of state. `make cost`.
 
 Every block of code that QEMU executes is logged, and the instructions of a step are counted, from its first to its
 last: exact, and the same each time. The caller (the section .outside of image.ld) is not counted. Prints a table and
@@ -42,12 +42,12 @@ CLOCK_MHZ, CYCLES = 168.0, 1.5
 """For estimates of time: the clock of a usual M4F, and cycles per instruction (1.2 to 2, as its memory has it)."""
 
 EVEN = 1.2
-"""The worst step may take so many times the instructions of a typical one."""
+"""Largest ratio of the instructions of the worst step to those of a typical step."""
 
 
 @dataclass(frozen=True)
 class Processor:
-    """One that code is made for, the board of QEMU that runs it, and what it needs beside the compiler's library."""
+    """Processor, the board of QEMU that runs its code, and the needs beyond the compiler's library."""
 
     name: str
     flags: tuple[str, ...]
@@ -73,16 +73,16 @@ class Orders:
 
     @property
     def count(self) -> int:
-        """Of the parameters."""
+        """Number of parameters."""
         return self.na + self.nb + self.offset
 
     @property
     def name(self) -> str:
-        """For the table."""
+        """Name of the orders in the table."""
         return f"n = {self.count}, edges {'may slip' if self.may_slip else 'locked'}"
 
     def flags(self, *, fixed: bool) -> tuple[str, ...]:
-        """For the subject; and for the core, if it is to know them when it is compiled."""
+        """Compiler options for the subject; and for the core, if the orders are fixed at compile time."""
         orders = {"NA": self.na, "NB": self.nb, "NK": self.nk, "OFFSET": self.offset}
         chosen = tuple(f"-DSUBJECT_{name}={value}U" for name, value in orders.items())
         if not self.may_slip:
@@ -133,7 +133,7 @@ class Cost:
 
 
 def run(command: Sequence[str | Path]) -> str:
-    """What a tool prints; SystemExit with its complaint if it fails."""
+    """Output of a tool; SystemExit with its error message if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"cost: {' '.join(map(str, command[:1]))} failed:\n{done.stderr}")
@@ -153,7 +153,7 @@ def core_sources() -> list[Path]:
 
 
 def all_sources() -> list[Path]:
-    """With isolation."""
+    """Sources of the estimator with isolation."""
     return [*core_sources(), *sorted(ISOLATION.glob("*.c"))]
 
 
@@ -229,8 +229,9 @@ def executed(image: Path, machine: str) -> Iterator[bytes]:
 
 
 def count_steps(image: Path, machine: str, step: str, *others: str) -> list[int]:
-    """How many instructions each call of the function ``step`` took, in the order of the calls; ``others`` are called
-    between them. SystemExit as ``executed``.
+    """Instructions of each call of the function ``step``, in the order of the calls.
+
+    The program calls ``others`` in between. SystemExit under the conditions of ``executed``.
     """
     places = symbols(image)
     ends = {places[name][0] for name in (step, *others, "after_last_step")}
@@ -278,7 +279,7 @@ class Bench:
         return self._steps(name, processor, [HERE / "image.c", HERE / "textbook.c"], flags, "textbook_step")
 
     def isolation(self, processor: Processor, orders: Orders) -> Iterator[Steps]:
-        """What isolation takes: to enter a sample, which is most at an alarm, and each slice of work after that."""
+        """Steps of isolation: entering a sample, which costs most at an alarm, and each slice of work after that."""
         calls = ("est_isolation_work", "est_isolation_enter", "est_step")
         sources = [HERE / "image.c", HERE / "subject_est.c", *all_sources()]
         flags = ("-O2", *processor.flags, *orders.flags(fixed=False), "-DSUBJECT_ISOLATES")
@@ -320,7 +321,7 @@ class Bench:
 
 
 def costs(folder: Path) -> Iterator[Cost]:
-    """Everything; images are made in ``folder``."""
+    """All costs; images are made in ``folder``."""
     bench = Bench(folder)
     yield from instructions(bench)
     yield from soft_float(bench)
@@ -346,7 +347,7 @@ def device(steps: Steps) -> Iterator[Cost]:
 
 
 def isolation(bench: Bench) -> Iterator[Cost]:
-    """Beside the core, on the M4F."""
+    """Costs of isolation beside the core, on the M4F."""
     for steps in bench.isolation(M4F, LARGE):
         yield Cost(steps.name, steps.typical, "instructions")
         yield Cost(f"{steps.name}, worst", max(steps.counts), "instructions")
@@ -356,7 +357,7 @@ def isolation(bench: Bench) -> Iterator[Cost]:
 
 
 def instructions(bench: Bench) -> Iterator[Cost]:
-    """On the M4F."""
+    """Costs in instructions, on the M4F."""
     rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
     for orders, at_run_time, at_compile_time in ((SMALL, 400, 260), (LARGE, 750, 520), (FREE, 750, 520)):
         rival = rivals[orders.count][1]

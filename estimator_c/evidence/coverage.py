@@ -1,4 +1,4 @@
-"""Which lines and branches of core and isolation the tests go through. `make coverage`.
+"""Line and branch coverage of core and isolation by the tests. `make coverage`.
 
 Runs their tests on a driver built with gcov's counters (without optimisation, asserts off, one copy of every
 line), and lists what none of them reached. 100 % is demanded of lines and branches.
@@ -37,7 +37,7 @@ ELSEWHERE = {
 
 @dataclass
 class Coverage:
-    """What the tests reached, and what they did not: (file, line, the line's text)."""
+    """Lines and branches that the tests reached or missed: (file, line, the line's text)."""
 
     lines: int = 0
     branches: int = 0

@@ -50,7 +50,7 @@ est_init() == true then means a valid configuration. The loop of main() is one o
 targets, est_t has no padding at its end that would hide a read beyond its last array."""
 
 SIZES = re.compile(r"^(\s*(?:const )?(?:float|est_past_t)\s+\w+)((?:\[[^]]*\])+)", re.MULTILINE)
-"""Of the arrays that are declared."""
+"""Pattern of the declarations of arrays, with their sizes."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class Shape:
 
     @property
     def count(self) -> int:
-        """Of the parameters."""
+        """Number of parameters."""
         return self.na + self.nb + self.nc + self.offset
 
     @property
     def defines(self) -> list[str]:
-        """As eva.c wants it."""
+        """Definitions of the orders in the form that eva.c expects."""
         orders = {"NA": self.na, "NB": self.nb, "NC": self.nc, "OFFSET": self.offset}
         return [f"-DEST_NC_MAX={NC_MAX}U", *(f"-D{name}={value}U" for name, value in orders.items())]
 
@@ -85,20 +85,20 @@ SHAPES = tuple(
         key=lambda shape: (shape != DEFAULT, -shape.count),
     )
 )
-"""The default and the largest first."""
+"""Shapes to analyse, the default and the largest first."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """What Eva says."""
+    """Result of Eva."""
 
     alarms: tuple[str, ...]
     reached: float
-    """Part of the statements, of the functions that were reached."""
+    """Fraction of statements reached, within the functions that were reached."""
 
 
 def _literal(sizes: re.Match[str]) -> str:
-    """Frama-C 25 stops at the size of an array that is not a literal."""
+    """Declaration with literal array sizes: Frama-C 25 stops at any other size."""
 
     def value(size: re.Match[str]) -> str:
         expression = re.sub(r"\((.*) \? (.*) : (.*)\)", r"(\2) if (\1) else (\3)", size[1].replace("U", ""))
@@ -117,7 +117,7 @@ def _preprocessed(source: Path, folder: Path, shape: Shape) -> Path:
 
 
 def analysed(shape: Shape) -> Analysis:
-    """Runs Eva; RuntimeError if it comes to no end."""
+    """Run Eva; RuntimeError if it does not finish."""
     with tempfile.TemporaryDirectory() as scratch:
         sources = [HERE / "eva.c", *sorted(CORE.glob("*.c"))]
         files = [_preprocessed(source, Path(scratch), shape) for source in sources]
@@ -133,13 +133,13 @@ def analysed(shape: Shape) -> Analysis:
 
 
 def _digest() -> str:
-    """Of the core, and of how it is called; remarks and layout do not count."""
+    """Digest of the core and of its calls; comments and layout do not count."""
     texts = (re.sub(r"//.*", "", path.read_text()) for path in (HERE / "eva.c", *sorted(CORE.glob("*.[ch]"))))
     return hashlib.sha256(" ".join("".join(texts).split()).encode()).hexdigest()
 
 
 def _known() -> dict[Shape, Analysis]:
-    """What earlier runs found of this very core."""
+    """Results of earlier runs on this same core."""
     if not RESULTS.exists():
         return {}
     record = json.loads(RESULTS.read_text())

@@ -82,7 +82,7 @@ FLAGS = (
 """One copy of each equation's code: the others are for speed, and test_est_builds.py compares them."""
 
 TESTED, HASHED = (), ("-DEST_THETA_MAX=8U",)
-"""How the core is built for the tests, and for bit_exact.c."""
+"""Compiler options of the core for the tests, and for bit_exact.c."""
 
 AROUND = {
     TESTED: (
@@ -93,7 +93,7 @@ AROUND = {
     ),
     HASHED: (CORE.parent / "evidence" / "bit_exact.c", *(CORE.parent / "isolation").glob("*.c")),
 }
-"""What calls the core."""
+"""Sources that call the core, by its compiler options."""
 
 SWAPS = {
     "<": ("<=", ">="),
@@ -133,19 +133,19 @@ class Mutant:
     file: str
     line: int
     function: str
-    """Or the macro."""
+    """Name of the function or macro."""
     before: str
     after: str
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """What it is called, wherever the line has moved to."""
+        """Key of the mutant, independent of its line number."""
         return self.file, self.function, code_of(self.before).strip(), code_of(self.after).strip()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a mutant."""
+    """Outcome of one mutant."""
 
     mutant: Mutant
     fate: str
@@ -157,7 +157,7 @@ class Outcome:
 
 
 def code_of(line: str) -> str:
-    """Without a remark."""
+    """Line of code without its comment."""
     return line.split("//", maxsplit=1)[0]
 
 
@@ -222,12 +222,12 @@ def sources() -> dict[tuple[str, str], str]:
 
 
 def sampled(every: Sequence[Mutant], count: int, seed: int = 1) -> list[Mutant]:
-    """So many by chance: the same ones wherever their lines have moved to, and whatever else has come or gone."""
+    """Random sample of ``count`` mutants. It stays the same when lines move or other mutants come or go."""
     return sorted(every, key=lambda mutant: hashlib.sha256(repr((seed, mutant.key)).encode()).digest())[:count]
 
 
 def shown(key: tuple[str, str, str, str]) -> str:
-    """As MUTATION.md has it."""
+    """Key of a mutant in the form of MUTATION.md."""
     file, function, before, after = key
     return f"@ {file} {function}\n- {before}\n+ {after}"
 
@@ -252,7 +252,7 @@ def explained() -> dict[tuple[str, str, str, str], str]:
 
 
 def _numbered(every: Iterable[Mutant]) -> Iterator[tuple[Mutant, tuple[object, ...]]]:
-    """Each with a name of its own: its key, and how many of that key came before it."""
+    """Mutants with unique names: the key, and the number of earlier mutants with that key."""
     seen: Counter[tuple[str, str, str, str]] = Counter()
     for mutant in every:
         yield mutant, (*mutant.key, seen[mutant.key])
@@ -282,7 +282,7 @@ def recalled(
 
 
 def write(record: Path, outcomes: Iterable[Outcome]) -> None:
-    """All at once: a run may be ended at any time."""
+    """Write all outcomes at once: a run may be ended at any time."""
     ordered = sorted(outcomes, key=lambda outcome: (outcome.mutant.file, outcome.mutant.line, outcome.mutant.after))
     fates = Counter(outcome.fate for outcome in ordered)
     record.parent.mkdir(parents=True, exist_ok=True)
@@ -309,7 +309,7 @@ KEPT = {
 
 
 def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    """One whose results are kept: tests may write into what they get."""
+    """Function with cached results: tests may write into the results that they get."""
     known: dict[bytes, bytes] = {}
 
     @functools.wraps(function)
@@ -363,7 +363,7 @@ class _Session:
         self._before_each: Callable[[], None] = lambda: None
 
     def run(self) -> None:
-        """RuntimeError if a test fails on the core as it is."""
+        """Run the session; RuntimeError if a test fails on the core as it is."""
         options = "-q --assert=plain -p no:xdist -p no:cacheprovider -o timeout=0 -s -p no:faulthandler".split()
         with Path(os.devnull).open("w") as nothing, contextlib.redirect_stdout(nothing):
             status = pytest.main([*options, "-k", LONG, f"--rootdir={ROOT}", *TESTS], plugins=[self])
@@ -371,7 +371,7 @@ class _Session:
             raise RuntimeError(f"the tests fail on the core as it is: {self._failed or status!r}")
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """In place of pytest's own."""
+        """Replace the test loop of pytest."""
         self._tests = session.items
         if not (self._first_failure() or self._first_failure()):
             self._tests.sort(key=self._price)
@@ -380,11 +380,11 @@ class _Session:
         return True
 
     def _price(self, test: pytest.Item) -> float:
-        """Seconds for each mutant noticed."""
+        """Seconds that a test takes for each mutant noticed."""
         return self._seconds[test.nodeid] / (1 + self._noticed.get(_name(test.nodeid), 0))
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Remembers what failed first."""
+        """Note the first failure."""
         if report.failed and not self._failed:
             self._failed = _name(report.nodeid)
 
@@ -399,7 +399,7 @@ class _Session:
         return self._failed
 
     def first_failure(self) -> str:
-        """On the present library, in a fork; a crash, or no end, counts as one."""
+        """First failure with the present library, in a fork; a crash or a time-out counts as one."""
         receiver, sender = os.pipe()
         child = os.fork()
         if child == 0:
@@ -445,7 +445,7 @@ class _Build:
             self._object(path, folder / "around")
 
     def copy(self, folder: Path) -> _Build:
-        """Another, so that a mutant leaves nothing behind."""
+        """Copy of the build, so that a mutant leaves nothing behind."""
         other = copy.copy(self)
         other._folder = shutil.copytree(self._folder, folder)  # noqa: SLF001 - of its own kind
         return other
@@ -487,7 +487,7 @@ def _hash(program: Path) -> str:
 
 
 def _try(mutant: Mutant) -> Outcome:
-    """In a worker of the pool, a fork of the process that has begun the session."""
+    """Try a mutant in a worker of the pool, a fork of the process that has begun the session."""
     global _library  # noqa: PLW0603 - the tests, in a fork of this process, look there
     session, plain, expected = _begun[-1]
     with tempfile.TemporaryDirectory() as scratch:
@@ -508,7 +508,7 @@ def _try(mutant: Mutant) -> Outcome:
 
 
 def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tell: Callable[[Outcome], None]) -> None:
-    """Tells what becomes of each as soon as it is known; RuntimeError if the tests fail on the core as it is.
+    """Report each outcome as soon as it is known; RuntimeError if the tests fail on the core as it is.
 
     :param noticed: how many mutants each test is known to have noticed.
     """
@@ -532,7 +532,7 @@ def try_all(chosen: Sequence[Mutant], jobs: int, noticed: Mapping[str, int], tel
 
 
 def table(every: Sequence[Mutant], outcomes: Sequence[Outcome]) -> str:
-    """Of each file how many mutants there are, were tried, and what became of them; as evidence/README.md has it."""
+    """Table of evidence/README.md: for each file the mutants, those tried, and their outcomes."""
     rows = ["| | mutants | tried | noticed | the same machine code | do not compile | not noticed |", f"|{'---|' * 7}"]
     for name, count in [*Counter(mutant.file for mutant in every).most_common(), ("all", len(every))]:
         fates = [outcome.fate for outcome in outcomes if name in ("all", outcome.mutant.file)]

@@ -18,9 +18,9 @@ LOOP = ESTIMATOR / "ports" / "loop"
 HERE = ESTIMATOR / "fuzz"
 
 LONGEST_INPUT = {"fuzz_est": 512, "fuzz_serial": 2048, "fuzz_can": 2048, "fuzz_slcan": 2048}
-"""By target, in bytes: some hundred samples."""
+"""Longest input by target, in bytes: some hundred samples."""
 LINES = ("fuzz_serial", "fuzz_can", "fuzz_slcan")
-"""Those over the device."""
+"""Targets that fuzz the device over a line."""
 
 _SANITIZED = ("-g", "-O1", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=undefined")
 _INCLUDE = tuple(f"-I{part}" for part in (*PARTS, LOOP, HERE))
@@ -41,7 +41,7 @@ def build(target: str, folder: Path) -> Path:
 
 
 def fuzz(program: Path, seconds: int, *options: str) -> tuple[int, str]:
-    """Run it; its corpus is beside it. How many inputs it tried (0: it found something), and its log."""
+    """Run a program with its corpus beside it. Return the number of inputs tried (0: it found a fault), and its log."""
     corpus = program.with_name(f"corpus_{program.name}")
     corpus.mkdir(exist_ok=True)
     limits = [f"-max_total_time={seconds}", f"-max_len={LONGEST_INPUT[program.name]}", "-rss_limit_mb=1024"]

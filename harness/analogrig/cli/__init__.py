@@ -52,7 +52,7 @@ _COMMANDS = (
     listing,
     completion,
 )
-"""Each has ``add(commands)``; in the order of ``--help``."""
+"""Modules of the commands in the order of ``--help``; each has ``add(commands)``."""
 
 
 _EXHAUSTED = {
@@ -61,7 +61,7 @@ _EXHAUSTED = {
     errno.ENOMEM: "close programs",
     errno.ENOSPC: "make room on the disk",
 }
-"""Cures for what any operation of the system can fail by, an import among them."""
+"""Advice for failures that any operation of the system can have, an import among them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from analogrig.rigs.rig import Rig
 
 MOST_LSB = 1.0
-"""rms between rig and twin, on what the fit has not seen, beyond which it is none."""
+"""Largest rms difference between rig and twin, on data that the fit has not seen."""
 
 _SHOWN_AS = {"": (100.0, "%"), "V": (1e3, "mV"), "s": (1e6, "us"), "LSB": (1.0, "LSB")}
-"""By the unit of an estimate."""
+"""Scale and unit in which an estimate is shown, by its own unit."""
 
 
 def add(commands: Any) -> None:
@@ -99,7 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[SquareWaveRecording]:
-    """Those to be fitted, and one more to compare rig and twin on.
+    """Recordings to fit, and one more on which rig and twin are compared.
 
     :raises RigError: the rig failed, or is not well.
     """
@@ -128,7 +128,7 @@ def _value(estimate: FittedValue) -> str:
 
 
 def _said(found: Calibration, check_lsb: float) -> list[str]:
-    """How good it is and what it does not know, a line each."""
+    """Quality and limits of a calibration, one line each."""
     computer = found.twin.computer
     others = [
         f"{stock}, by {pots} {chi_square - found.chi_square:+.0f}"
@@ -159,7 +159,7 @@ def _why_kept(found: Calibration) -> str:
 
 
 def _caveats(found: Calibration) -> list[str]:
-    """Why the twin may not be all that the rig is; a line each."""
+    """Reasons why the twin may differ from the rig, one line each."""
     if found.explains_all:
         return []
     deviation, wider = (2.0 * found.freedom) ** 0.5, (found.chi_square / found.freedom) ** 0.5
@@ -169,7 +169,7 @@ def _caveats(found: Calibration) -> list[str]:
 
 
 def _toml(found: Calibration, arguments: argparse.Namespace, check_lsb: float) -> str:
-    """The description, which ``open_rig`` gives back; what it is and how sure, as comments."""
+    """Rig description for ``open_rig``, with its origin and uncertainty as comments."""
     from dataclasses import asdict, replace
 
     from analogrig.config import to_toml

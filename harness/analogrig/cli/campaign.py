@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 MOST_WORKERS = 16
-"""For each processor."""
+"""Largest number of workers per processor."""
 
 
 def add(commands: Any) -> None:
@@ -119,7 +119,7 @@ def _note_session(plan: Plan, out: Path, arguments: argparse.Namespace) -> None:
 
 @contextlib.contextmanager
 def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[Workers]:
-    """Those that the command line asks for, by default at most as many as are useful.
+    """Workers that the command line asks for, by default at most as many as are useful.
 
     ``alone``: a device that cannot be shared, or "".
 
@@ -143,7 +143,7 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
-    """None when nobody watches."""
+    """Callback that shows the progress of a plan; None if nobody watches."""
     line = watched()
     if line is None:
         return None

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analogrig.campaigns.certificate import Certificate, Question
 
 _ESTIMATES = 64
-"""Of a rare rate, when nobody says how many."""
+"""Default number of estimates of a rare rate."""
 
 _STATUS = {"certified": PASSED, "refuted": FAILED, "inconclusive": INCONCLUSIVE}
 

@@ -89,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _differ(found: RigComparison, arguments: argparse.Namespace) -> bool:
-    """Whether verdicts differ beyond chance, or more than was allowed."""
+    """True if verdicts differ beyond chance, or by more than was allowed."""
     lsb = max(each.rms_most_lsb for each in found.signals)
     latency_n = float("inf") if found.latency is None else found.latency.within_n
     return (

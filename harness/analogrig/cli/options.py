@@ -50,7 +50,7 @@ def add_command(commands: Any, name: str, does: str, *examples: str) -> argparse
 
 
 def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
-    """``default``: when the environment names none."""
+    """Add --rig; ``default`` applies if the environment names no rig."""
     command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar=RIG, help=words)
     add_allow(command)
 
@@ -191,7 +191,7 @@ def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run
 
 
 def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the command line says about the device beyond its name."""
+    """Changes of the device settings that the command line makes beyond the device's name."""
     in_real_time = "stream" if arguments.real_time is not None else None
     return {
         "exchange": arguments.exchange or in_real_time,
@@ -204,7 +204,7 @@ def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
-    """The rig, the scenario and the seed that were asked for; what was not, as the scenario or the recording has it."""
+    """Open the requested rig, scenario and seed; the scenario or the recording supplies those not given."""
     from dataclasses import replace
 
     from analogrig.rigs.description import DEFAULT_RIG, open_rig
@@ -237,7 +237,7 @@ def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
 
 
 def add_capture(command: argparse.ArgumentParser) -> None:
-    """What a CAN log does not say itself."""
+    """Add the options for data that a CAN log does not contain."""
     command.add_argument(
         "--scenario", metavar=SCENARIO, help="scenario of a CAN log: shipped name or .toml file (run.npz holds its own)"
     )
@@ -250,7 +250,7 @@ def add_capture(command: argparse.ArgumentParser) -> None:
 
 
 def is_capture(path: Path) -> bool:
-    """Whether it is, by its name, no recording of ours."""
+    """True if the file name is not that of our own recordings."""
     return path.suffix != ".npz"
 
 

@@ -45,7 +45,10 @@ def play(
     arguments: argparse.Namespace,
     log: CanLog | None = None,
 ) -> int:
-    """:raises ConfigurationError: a log was asked for of a device that is on no CAN bus."""
+    """Play a scenario with the options of the command line.
+
+    :raises ConfigurationError: a log was asked for of a device that is on no CAN bus.
+    """
     from dataclasses import replace
 
     from analogrig.bench import Bench

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analogrig.hardware.simulator.server import Server
 
 DEFAULT_PORT = 5000
-"""That of a Red Pitaya."""
+"""Default TCP port, the one of a Red Pitaya."""
 
 
 def add(commands: Any) -> None:
@@ -103,7 +103,7 @@ async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str,
 
 
 _PR_SET_PDEATHSIG = 1
-"""Of prctl(2): the signal that a process gets when its parent ends, by SIGKILL too."""
+"""Option of prctl(2): the signal that a process gets when its parent ends, also when SIGKILL ended it."""
 
 
 async def _client(command: Sequence[str], signalled: asyncio.Future[int]) -> int:

@@ -117,7 +117,10 @@ def _coloured(text: str, stream: TextIO) -> str:
 
 
 def _takes_colour(stream: TextIO) -> bool:
-    """NO_COLOR forbids, FORCE_COLOR or CLICOLOR_FORCE demand; else true on a terminal that is not dumb."""
+    """True if the stream takes colour: NO_COLOR forbids it, FORCE_COLOR or CLICOLOR_FORCE demand it.
+
+    Otherwise true on a terminal that is not dumb.
+    """
     if os.environ.get("NO_COLOR"):
         return False
     if any(os.environ.get(name, "0") not in {"", "0"} for name in ("FORCE_COLOR", "CLICOLOR_FORCE")):

@@ -1,5 +1,7 @@
-"""What is left of a play that failed: files of scenario, rig and device, the recording, and the one line that repeats
-it."""
+"""Counterexamples: files that repeat a failed play.
+
+A counterexample holds the scenario, rig and device, the recording, and the command that repeats the play.
+"""
 
 from __future__ import annotations
 
@@ -28,16 +30,17 @@ class Counterexample:
 
     run: Run
     statement: Statement | None = None
-    """None: no file could say what was asserted; what the scenario expects is what counts."""
+    """Statement that failed; None if no file can express it: then the scenario's ``[expect]`` counts."""
     seed: int | None = None
-    """From which on the statement looks for plays; None: that of the run."""
+    """First seed of the statement; None: the seed of the run."""
     dut: str = ""
-    """How the user named the device, if that is known."""
+    """Device name as the user gave it; empty if unknown."""
     why: str = ""
-    """What was found instead of the statement."""
+    """Reason why the statement does not hold."""
 
     def command(self, scenario: Path) -> str:
-        """The line that plays the run again, from its scenario file, and the device beside it if it has no name."""
+        """Command that plays the run again from its scenario file, and from its device file if the device has no
+        name."""
         words = ["analogrig", "run", "--scenario", str(scenario)]
         if self.seed not in (None, self.run.conditions.seed):
             words += ["--seed", str(self.run.conditions.seed)]
@@ -47,12 +50,13 @@ class Counterexample:
         return shlex.join([*words, *_allowed("--allow", (*of_device, *_rig_things(self.run)))])
 
     def suite_command(self, folder: Path) -> str:
-        """The line that judges it again, as a test; it allows what the files name."""
+        """Command that judges the play again as a test, and allows the things that the files name."""
         things = (*recorded(self.run.conditions.dut).things, *_rig_things(self.run))
         return shlex.join(["pytest", str(folder), "--hil-scenario-dir", str(folder), *_allowed("--hil-allow", things)])
 
     def write(self, folder: Path, *, page: bool = True) -> None:
-        """Into ``folder``, at once or not at all: what stood there before is there until all of this is.
+        """Write the counterexample into ``folder``, all or nothing: the old content stays until the new one is
+        complete.
 
         The scenario file names its seed, its rig, its device and what did not hold, so that a folder of such files is a
         regression suite: `pytest --hil-scenario-dir FOLDER`. A rig or a device that its name alone does not describe
@@ -82,7 +86,7 @@ class Counterexample:
             write_report(self.run, judge(self.run), folder / REPORT_FILE)
 
     def _tables(self) -> dict[str, dict[str, Any]]:
-        """What goes into which file."""
+        """Tables to write, by file name."""
         conditions, device = self.run.conditions, self._device()
         scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
         scenario["seed"] = conditions.seed if self.seed is None else self.seed
@@ -102,13 +106,13 @@ class Counterexample:
         return tables
 
     def _device(self) -> str:
-        """The name that describes it; empty: it takes a file."""
+        """Name that describes the device; empty if the device needs a file."""
         names = (str(self.dut), str(self.run.conditions.dut["name"]))  # as the command line would read them
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
 
 
 def _named_paths(device: str) -> list[str]:
-    """Paths in the name of a device, as they are written there."""
+    """Paths in the name of a device, as written there."""
     where = device.partition(":")[2].partition("?")[0]
     return [where] if any(thing.is_path for thing in describe(device).things) else []
 
@@ -127,7 +131,8 @@ def _allowed(option: str, things: Iterable[Thing]) -> list[str]:
 
 
 def _take_the_place(new: Path, folder: Path) -> None:
-    """Whoever is killed between the two names leaves the old folder under another."""
+    """Replace ``folder`` by ``new``. A process killed between the two renames leaves the old folder under another
+    name."""
     old = folder.with_name(f".{folder.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
@@ -137,7 +142,7 @@ def _take_the_place(new: Path, folder: Path) -> None:
 
 
 def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> str:
-    """The command that plays a run again, if names or files say what was played; else "", and it takes files.
+    """Command that plays a run again, if names or files describe what was played; else "": the run needs files.
 
     ``scenario``, ``rig``, ``dut``: how the user named them, if that is known: a file is recorded without its folder.
     """
@@ -155,7 +160,7 @@ def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> st
 
 
 def _is_scenario(name: str, run: Run) -> bool:
-    """Whether that is what was played; so the others."""
+    """True if the named scenario is the one that the run played."""
     from analogrig.errors import AnalogrigError
     from analogrig.scenario import Scenario
 
@@ -186,6 +191,7 @@ def _is_device(name: str, run: Run) -> bool:
 
 
 def _settings(dut: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a device, without who it was, and without the zero of the force, which the bench sets by the rig's card."""
+    """Device settings without its identity, and without the zero of the force: the bench sets that by the rig's
+    card."""
     estimator = {key: value for key, value in dut["estimator"].items() if key != "force_zero"}
     return {**{key: value for key, value in dut.items() if key != "identity"}, "estimator": estimator}

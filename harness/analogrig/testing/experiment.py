@@ -1,6 +1,6 @@
-"""Experiments: statements about as many plays of a scenario as they take; and those of a file, judged again.
+"""Experiments: statements about as many plays of a scenario as they take; and statements of a file, judged again.
 
-By what they judged, and on which scenario and seed, stands in the file of a counterexample
+The file of a counterexample names the statement, its limits, the scenario and the seed
 (``analogrig.testing.statement``).
 """
 
@@ -37,16 +37,16 @@ class Play(Protocol):
         """Play a scenario, by default with the seed that it has."""
 
     def on(self, rig: Rig, dut: Dut) -> Play:
-        """The same for another rig or device."""
+        """Return the same fixture for another rig or device."""
 
     def note(self, finding: Finding, seed: int) -> None:
-        """What was found of the plays from a seed on; the last that was noted is why a test fails, if it does."""
+        """Note a finding about the plays from a seed on. The last finding noted is the reason why a test fails."""
 
 
 def experiment(
     judge: Callable[Concatenate[Play, Scenario, int, Arguments], Finding],
 ) -> Callable[Concatenate[Play, Scenario, int, Arguments], Finding]:
-    """A statement about as many plays of a scenario as it takes, from a seed on."""
+    """Declare a statement about as many plays of a scenario as it takes, from a seed on."""
 
     @functools.wraps(judge)
     def noted(
@@ -64,7 +64,7 @@ def experiment(
 def with_some_seed(
     play: Play, scenario: str | Scenario, seed: int, statement: Callable[[Played], Finding], tries: int
 ) -> Finding:
-    """Whether a statement about a play holds with this seed, or the next, ...; if not, why it does not with this one.
+    """Finding: a statement about a play holds with this seed, or with one of the ``tries - 1`` seeds after it.
 
     With a chance p of one play to fail a sound device, that of this to fail it is p to the power of ``tries``. A play
     that is INCONCLUSIVE is not left to chance: then it does not hold.
@@ -84,7 +84,7 @@ def with_some_seed(
 
 
 def judged(statement: Statement, play: Play, scenario: Scenario, seed: int, where: str) -> Finding:
-    """Whether what stands in a file holds; ``where`` leads every error.
+    """Judge the statement of a file again; ``where`` leads every error.
 
     :raises ConfigurationError: there is no such statement, or it has not such limits.
     """

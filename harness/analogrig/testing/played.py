@@ -1,4 +1,4 @@
-"""A Run as a test speaks of it: what it shows, and why.
+"""Statements about one play, for use in tests.
 
 ``played.detects(within=1.5)`` and its like give a Finding: true or false, and a sentence that pytest shows when an
 assertion about it fails.
@@ -32,7 +32,7 @@ Arguments = ParamSpec("Arguments")
 def _of_a_valid_play(
     statement: Callable[Concatenate[Played, Arguments], Finding],
 ) -> Callable[Concatenate[Played, Arguments], Finding]:
-    """Nothing holds of a play that is not valid; what is found is noted."""
+    """Make a statement fail for a play that is not valid, and note every finding."""
 
     @functools.wraps(statement)
     def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
@@ -53,7 +53,7 @@ def _of_a_valid_play(
 
 
 def _to_nobody(_: Finding) -> None:
-    """Outside the plugin nobody asks why a test has failed."""
+    """Ignore a finding: outside the plugin no test needs its reason."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -66,9 +66,9 @@ class Played:
 
     run: Run
     repeat: str = ""
-    """The command that repeats it; empty: no names or files say what was played."""
+    """Command that repeats the play; empty if no names or files describe what was played."""
     note: Callable[[Finding], None] = field(default=_to_nobody, compare=False)
-    """Told whatever is found of it."""
+    """Callback that receives every finding about the play."""
 
     def __repr__(self) -> str:
         conditions = self.run.conditions
@@ -81,12 +81,12 @@ class Played:
 
     @_of_a_valid_play
     def passes(self) -> Finding:
-        """What the scenario's ``[expect]`` asks: no change missed or late, no false alarm."""
+        """Finding: the scenario's ``[expect]`` is met: no change missed or late, no false alarm."""
         return Finding(self.verdict.outcome == "passed", "; ".join(self.verdict.reasons) or "all that is expected")
 
     @_of_a_valid_play
     def detects(self, within: float | None = None) -> Finding:
-        """Every change that could be seen raised an alarm before the next one.
+        """Finding: every detectable change raised an alarm before the next change.
 
         :param within: and not later than so many times its information bound (and the bound's own sample); None: than
             the scenario's ``[expect]`` says.
@@ -102,7 +102,7 @@ class Played:
 
     @_of_a_valid_play
     def stays_quiet(self) -> Finding:
-        """No alarm but one for each change."""
+        """Finding: no alarm except one for each change."""
         alarms, doubtful = self.verdict.false_alarms, self.verdict.doubtful_alarms
         if doubtful and not alarms:
             return Finding(holds=False, why=f"INCONCLUSIVE: the alarm at {doubtful[0]} is false, or not: {_UNKNOWN}")
@@ -112,7 +112,7 @@ class Played:
 
     @_of_a_valid_play
     def isolates(self) -> Finding:
-        """Whatever was said to have changed has changed. Silence is allowed."""
+        """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
         judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
         said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
@@ -123,7 +123,7 @@ class Played:
 
     @_of_a_valid_play
     def estimates(self, within: float) -> Finding:
-        """M, B and K at the end of every stretch are right to a part ``within``."""
+        """Finding: M, B and K at the end of every stretch have a relative error of at most ``within``."""
         off = []
         for segment in self.verdict.estimates:
             if segment.estimate is None:
@@ -137,7 +137,7 @@ class Played:
 
     @_of_a_valid_play
     def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:
-        """The estimate goes the way of another one, in a tube around it.
+        """Finding: the estimate stays in a tube around a reference estimate.
 
         :param reference: (n, p) what theta should be after each sample; NaN: any.
         :param tolerance: how far it may be off; of a shape that broadcasts to (n, p).
@@ -166,7 +166,7 @@ _UNKNOWN = "it depends on when the change came, which is not known better"
 
 
 def _not_detected(tweak: ChangeVerdict, within: float | None) -> str:
-    """Why a change that could be seen was not detected in time, whenever it came; empty if it was."""
+    """Reason why a detectable change was not detected in time under any hypothesis of its instant; empty if it was."""
     reasons = [_too_late(each, within) for each in tweak.hypotheses]
     if all(reasons):
         return _too_late(tweak, within)
@@ -175,7 +175,7 @@ def _not_detected(tweak: ChangeVerdict, within: float | None) -> str:
 
 
 def _too_late(tweak: ChangeVerdict, within: float | None) -> str:
-    """As ``_not_detected``, for the very instant that it has."""
+    """Reason why a change at a known instant was missed or late; empty if it was detected in time."""
     if tweak.latency_n is None and tweak.bound_n is None:
         return ""
     if tweak.latency_n is None:
@@ -225,12 +225,12 @@ def _rate_below(rate: float, plays: Sequence[Played], confidence: float) -> Find
 
 
 def _samples_of(run: Run) -> tuple[str, bytes]:
-    """What makes it a play of its own: the device, and the samples that it was given."""
+    """Key of a distinct play: the device and the samples that it received."""
     return str(run.conditions.dut["name"]), hashlib.sha256(run.codes.tobytes()).digest()
 
 
 def _of_all(plays: Sequence[Played], rate: float, confidence: float) -> Statement | None:
-    """What is said of them, if a scenario and its first seed tell them all."""
+    """Statement about all plays; None if a scenario and its first seed do not describe them all."""
     conditions = [each.run.conditions for each in plays]
     first = conditions[0]
     if any(

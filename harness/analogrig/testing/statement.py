@@ -1,4 +1,4 @@
-"""What a test asserts of plays, by its name and limits, so that the file of a counterexample can say it again.
+"""Statements: assertions about plays, by name and limits, so that the file of a counterexample can repeat them.
 
 A statement is either about one play (the findings of ``analogrig.testing.played``), or an experiment
 (``analogrig.testing.experiment``).
@@ -28,9 +28,9 @@ class Finding:
     holds: bool
     why: str
     statement: Statement | None = None
-    """What holds, or not; None: no file could say it."""
+    """Statement that was judged; None if no file can express it."""
     run: Run | None = field(default=None, compare=False)
-    """The play that shows it."""
+    """Play that shows the finding."""
 
     def __bool__(self) -> bool:
         return self.holds
@@ -41,20 +41,20 @@ class Finding:
 
 @dataclass(frozen=True)
 class Known:
-    """A statement that a file can name."""
+    """Statement that a file can name."""
 
     judge: Callable[..., Finding]
     limits: type
-    """A dataclass of them, by which those in a file are checked."""
+    """Dataclass of the limits, which checks the limits in a file."""
     is_experiment: bool
 
 
 KNOWN: dict[str, Known] = {}
-"""By name. A module makes its own known when it is imported."""
+"""Known statements, by name. A module registers its own when it is imported."""
 
 
 def said(judge: Callable[..., Finding], *arguments: Any, **limits: Any) -> Statement | None:
-    """The statement of this call; None if no file can have its limits."""
+    """Statement of this call; None if no file can hold its limits."""
     made_known = KNOWN.get(judge.__name__)
     if made_known is None:
         return None
@@ -67,7 +67,10 @@ def said(judge: Callable[..., Finding], *arguments: Any, **limits: Any) -> State
 
 
 def make_known(judge: Callable[..., Finding], *, is_experiment: bool) -> None:
-    """What comes after the play, or after play, scenario and seed, are its limits, if they are plain values."""
+    """Register a statement that a file can name, if its limits are plain values.
+
+    The limits are the parameters after ``play``, or for an experiment after ``play``, ``scenario`` and ``seed``.
+    """
     hints = typing.get_type_hints(judge)
     parameters = list(inspect.signature(judge).parameters.values())[3 if is_experiment else 1 :]
     if any(not _is_plain(hints[each.name]) for each in parameters):

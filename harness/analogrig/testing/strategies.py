@@ -1,8 +1,8 @@
 """Strategies for hypothesis: plants, changes, excitations, noise, cards, computers, link faults, and whole scenarios.
 
-Each of them shrinks towards the usual: the front suspension with its own parameters, one jump of the stiffness, the
-square wave of the thesis, the ideal card. What is left of a scenario that fails is what matters. ``detectable`` of
-analogrig.judging.information tells which changes a device may be held to.
+Each strategy shrinks towards the usual case. Usual are the front suspension with its own parameters, one jump of the
+stiffness, the square wave of the thesis, and the ideal card. A scenario that fails keeps only the parts that matter.
+``detectable`` of analogrig.judging.information selects the changes that a device must detect.
 
 Needs the extra ``analogrig[pytest]``.
 """
@@ -36,7 +36,7 @@ WIDE_RANGES_V = {
     "velocity": (-10.0, 10.0),
     "net_force": (-12.5, 12.5),
 }
-"""Of the card of the rig ``emulator``: they hold every signal."""
+"""Ranges of the card of the rig ``emulator``: they hold every signal."""
 
 WARM_UP_N, SETTLING_N = 400, 300
 """Samples before the first change, and between two: enough edges for the device to have learned the plant."""
@@ -45,7 +45,7 @@ QUIET_N = 1000
 """Samples of a scenario in which nothing changes."""
 
 MOST_DISPLACEMENT_V = 8.0
-"""That a scenario may come to, at the most."""
+"""Largest displacement that a scenario may reach."""
 
 for _name, _examples in profiles.EXAMPLES.items():
     settings.register_profile(
@@ -70,12 +70,12 @@ def profile(name: str = "") -> settings:
 
 
 def _usually(usual: Any, others: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Shrinks to the usual value."""
+    """Strategy that shrinks to the usual value."""
     return st.one_of(st.just(usual), others)
 
 
 def _number(low: float, high: float, digits: int = 3) -> st.SearchStrategy[float]:
-    """Evenly spread, with few digits, so that a file shows it as it is."""
+    """Evenly distributed numbers with few digits, so that a file shows them exactly."""
     step = 10.0 ** math.floor(math.log10(high) - digits + 1)
     return st.integers(math.ceil(low / step), math.floor(high / step)).map(lambda n: float(f"{n * step:.12g}"))
 
@@ -91,7 +91,7 @@ def suspensions() -> st.SearchStrategy[PlantChoice]:
 
 
 def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
-    """So many of the same, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
+    """Random suspensions, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
     rng = np.random.default_rng(seed)
     mass, stiffness, ratio = (
         rng.uniform(*ends, count) for ends in (*(REACH[name] for name in ("M", "K")), DAMPING_RATIO)
@@ -103,7 +103,7 @@ def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
 
 
 def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> PlantChoice:
-    """Without a damping ratio, that of the front suspension."""
+    """Suspension with these parameters; without a damping ratio, that of the front suspension."""
     front = PLANTS["front"]
     critical = 2.0 * math.sqrt(mass_kg * stiffness_n_per_m)
     damping = front.damping_n_s_per_m if damping_ratio is None else _rounded(damping_ratio * critical)
@@ -137,7 +137,7 @@ def changes(
     together: int = 1,
     longest_ramp_n: int = 0,
 ) -> st.SearchStrategy[PotChange]:
-    """Pots that are turned.
+    """Changes of the pots during a play.
 
     :param plant: the plant that changes; None: the front suspension.
     :param sizes: the least and the largest relative change, up or down as the pots allow.
@@ -195,7 +195,7 @@ def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:
 def _excitation(
     shape: str, levels_v: tuple[float, float], frequency_hz: float, phase: float, clock: tuple[str, float]
 ) -> Excitation:
-    """A random sequence stays where it is for up to as many bits as its register has."""
+    """Excitation; a random sequence keeps its level for up to as many bits as its register has."""
     return Excitation(
         shape=shape,
         low_v=levels_v[0],
@@ -232,7 +232,7 @@ def _within_range(excitation: Excitation, plants: Sequence[Plant]) -> Excitation
 
 
 def noise(most_lsb: float = 1.0) -> st.SearchStrategy[float]:
-    """Of a card, rms in LSB; the default device is set for no more than 1."""
+    """Noise of a card, rms in LSB; the default device is set for no more than 1."""
     return _usually(most_lsb, _number(0.1 * most_lsb, most_lsb, 2))
 
 
@@ -267,12 +267,12 @@ def rigs(most_noise_lsb: float = 1.0) -> st.SearchStrategy[EmulatorDescription]:
 
 
 def seeds() -> st.SearchStrategy[int]:
-    """Of all that is random in a play."""
+    """Seeds of all random parts of a play."""
     return st.integers(0, 2**31 - 1)
 
 
 def link_faults(kinds: Sequence[str] | None = None, most: int = 3) -> st.SearchStrategy[str]:
-    """What goes wrong on a line, as ``--wire-faults`` has it; shrinks to a line without faults."""
+    """Link faults in the syntax of ``--wire-faults``; shrinks to a line without faults."""
     from analogrig.links.faulty_wire import FaultyWire
 
     where = st.one_of(

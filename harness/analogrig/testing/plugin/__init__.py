@@ -148,7 +148,7 @@ def hil_dut(request: pytest.FixtureRequest) -> Dut:
 
 @pytest.fixture
 def hil_bench(request: pytest.FixtureRequest, hil_rig: Rig, hil_dut: Dut) -> Bench:
-    """Both on one table."""
+    """Bench of the rig and device of the session."""
     from analogrig.bench import Bench
 
     return Bench(hil_rig, hil_dut, time_limit_s=time_limit_s(request.config))

@@ -1,4 +1,4 @@
-"""The devices of a session, and what of rigs and devices there is only one, which one worker of pytest-xdist owns."""
+"""Devices of a session, and the assignment of single rigs and devices to one worker of pytest-xdist."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from analogrig.trust import Trust
 
 _TOLD = "analogrig_owned"
-"""What a worker is told: the folder in which it says which tests need what there is one of."""
+"""Key of a worker's input: the folder that lists the tests which need a single rig or device."""
 
 _SPREADING = ("load", "worksteal")
-"""Those --dist of pytest-xdist that give any test to any worker."""
+"""Values of --dist with which pytest-xdist gives any test to any worker."""
 
 
 @runtime_checkable
@@ -32,18 +32,18 @@ class Equipped(Protocol):
     """An item that names its own rig and device; other plugins' items have no such method."""
 
     def hil_equipment(self) -> tuple[str, str]:
-        """The names of rig and device; empty: unknown."""
+        """Names of rig and device; empty if unknown."""
 
 
 @dataclass
 class Devices:
-    """They last as long as the session, and are reached anew when a test has hung them."""
+    """Devices of a session. They stay open until the session ends, and are reopened after a test has hung them."""
 
     _open: dict[str, Dut] = field(default_factory=dict)
     _described: dict[str, Any] = field(default_factory=dict)
 
     def lease(self, name: str, trust: Trust) -> Dut:
-        """A device that is there, reset and configured as described, whatever the test before has done to it.
+        """Device that is reachable, reset and configured as described, in whatever state the last test left it.
 
         :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
@@ -68,12 +68,12 @@ class Devices:
         return dut
 
     def release(self, name: str) -> None:
-        """It is not asked for again."""
+        """Close the device ``name``, if it is open."""
         if (dut := self._open.pop(name, None)) is not None:
             dut.close()
 
     def _let_go(self, only_one: str) -> None:
-        """Of what is open under another name, and cannot be opened twice."""
+        """Close the devices open under another name that cannot be opened twice."""
         from analogrig.devices.registry import describe
 
         for name in [name for name in self._open if only_one and describe(name).only_one == only_one]:
@@ -85,7 +85,7 @@ class Devices:
 
 
 class OneOwner:
-    """Has pytest-xdist give all tests that need the one rig or device to one worker, and any other to any.
+    """Scheduling of pytest-xdist that gives all tests of a single rig or device to one worker, and any other to any.
 
     Its own groups (--dist loadgroup) would do, but do not reach the scheduler with pytest 9.2 (pytest-xdist 1386).
     """
@@ -114,7 +114,8 @@ class OneOwner:
 
 @functools.cache
 def _owned(folder: Path) -> frozenset[str]:
-    """Asked when every worker has collected: each says the same."""
+    """Node ids of the tests that one worker owns. Call it after all workers have collected: each records the same
+    list."""
     told = sorted(folder.iterdir())
     return frozenset(json.loads(told[0].read_text(encoding="utf-8")) if told else ())
 
@@ -142,7 +143,7 @@ def keep_with_owner(config: pytest.Config) -> None:
 
 
 def tell_owned(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
-    """In a worker: which tests belong together."""
+    """In a worker: record which tests belong together."""
     told = getattr(config, "workerinput", {})
     if _TOLD in told:
         owned = [item.nodeid for item in items if single_of(item)]
@@ -164,7 +165,7 @@ def check_owner(item: pytest.Item) -> None:
 
 
 def single_of(item: pytest.Item) -> str:
-    """What a test needs of which there is one, and that one worker owns it; empty: nothing."""
+    """Description of the single rig or device that a test needs and one worker owns; empty if the test needs none."""
     if isinstance(item, Equipped):
         return _single(*item.hil_equipment())
     wanted = getattr(item, "fixturenames", ())
@@ -173,7 +174,10 @@ def single_of(item: pytest.Item) -> str:
 
 
 def _single(rig: str, dut: str) -> str:
-    """Which of a rig and a device there is only one of; whether they exist at all will be found out by who asks."""
+    """Description of the single one of a rig and a device; empty if neither is single.
+
+    The code that opens them reports names that do not exist.
+    """
     if not rig and not dut:
         return ""
     from analogrig.devices.registry import describe

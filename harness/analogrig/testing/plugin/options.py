@@ -26,7 +26,7 @@ Source = Literal["parameter", "command line", "environment", "ini file", "defaul
 
 @dataclass(frozen=True)
 class Said:
-    """The value of an option, and its source: the start of every complaint about it."""
+    """Value of an option and its source, which begins every error message about it."""
 
     value: str
     by: str
@@ -47,7 +47,7 @@ class Option:
     default: str
     help: str
     complaint: Callable[[str], str] = _accept
-    """Return why a value is wrong; empty if nothing is known against it."""
+    """Return the reason why a value is wrong; empty if none is known."""
 
     @property
     def ini(self) -> str:
@@ -129,7 +129,7 @@ def _no_profile(value: str) -> str:
 
 
 def _seconds(value: str) -> float | None:
-    """A time limit; None: it cannot be one."""
+    """Time limit in seconds; None if the value cannot be one."""
     try:
         seconds = float(value)
     except ValueError:

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def in_one_line(by: str = "") -> Iterator[None]:
-    """What went wrong with rig, link or device is told without the way through our code; what cannot be configured
-    together with who wanted it."""
+    """Report a failure of rig, link or device without a traceback; name the requester ``by`` of a bad configuration."""
     from analogrig.errors import AnalogrigError, ConfigurationError
     from analogrig_emulator import EmulatorError
 
@@ -44,21 +43,21 @@ def in_one_line(by: str = "") -> Iterator[None]:
 
 @dataclass
 class Record:
-    """What one test has played and found; of a property that hypothesis tries, with its last example."""
+    """Plays and findings of one test. For a property of hypothesis, those of its last example."""
 
     plays: list[Played] = field(default_factory=list)
     found: tuple[Finding, int] | None = None
-    """The last finding, and the seed from which on it looked for plays."""
+    """Last finding, and the first seed of the plays that it is about."""
     shown: Counterexample | None = None
-    """By the last example that failed."""
+    """Counterexample of the last example that failed."""
 
     def begin(self) -> None:
-        """Another example."""
+        """Begin another example."""
         self.plays.clear()
         self.found = None
 
     def counterexample(self, item: pytest.Item) -> Counterexample | None:
-        """The plays until now, if they have failed; None: nothing was played."""
+        """Counterexample of the plays until now; None if nothing was played."""
         from analogrig.testing.counterexample import Counterexample
 
         if not self.plays:
@@ -119,13 +118,13 @@ class Player:
         return "hil_play"
 
     def on(self, rig: Rig, dut: Dut) -> Player:
-        """The same for another rig or device."""
+        """Player for another rig or device."""
         from analogrig.bench import Bench
 
         return Player(self.item, Bench(rig, dut, time_limit_s=time_limit_s(self.item.config)))
 
     def note(self, finding: Finding, seed: int) -> None:
-        """What was found of the plays from a seed on."""
+        """Note a finding about the plays from a seed on."""
         record_of(self.item).found = finding, seed
 
 
@@ -134,8 +133,11 @@ class Player:
 
 @contextlib.contextmanager
 def examples_kept(item: pytest.Item) -> Iterator[None]:
-    """Write each failing example of hypothesis at once, in the place of the one before: a session that is ended while
-    hypothesis shrinks leaves the simplest until then. Tests without ``hil_play`` are left alone."""
+    """Write each failing example of hypothesis at once, in place of the one before.
+
+    A session that ends while hypothesis shrinks leaves the simplest example until then. Tests without ``hil_play`` are
+    left alone.
+    """
     if "hil_play" not in getattr(item, "fixturenames", ()):
         yield
         return
@@ -173,7 +175,8 @@ def _kept_if_it_fails(tried: Callable[..., None], item: pytest.Item) -> Callable
 
 
 def _is_from_elsewhere(error: BaseException) -> bool:
-    """Whether it says nothing of the example, as a time-out of pytest does; ours show no way to where they were."""
+    """True if the error is unrelated to the example, such as a time-out of pytest. Our own failures show no
+    traceback."""
     return isinstance(error, pytest.fail.Exception) and error.pytrace
 
 
@@ -187,8 +190,10 @@ def _keep(record: Record, item: pytest.Item) -> None:
 
 
 def left_by(item: pytest.Item) -> str:
-    """Writes what a test that failed leaves; says what was found, in full, where it is, and how to repeat it.
-    Empty: it has played nothing.
+    """Write the counterexample of a failed test. Return the full finding, the place of the files and the command to
+    repeat it.
+
+    The text is empty if nothing was played.
 
     A scenario of --hil-scenario-dir is there already: what it leaves shall not be one more of them.
     """
@@ -234,7 +239,7 @@ def _unwritten() -> tuple[type[Exception], ...]:
 
 
 def properties(item: pytest.Item) -> list[tuple[str, Any]]:
-    """What JUnit shall know of the plays of a test."""
+    """JUnit properties of the plays of a test."""
     record = record_of(item)
     found = [("found", f"{record.found[0]!r}"[1:-1])] if record.found else []
     return [*(each for played in record.plays for each in _properties(played).items()), *found]
@@ -270,7 +275,7 @@ def _latency(tweak: ChangeVerdict) -> str:
 
 @functools.cache
 def _commit() -> str:
-    """Of the repository in which pytest runs; empty where there is none."""
+    """Commit of the repository in which pytest runs; empty outside a repository."""
     command = ["git", "rev-parse", "--short=12", "HEAD"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)

@@ -24,10 +24,10 @@ _FOLDER = pytest.StashKey[Path]()
 """Folder whose scenario files are tests; absent without one."""
 
 _COMPLAINT = pytest.StashKey[str]()
-"""Why the folder of the ini file cannot be collected."""
+"""Reason why the folder of the ini file cannot be collected."""
 
 DEVICES = pytest.StashKey[Devices]()
-"""Of the session."""
+"""Devices of the session."""
 
 
 def add_folder(config: pytest.Config) -> None:
@@ -54,7 +54,7 @@ def add_folder(config: pytest.Config) -> None:
 
 
 def _passed_over(folder: str, config: pytest.Config) -> str:
-    """Why pytest does not enter a folder that is not named; empty if it does."""
+    """Reason why pytest does not enter a folder that is not named; empty if pytest enters it."""
     patterns = config.getini("norecursedirs")
     parts = _below(Path(folder).resolve(), config)
     if not any(fnmatch.fnmatch(part, pattern) for part in parts for pattern in patterns):
@@ -75,7 +75,7 @@ def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
 
 
 def _is_scenario(path: Path) -> bool:
-    """A rig or a device beside it is none."""
+    """True if the file is a scenario; rig and device files beside it are none."""
     from analogrig import config
     from analogrig.devices.registry import KINDS
     from analogrig.errors import AnalogrigError

@@ -21,11 +21,11 @@ from analogrig.testing.statement import Finding
 __all__ = ["TRIES", "Play", "is_playable", "with_some_seed"]
 
 TRIES = 5
-"""What chance may spoil has failed when it did so with as many seeds, one after the other."""
+"""Number of consecutive seeds with which a statement subject to chance must fail before its test fails."""
 
 
 def is_playable(rig: Rig, scenario: Scenario) -> bool:
-    """Whether the rig has the waveform and the pots; one that has next to none fails hypothesis's health check."""
+    """True if the rig has the waveform and the pots. A rig that has next to none fails hypothesis's health check."""
     try:
         rig.perform(scenario, 0)
     except ConfigurationError:

@@ -1,8 +1,7 @@
-"""The shipped properties as experiments: each plays what it needs, from a scenario and a seed on, and says what it
-found.
+"""Shipped properties as experiments: each makes its plays from a scenario and a first seed, and returns a finding.
 
-The tests beside this module draw scenarios and state limits; what fails is left with both, and judged again by the
-function that failed (``analogrig.testing.statement``).
+The tests beside this module draw scenarios and state limits. A failure keeps both, and the function that failed judges
+them again (``analogrig.testing.statement``).
 """
 
 from __future__ import annotations
@@ -36,23 +35,23 @@ from analogrig.testing.played import Played, rate_below
 from analogrig.testing.statement import Finding
 
 LONGEST_TIMEOUT_S = 0.5
-"""Of a line on which faults are tried: some cost one, or a few."""
+"""Longest time-out of a line on which faults are tried: some faults cost one time-out, or a few."""
 
 _WITNESS_N = 2000
-"""Samples of the play that is left of many trials; more, if its first alarm came later."""
+"""Samples of the play kept as evidence of many trials; more if its first alarm came later."""
 
 _AFTER_N = 100
-"""Samples of it after that alarm."""
+"""Samples of the kept play after its first alarm."""
 
 _MOST_UNARMED = 2
-"""Trials may take so many times the samples in which the trigger was armed; else silence is no evidence."""
+"""Largest ratio of samples to samples with the trigger armed. Beyond it, zero alarms prove nothing."""
 
 _EVER = 1e9
-"""Of the bound: an alarm before the next change."""
+"""Multiple of the information bound that allows any latency: an alarm before the next change suffices."""
 
 
 def described(dut: Dut) -> DeviceDescription:
-    """As it is configured now."""
+    """Description of the device in its present configuration."""
     return recorded(dut.description())
 
 
@@ -61,7 +60,7 @@ def _played(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Playe
 
 
 def _invalid(*plays: Played) -> Finding | None:
-    """Nothing is said of plays that are not valid."""
+    """Finding that does not hold, for the first play that is not valid; None if all are valid."""
     for played in plays:
         if not played.verdict.valid:
             return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}", run=played.run)
@@ -75,7 +74,7 @@ def _invalid(*plays: Played) -> Finding | None:
 def rate_of_plays_below(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int
 ) -> Finding:
-    """``analogrig.testing.played.rate_below`` of so many plays."""
+    """Finding of ``analogrig.testing.played.rate_below`` for a given number of plays."""
     return rate_below(rate, _played(play, scenario, seed, plays), confidence=confidence)
 
 
@@ -83,7 +82,10 @@ def rate_of_plays_below(
 def false_alarms_at_most(
     play: Play, scenario: Scenario, seed: int, allowed: int, samples: int, samples_each: int
 ) -> Finding:
-    """No more than so many in trials of ``samples_each``, in which the trigger was armed in ``samples`` altogether."""
+    """Finding: at most ``allowed`` false alarms while the trigger was armed in ``samples`` samples.
+
+    Each trial takes ``samples_each`` samples.
+    """
     trials = _trials(play, f"takes {samples} samples: analogrig certify")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     alarms: list[NDArray[np.int64]] = []
@@ -110,7 +112,7 @@ def false_alarms_at_most(
 def false_alarms_of_plants_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plants: int, samples_each: int
 ) -> Finding:
-    """That they are more frequent over plants that are drawn cannot be said with that confidence."""
+    """Finding: over random plants, the lower confidence limit of the false-alarm rate is at most ``rate``."""
     from analogrig.testing.strategies import random_suspensions
 
     trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
@@ -136,7 +138,12 @@ def false_alarms_of_plants_rarer(
 def rare_false_alarms_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
 ) -> Finding:
-    """The same of a rate that is too low to be waited for, by ``analogrig.campaigns.rare``."""
+    """Finding: the lower confidence limit of a false-alarm rate too low to count is at most ``rate``.
+
+    ``analogrig.campaigns.rare`` estimates the rate.
+
+    ``analogrig.campaigns.rare`` estimates the rate.
+    """
     rig, device = _in_this_process(play, "needs the estimator in this process")
     if device.estimator.trigger != "cusum":
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
@@ -153,7 +160,7 @@ def _trials(play: Play, otherwise: str) -> Trials:
 
 
 def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
-    """Rig and device, if trials without a line are what the bench would give; else the test is skipped."""
+    """Rig and device, if trials without a line equal those on the bench; else the test is skipped."""
     rig, device = play.bench.rig, described(play.bench.dut)
     if not is_emulated(rig) or not are_possible(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
@@ -165,7 +172,7 @@ def _with_most(alarms: list[NDArray[np.int64]]) -> int:
 
 
 def _witnessed(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
-    """With a play that leaves a recording."""
+    """Failed finding with a play that leaves a recording."""
     samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
     witness = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
     return Finding(holds=False, why=why, run=play(witness, seed, allow_inconclusive=True).run)
@@ -186,8 +193,12 @@ def changes_are_noticed_soon_and_rightly_named(
     right: float,
     confidence: float,
 ) -> Finding:
-    """Mean latency over mean bound is at most ``latency``, after more plays if a few have it little above, and at most
-    ``doubtful_latency``; and of the diagnoses at least the part ``right`` may be."""
+    """Finding: mean latency over mean bound is at most ``latency``, and enough diagnoses are right.
+
+    With ``confidence``, the diagnoses must not refute that at least the part ``right`` of them is right.
+
+    A ratio up to ``doubtful_latency`` after ``plays`` plays is decided by ``most_plays`` plays.
+    """
     every = _played(play, scenario, seed, plays)
     if latency < _latency_over_bound(every) <= doubtful_latency:
         every += _played(play, scenario, seed + plays, most_plays - plays)
@@ -236,7 +247,7 @@ def _too_often_misnamed(plays: Sequence[Played], right: float, confidence: float
 
 
 def _wrongly_named(plays: Sequence[Played]) -> Finding:
-    """The first of them; there is one."""
+    """Finding of the first play with a wrong diagnosis; the caller knows that there is one."""
     return next(finding for played in plays if not (finding := played.isolates()))
 
 
@@ -252,8 +263,10 @@ def single_changes_are_rightly_named(
     most_plays: int,
     silent: int,
 ) -> Finding:
-    """Wald's test of the part that is called wrongly, ``expected`` against ``refuted``; a device that has named nothing
-    in ``silent`` plays does not name changes at all, which is allowed."""
+    """Finding: Wald's test accepts the part ``expected`` of wrong diagnoses against ``refuted``.
+
+    A device without a diagnosis in ``silent`` plays does not diagnose changes at all, which is allowed.
+    """
     test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
     every: list[Played] = []
     for number in range(most_plays):
@@ -278,7 +291,7 @@ def single_changes_are_rightly_named(
 
 @experiment
 def answers_with_numbers(play: Play, scenario: Scenario, seed: int) -> Finding:
-    """Whatever comes: the device answers, with finite numbers, and raises no alarm below its ceiling."""
+    """Finding: the device answers any input with finite numbers, and raises no alarm below its ceiling."""
     played = play(scenario, seed, allow_inconclusive=True)
     run, ceiling = played.run, played.verdict.ceiling
     wrong = list(run.conditions.faults[:1])
@@ -296,7 +309,8 @@ def answers_with_numbers(play: Play, scenario: Scenario, seed: int) -> Finding:
 
 @experiment
 def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) -> Finding:
-    """While the force has no edge, up to sample ``until``, there is nothing to learn, and no alarm to raise."""
+    """Finding: while the force has no edge, up to sample ``until``, the device raises no alarm and its estimate stays
+    finite."""
     _configure(play, stuck_n=0)  # a displacement that does not move is a measurement then
     played = play(scenario, seed, allow_inconclusive=True)
     if (invalid := _invalid(played)) is not None:
@@ -312,7 +326,7 @@ def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) ->
 def alarms_keep_hold_off_and_warm_up(
     play: Play, scenario: Scenario, seed: int, hold_off_n: int, warm_up_n: int, at_least: int
 ) -> Finding:
-    """A device that is set to raise alarms as often as it may, and raises some, keeps those times."""
+    """Finding: a device set to raise alarms as often as possible keeps the hold-off and the warm-up."""
     restless = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
     _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **restless)
     played = play(scenario, seed, allow_inconclusive=True)
@@ -330,14 +344,14 @@ def alarms_keep_hold_off_and_warm_up(
 
 
 def _configure(play: Play, **settings: Any) -> None:
-    """The device until the next test."""
+    """Configure the device until the next test."""
     dut = play.bench.dut
     dut.configure(dataclasses.replace(dut.estimator, **settings))
 
 
 @experiment
 def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
-    """They leave the estimate as it is without them, or the run is INCONCLUSIVE, or refused with the cause."""
+    """Finding: line faults leave the estimate unchanged, or the run is INCONCLUSIVE, or refused with the cause."""
     bench, device = play.bench, described(play.bench.dut)
     if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
@@ -364,8 +378,14 @@ def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, fau
 def faults_among_the_samples_cost_no_more_than_samples(
     play: Play, scenario: Scenario, seed: int, each: int, least_valid: int
 ) -> Finding:
-    """Of each kind of fault that passes, ``each`` at messages with samples: what is lost is as if it had been declared
-    missing, to the bit, and nothing else changes. At least so many of the kinds must have left a valid run."""
+    """Finding: faults at messages with samples cost no more than those samples.
+
+    The result equals, to the bit, a run in which the lost samples were declared missing. ``each`` faults of each
+    passing kind are tried. ``least_valid`` of the kinds must leave a valid run.
+
+    The result equals, to the bit, a run in which the lost samples were declared missing. ``each`` faults of each
+    passing kind are tried. At least so many of the kinds must have left a valid run.
+    """
     device = dataclasses.replace(described(play.bench.dut), wire_faults="")
     if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
@@ -393,19 +413,19 @@ def faults_among_the_samples_cost_no_more_than_samples(
 
 
 PASSING = frozenset({"drop", "duplicate", "repeat", "reorder", "flip", "lose", "insert", "truncate"})
-"""Kinds of faults after which the line is as it was, and of which none goes on for long."""
+"""Kinds of faults that end soon and leave the line as it was before."""
 
 _BEFORE_SAMPLES_N = 5
 """Messages to the device before the first with samples, beside two for each of its settings."""
 
 
 _START, _LATE_STARTS = "an order to start that comes again", 4
-"""Orders to start that come again, each in a run of its own: some come too late to be known for what they are."""
+"""Repeated start orders, each in a run of its own: some come too late to be recognised as repetitions."""
 
 
 def _cases(kinds: Sequence[str], dut: Dut, run: Run, each: int) -> Iterator[tuple[str, str]]:
-    """Kinds and faults: of each kind so many, evenly over a run on a connection of its own; and orders to start that
-    come again among the samples."""
+    """Kinds and faults: ``each`` of a kind, evenly over a run on its own connection; and start orders repeated among
+    the samples."""
     first = 2 * len(list(dut.estimator.settings())) + _BEFORE_SAMPLES_N
     messages = run.samples // dut.line["samples_per_message"]
     for kind in kinds:
@@ -420,13 +440,13 @@ def _replayed(run: Run) -> Scenario:
 
 
 def _spoiled(without: Run, device: DeviceDescription) -> Run:
-    """The same samples, which a real rig would not take twice, over a line with faults."""
+    """Play the same samples, which a real rig would not take twice, over a line with faults."""
     with connect(device) as dut:
         return Bench(RecordingRig.of(without, Path("without")), dut).play(_replayed(without), without.conditions.seed)
 
 
 def _missing(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
-    """The same samples, some of them declared missing."""
+    """Rig that replays the samples of a run, some of them declared missing."""
     return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | lost[:, np.newaxis]), Path("missing"))
 
 
@@ -442,11 +462,11 @@ _EFFECTS = (
     "samples_lost",
     "samples_ignored",
 )
-"""Counters of the device that tell of a fault."""
+"""Device counters that count the effects of a fault."""
 
 
 def _harm(run: Run, declared: Run) -> str:
-    """How a run differs from one in which the samples that it has lost were declared missing; empty: not at all."""
+    """Difference between a run and one whose lost samples were declared missing; empty if there is none."""
     heard = ~run.lost
     for name in ("theta", "innovation", "statistic"):
         ours, theirs = (getattr(each, name)[heard].view(np.uint32) for each in (run, declared))

@@ -1,4 +1,4 @@
-"""What the generator, the card and the line do is not taken for a change of the plant."""
+"""Imperfections of generator, card and line are not taken for a change of the plant."""
 
 from __future__ import annotations
 

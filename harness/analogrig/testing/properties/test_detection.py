@@ -1,7 +1,7 @@
-"""What can be seen is seen in time; where nothing happens nothing is seen; what is said to have changed has, mostly.
+"""Detectable changes are detected in time, a constant plant raises no alarm, and most diagnoses are right.
 
-How late is in time, how often chance may spoil it, and how often a name may be wrong is said beside each number here,
-and derived in harness/docs/background/properties.md.
+The text at each number states how late is in time, how often chance may fail a test, and how many diagnoses may be
+wrong. harness/docs/background/properties.md derives these limits.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ MOST_LATENCY, DOUBTFUL_LATENCY = 1.35, 1.42
 """Mean latency over mean bound: 1.22 on the thesis profile, with a standard error of 0.029 over PLAYS_N plays; what is
 between the two is played MOST_PLAYS_N times."""
 LEAST_RIGHT, SURELY = 0.9, 1.0 - 1e-7
-"""Of the diagnoses on the thesis profile, of which two are hard: M falls by three quarters, B and K change at once."""
+"""Least part of right diagnoses on the thesis profile. Two of its changes are hard: M falls by three quarters, and B
+and K change at once."""
 
 SINGLE_WRONG, SINGLE_FAR_TOO_WRONG = 0.01, 0.05
-"""Of the diagnoses of single changes by 20 %: what is expected at most, and what is refuted."""
+"""Part of wrong diagnoses of single changes by 20 %: the largest expected, and the refuted alternative."""
 SINGLE_MISS, SINGLE_FALSE_FAILURE = 1e-3, 1e-7
 MOST_SINGLE_PLAYS_N, SILENT_N = 300, 5
 

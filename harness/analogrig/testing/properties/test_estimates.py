@@ -1,4 +1,4 @@
-"""Estimates are right when the plant has been still, and numbers whatever comes."""
+"""Estimates are right while the plant is constant, and finite with any input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from analogrig.testing.strategies import profile, rigs, scenarios, seeds
 from analogrig_emulator import Excitation
 
 WITHIN = 0.1
-"""Of M, B and K each: six times the rms error of the worst plant drawn."""
+"""Largest relative error of each of M, B and K: six times the rms error of the worst plant drawn."""
 
 PAUSED = Scenario(
     samples=16_000,
