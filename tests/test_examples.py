@@ -49,6 +49,7 @@ def test_first_test_passes_with_the_projects_estimator(example: Path) -> None:
     assert "3 passed" in run("pytest -q --hil-dut inproc", example)
 
 
+@pytest.mark.tools("sed")
 @pytest.mark.parametrize("example", ["estimator"], indirect=True)
 def test_estimator_compiles_and_its_tests_run(example: Path) -> None:
     assert "1 passed, 1 xfailed" in run("make && pytest -q", example)

@@ -31,6 +31,7 @@ PACKAGES = {
     "gcc": "gcc",
     "gcov": "gcc",
     "bash": "bash",
+    "sed": "sed",
     "clang": "clang libclang-rt-dev",
     "clang-format-14": "clang-format-14",
     "clang-tidy": "clang-tidy",

@@ -20,6 +20,7 @@ def pasted() -> str:
     return "".join(re.findall(r"^```sh\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL))
 
 
+@pytest.mark.tools("sed")
 def test_own_estimator_is_judged_as_the_page_states(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     script = f"set -e\n{pasted()}"
