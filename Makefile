@@ -154,6 +154,7 @@ mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sa
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
+	@rm -rf *.egg-info
 
 wheels: $(BUILD)/wheels/.made ## build manylinux wheels for x86_64 and aarch64 into build/wheels; downloads zig, 100 MB
 
@@ -176,6 +177,7 @@ $(BUILD)/wheels/.made: $(ZIG)/.made $(PRODUCTS) setup.py pyproject.toml $(PYTHON
 	        --outdir $(@D) . >$(@D)/log 2>&1 || { cat $(@D)/log >&2; exit 1; }; \
 	done
 	@for wheel in $(@D)/*.whl; do $(ZIG)/bin/auditwheel show $$wheel; done
+	@rm -rf *.egg-info  # a second description of the package, which pytest would find
 	@touch $@
 
 lock: ## resolve requirements.lock again from pyproject.toml; needs uv
