@@ -1,4 +1,4 @@
-"""That nothing undefined can happen in the core: Frama-C's Eva, an abstract interpreter, over eva.c. `make eva`.
+"""Proof of no undefined behaviour in the core: Frama-C's Eva, an abstract interpreter, over eva.c. `make eva`.
 
 For all orders of the model, any delay, any configuration and any samples: no access outside an array or by a stale
 pointer, no read of what was not written, no overflow of whole numbers, no conversion out of range. NaN and the

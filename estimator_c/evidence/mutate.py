@@ -1,4 +1,4 @@
-"""Whether the tests of the core notice when it is wrong: every operator, constant, condition, statement, one at a time.
+"""Mutation test of the core: every operator, constant, condition and statement, one at a time.
 
 `make mutate` makes each mutant, runs the tests on it until one fails, and prints those that none notices. MUTATION.md
 explains them; one that it does not explain, or an explanation whose mutant is noticed or gone, is a failure.
