@@ -172,7 +172,7 @@ def test_users_repository_finds_its_bug_and_leaves_what_repeats_it(
     found = run(users_environment / "python", "-m", "pytest", "-q", cwd=users_repository, status=1)
     assert "1 failed, 1 passed" in found
     assert "B at 1400 was missed" in found
-    repeat = re.search(r"^repeat it with: analogrig (.*)$", found, re.MULTILINE)
+    repeat = re.search(r"^play it again with: analogrig (.*)$", found, re.MULTILINE)
     assert repeat is not None
     again = run(users_environment / "analogrig", *shlex.split(repeat[1]), cwd=users_repository, status=1)
     assert "missed" in again

@@ -35,6 +35,13 @@ def test_sound_run_has_no_advice() -> None:
     assert advised(made_run(LOADED, [(0, FRONT), (400, SOFT)], alarms=[404], theta=GOOD_THETA)) == ""
 
 
+def test_statement_that_only_pytest_judges_is_named() -> None:
+    run = made_run(LOADED, [(0, FRONT)], theta=GOOD_THETA)
+    scenario = {**run.conditions.scenario, "statement": {"name": "detects", "limits": {"within": 1.5}}}
+    stated = dataclasses.replace(run, conditions=dataclasses.replace(run.conditions, scenario=scenario))
+    assert "[statement] detects is not judged here" in advised(stated)
+
+
 def test_more_noise_than_the_device_is_set_for_is_named() -> None:
     run = made_run(
         LOADED, [(0, FRONT)], noise_lsb=2.0, theta=GOOD_THETA, estimator={**ESTIMATOR, "noise_variance": 1.2}

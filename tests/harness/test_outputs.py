@@ -130,6 +130,17 @@ def test_run_that_fails_later_keeps_what_it_has(out: Path, fault: Exception, mon
     assert Run.load(out / "run.npz").conditions.faults == (str(fault),)
 
 
+@pytest.mark.parametrize("name", ["run.npz", "report.html", "verdict.json", "can.log"])
+def test_folder_in_the_place_of_a_result_is_refused_before_the_run(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out" / name).mkdir(parents=True)
+    monkeypatch.setattr(Bench, "play", None)
+    assert main(["run", "--dut", "inproc", "--out", str(tmp_path / "out")]) == 2
+    assert f"{name} is no file: remove it, or choose another folder" in capsys.readouterr().err
+    assert (tmp_path / "out" / name).is_dir()
+
+
 def test_verdict_file_is_what_json_prints(out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--dut", "inproc", "--seed", "4", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)

@@ -119,7 +119,7 @@ def test_instant_of_a_command_is_dated_and_the_device_is_judged_by_it(program: P
     (tweak,) = judge(run).tweaks
     assert tweak.between[0] <= INSTANTS[0] <= tweak.between[1]
     assert tweak.between[1] - tweak.between[0] < 60
-    assert tweak.result == "noticed"
+    assert tweak.result == "detected"
 
 
 def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(program: Path) -> None:
@@ -129,7 +129,7 @@ def test_two_pots_of_a_command_are_one_change_from_the_first_to_the_second(progr
     earliest, latest = segment.earliest(), segment.latest()
     assert earliest.start <= INSTANTS[0] <= latest.start
     assert earliest.start + earliest.ramp_n <= INSTANTS[1] <= latest.start + latest.ramp_n
-    assert judge(run).tweaks[0].result == "noticed"
+    assert judge(run).tweaks[0].result == "detected"
 
 
 def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None:

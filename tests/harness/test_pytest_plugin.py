@@ -249,13 +249,33 @@ def test_failure_leaves_a_scenario_a_recording_and_the_line_that_repeats_it(
     result = run(user, "--hil-dut", "inproc", "--hil-rig", "noisy.toml", "--junitxml", "junit.xml")
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
-        ["E*<no: K at 300: * samples, allowed 1>*", "repeat it with: analogrig run --scenario *"]
+        ["E*<no: K at 300: * samples, allowed 1>*", "play it again with: analogrig run --scenario *"]
     )
-    (line,) = [line for line in result.outlines if line.startswith("repeat it with: ")]
+    (line,) = [line for line in result.outlines if line.startswith("play it again with: ")]
     monkeypatch.chdir(user.path)
-    status = cli.main([*line.split()[4:], "--json", "--out", str(user.path / "again")])
+    status = cli.main([*line.split()[5:], "--json", "--out", str(user.path / "again")])
     assert status == 0
     assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
+
+
+def test_play_refuses_a_file_that_names_another_rig_or_device_than_plays_it(user: pytest.Pytester) -> None:
+    """A play on the session's rig would pass for one on the rig that the file names."""
+    text = (user.path / "short.toml").read_text()
+    user.path.joinpath("named.toml").write_text(f'rig = "emulator-0-10v"\ndut = "inproc"\n{text}')
+    user.makepyfile(PLAYS.replace("short.toml", "named.toml").format(assertion="assert played.passes()"))
+    refused = run(user)
+    refused.assert_outcomes(failed=1)
+    refused.stdout.fnmatch_lines(["*named: names emulator-0-10v, but emulator of the session would play it: say --hil-*"])
+    run(user, "--hil-rig", "emulator-0-10v", "--hil-dut", "inproc").assert_outcomes(passed=1)
+    run(user, "--hil-rig", "emulator", "--hil-dut", "inproc").assert_outcomes(passed=1)  # the command line comes first
+
+
+def test_play_is_neither_true_nor_false(user: pytest.Pytester) -> None:
+    """``assert hil_play(...)`` would pass whatever the device does."""
+    user.makepyfile(PLAYS.format(assertion="assert played"))
+    result = run(user, "--hil-dut", "inproc")
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["E*TypeError: a play is neither true nor false: assert a finding*"])
 
 
 def test_failure_on_a_device_of_a_file_leaves_that_device_too(
@@ -266,10 +286,10 @@ def test_failure_on_a_device_of_a_file_leaves_that_device_too(
     )
     user.makepyfile(PLAYS.format(assertion="assert False"))
     result = run(user, "--hil-dut", "./mydev.toml", "--junitxml", "junit.xml")
-    (line,) = [line for line in result.outlines if line.startswith("repeat it with: ")]
+    (line,) = [line for line in result.outlines if line.startswith("play it again with: ")]
     (user.path / "mydev.toml").unlink()
     monkeypatch.chdir(user.path)
-    cli.main([*line.split()[4:], "--json", "--out", str(user.path / "again")])
+    cli.main([*line.split()[5:], "--json", "--out", str(user.path / "again")])
     assert f'"theta_hash": "{properties(user)["theta_hash"]}"' in capsys.readouterr().out
 
 

@@ -51,13 +51,13 @@ def deadline_of(start: int) -> int:
 def test_latency_is_an_interval_from_the_latest_to_the_earliest_instant() -> None:
     (tweak,) = judge(learned(between(395, 400, 402), alarms=[404])).tweaks
     assert (tweak.sample, tweak.between, tweak.latency_n, tweak.latencies_n) == (400, (395, 402), 4, (2, 9))
-    assert tweak.result == "noticed"
+    assert tweak.result == "detected"
 
 
 def test_exact_instant_is_judged_once() -> None:
     (tweak,) = judge(learned(Segment(400, SOFT), alarms=[404])).tweaks
     assert tweak.alternatives == ()
-    assert (tweak.between, tweak.latencies_n, tweak.result) == ((400, 400), (4, 4), "noticed")
+    assert (tweak.between, tweak.latencies_n, tweak.result) == ((400, 400), (4, 4), "detected")
 
 
 def test_alarm_before_the_earliest_instant_is_false() -> None:
@@ -170,7 +170,7 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     assert "between 395 and 402 (the likeliest instant is shown): noticed" in text
     assert ">395–402</button>" in page and ">2–9</td>" in page
     (tweak,) = as_json(verdict)["tweaks"]
-    wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "noticed"}
+    wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "detected"}
     assert tweak.items() >= wanted.items()
     assert _latency(verdict.tweaks[0]) == "2..9"
 

@@ -29,6 +29,7 @@ _EXAMINED_SAMPLES = 4000
 def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
     return (
+        *_statement(run),
         *_assumed_settings(run),
         *_overloads(verdict),
         *_noise_setting(run),
@@ -38,6 +39,15 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_undetectable_changes(verdict),
         *_implausible_estimates(verdict),
     )
+
+
+def _statement(run: Run) -> Iterator[str]:
+    statement = run.conditions.scenario.get("statement")
+    if statement:
+        yield (
+            f"the scenario's [statement] {statement['name']} is not judged here, only [expect]:"
+            " pytest --hil-scenario-dir FOLDER judges the statement"
+        )
 
 
 def _assumed_settings(run: Run) -> Iterator[str]:

@@ -35,7 +35,7 @@ LARGEST_LEVEL = 700.0
 
 Outcome = Literal["passed", "failed", "inconclusive"]
 
-Result = Literal["noticed", "late", "missed", "unseeable", "undecided", "not judged"]
+Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
 instant, which is known only as an interval. ``not judged``: the change was not found in the samples."""
 
@@ -125,7 +125,7 @@ def _result_at_instant(tweak: ChangeVerdict) -> Result:
         return "missed"
     if tweak.late:
         return "late"
-    return "unseeable" if tweak.latency_n is None else "noticed"
+    return "unseeable" if tweak.latency_n is None else "detected"
 
 
 @dataclass(frozen=True)

@@ -182,7 +182,7 @@ def _figures_sentence(run: Run, verdict: Verdict) -> str:
     """Detections and false alarms in one sentence; empty for an invalid run, whose figures prove nothing."""
     if not verdict.valid:
         return ""
-    detected = sum(tweak.result in {"noticed", "late"} for tweak in verdict.tweaks)
+    detected = sum(tweak.result in {"detected", "late"} for tweak in verdict.tweaks)
     count = len(verdict.tweaks)
     changes = f"{detected} of {_plural(count, 'change')} detected" if count else "No change to detect"
     false = _plural(len(verdict.false_alarms), "false alarm")
@@ -232,7 +232,7 @@ def _result(tweak: ChangeVerdict) -> tuple[str, str]:
         "unseeable": ("not detectable", "neutral"),
         "undecided": ("? depends on its instant", "neutral"),
         "not judged": ("? not judged: not found in the samples", "neutral"),
-        "noticed": ("✓ detected", "good"),
+        "detected": ("✓ detected", "good"),
     }[tweak.result]
 
 

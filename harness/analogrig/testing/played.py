@@ -75,6 +75,9 @@ class Played:
         words = f"{conditions.scenario['name']}, seed {conditions.seed}"
         return f"<{words}: {self.run.samples} samples on {conditions.rig['name']}, device {conditions.dut['name']}>"
 
+    def __bool__(self) -> bool:
+        raise TypeError("a play is neither true nor false: assert a finding, such as hil_play(...).passes()")
+
     @functools.cached_property
     def verdict(self) -> Verdict:
         return judge(self.run)

@@ -160,7 +160,7 @@ def hil_play(request: pytest.FixtureRequest, hil_bench: Bench) -> Play:
 
     A play that is INCONCLUSIVE fails the test with its reason; ``allow_inconclusive=True`` hands it on.
     """
-    return playing.Player(request.node, hil_bench)
+    return playing.Player(request.node, hil_bench, is_sessions=True)
 
 
 # ---------------------------------------------------------------------------------------------------- what has failed

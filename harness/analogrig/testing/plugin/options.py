@@ -97,11 +97,17 @@ class Option:
 
     def of(self, item: pytest.Item) -> str:
         """The value for an item, unchecked: its indirect parameter, else that of the session."""
+        parameter = self._parameter(item)
+        return self.said(item.config).value if parameter is None else parameter
+
+    def is_named(self, item: pytest.Item) -> bool:
+        """True if a parameter, the command line or the environment names the value for an item."""
+        return self._parameter(item) is not None or self.given(item.config) is not None
+
+    def _parameter(self, item: pytest.Item) -> str | None:
         callspec = getattr(item, "callspec", None)
         parameter = callspec.params.get(self.name) if callspec is not None else None
-        if isinstance(parameter, str | os.PathLike):
-            return str(parameter)
-        return self.said(item.config).value
+        return str(parameter) if isinstance(parameter, str | os.PathLike) else None
 
     def _on_command_line(self, config: pytest.Config) -> Said | None:
         value = config.getoption(self.flag)

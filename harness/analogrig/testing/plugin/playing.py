@@ -86,9 +86,11 @@ def record_of(item: pytest.Item) -> Record:
 class Player:
     """Plays for one test, and keeps what it has played: ``analogrig.testing.experiment.Play``."""
 
-    def __init__(self, item: pytest.Item, bench: Bench) -> None:
+    def __init__(self, item: pytest.Item, bench: Bench, *, is_sessions: bool = False) -> None:
+        """``is_sessions``: the rig and the device are those of the session, and no test has chosen them."""
         self.item = item
         self.bench = bench
+        self._is_sessions = is_sessions
 
     def __call__(
         self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
@@ -100,6 +102,7 @@ class Player:
 
         with in_one_line():
             chosen = scenario if isinstance(scenario, Scenario) else Scenario.load(str(scenario))
+            self._check_equipment(chosen)
             drawn = seed if seed is not None else DEFAULT_SEED if chosen.seed is None else chosen.seed
             run = self.bench.play(chosen, drawn)
         run = run.with_identity(provenance.identity(self.item.config, self.bench.dut.files()))
@@ -113,6 +116,22 @@ class Player:
         if not played.verdict.valid and not allow_inconclusive:
             pytest.fail(f"INCONCLUSIVE: {played.verdict.reasons[0]}", pytrace=False)
         return played
+
+    def _check_equipment(self, scenario: Scenario) -> None:
+        """Fail if the scenario names a rig or device other than the session's default, which would play in its stead.
+
+        What the command line, the environment or a parameter names comes before the scenario, as in `analogrig run`.
+        """
+        if not self._is_sessions:
+            return
+        equipment = (RIG, scenario.rig, self.bench.rig.description()), (DUT, scenario.dut, self.bench.dut.description())
+        for option, named, own in equipment:
+            if named and not option.is_named(self.item) and named not in (option.of(self.item), own["name"]):
+                pytest.fail(
+                    f"{scenario.name}: names {named}, but {own['name']} of the session would play it:"
+                    f" say {option.flag} {named}, or have pytest collect the file with {SCENARIO_DIR.flag}",
+                    pytrace=False,
+                )
 
     def __repr__(self) -> str:
         return "hil_play"
@@ -205,15 +224,15 @@ def left_by(item: pytest.Item) -> str:
         return ""
     lines = [f"found: {shown.why}"] if shown.why else []
     if _is_left_already(item, folder):
-        return "\n".join([*lines, f"repeat it with: {shown.command(item.path)}"])
+        return "\n".join([*lines, f"play it again with: {shown.command(item.path)}"])
     try:
         shown.write(folder)
     except _unwritten() as error:
         return "\n".join([*lines, f"its recording could not be written to {folder}: {error}"])
-    lines += [f"recording and scenario: {folder}", f"repeat it with: {shown.command(folder / SCENARIO_FILE)}"]
+    lines.append(f"recording and scenario: {folder}")
     if shown.statement is not None:
         lines.append(f"judge it again with: {shown.suite_command(folder)}")
-    return "\n".join(lines)
+    return "\n".join([*lines, f"play it again with: {shown.command(folder / SCENARIO_FILE)}"])
 
 
 def _is_left_already(item: pytest.Item, folder: Path) -> bool:
