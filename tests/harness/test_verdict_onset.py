@@ -81,7 +81,7 @@ def test_between_the_deadlines_of_earliest_and_latest_instant_a_run_is_inconclus
     verdict = judge(learned(between(395, 400, 402), alarms=[alarm]))
     assert verdict.outcome == "inconclusive"
     assert verdict.tweaks[0].result == "undecided"
-    assert verdict.reasons == ("K between 395 and 402 was late or noticed, depending on its instant",)
+    assert verdict.reasons == ("K between 395 and 402 was late or detected, depending on its instant",)
 
 
 def test_alarm_between_earliest_and_latest_instant_is_false_or_the_detection() -> None:
@@ -167,7 +167,7 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     text, page, verdict = shown(run)
     line = next(line for line in text.splitlines() if "24500 -> 18000" in line)
     assert line.split()[-2:] == ["2-9", str(verdict.tweaks[0].bound_n)]
-    assert "between 395 and 402 (the likeliest instant is shown): noticed" in text
+    assert "between 395 and 402 (the likeliest instant is shown): detected" in text
     assert ">395–402</button>" in page and ">2–9</td>" in page
     (tweak,) = as_json(verdict)["tweaks"]
     wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "detected"}
