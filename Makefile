@@ -46,7 +46,7 @@ export UV_PYTHON_DOWNLOADS := never
 export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
-.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs bench firmware no-firmware \
+.PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
         cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
         can-guest wheel lock clean distclean
 MAKEFLAGS += --no-builtin-rules
@@ -90,6 +90,9 @@ format: $(PRODUCTS) ## lay out the Python sources, and the C with clang-format
 docs: $(PRODUCTS) ## build the documentation site into build/docs; warnings are errors
 	@$(BIN)/python -m sphinx -q -W --keep-going -b html -d $(BUILD)/doctrees harness/docs $(BUILD)/docs
 	@echo "$(BUILD)/docs/index.html"
+
+metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares commits, ARGS=--arrows lists the imports between folders
+	@$(PYTHON) -m tests.metrics $(ARGS)
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)

@@ -1,0 +1,283 @@
+"""`make metrics`: figures of the structure and of the documents, of one commit or of several beside each other.
+
+python -m tests.metrics [--arrows] [COMMIT ...]; without a commit, of the files as they are. ``--arrows`` lists the
+imports between the folders of ``analogrig`` instead.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import subprocess
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+PARTS = ("harness", "emulator", "estimator_c", "tests")
+PRODUCT = PARTS[:3]
+
+CODE = re.compile(r"\.(py|c|h|S|js|html|css|ld|dbc)$")
+"""Files whose lines count as code."""
+
+BAD_START = re.compile(r"(What|Whether|Of|As|How|Who|Whatever|Whoever|That|Those|Why|In which|Where|When)\b")
+"""First words of docstrings that need the name above them to mean anything."""
+
+CONCRETE = re.compile(
+    r"\b(EmulatorRig|RecordingRig|RealRig|EmulatorDescription|RealDescription"
+    r"|InprocDevice|HostDevice|QemuDevice|SerialDevice|CanDevice|Inproc|Host|Qemu|Serial|Can)\b"
+)
+"""Classes of rigs and devices that have an interface."""
+
+LEVELS: tuple[tuple[str, ...], ...] = (
+    ("errors", "config", "wording", "catalogue", "_catalogue", "estimator_config", "storage", "header", "plant"),
+    ("run", "scenario", "trust", "identity", "signals", "output"),
+    ("links",),
+    ("protocol",),
+    ("devices", "rigs", "judging"),
+    ("bench",),
+    ("recordings",),
+    ("campaigns", "testing", "hardware", "reporting", "analogrig"),
+    ("cli", "device_program"),
+)
+"""Modules and folders of ``analogrig``, lowest level first. An import to a higher level runs upwards."""
+
+
+@dataclass(frozen=True)
+class Tree:
+    """The files of a commit."""
+
+    name: str
+    files: Mapping[str, str]
+    """Text of each file, by path."""
+
+    def python(self, *parts: str) -> Iterator[tuple[str, ast.Module]]:
+        """Path and syntax tree of each Python file of the parts."""
+        for path, text in self.files.items():
+            if path.endswith(".py") and path.partition("/")[0] in parts:
+                yield path, ast.parse(text)
+
+
+def read(commit: str | None) -> Tree:
+    """The tree of ``commit``; None: the tracked files as they are."""
+    if commit is None:
+        names = _git("ls-files").splitlines()
+        texts = {name: (ROOT / name).read_bytes() for name in names if (ROOT / name).is_file()}
+        name = "now"
+    else:
+        names = _git("ls-tree", "-r", "--name-only", commit).splitlines()
+        wanted = [each for each in names if CODE.search(each) or each.endswith((".md", ".toml"))]
+        texts = dict(zip(wanted, _contents(commit, wanted), strict=True))
+        name = commit
+    return Tree(name, {each: text.decode("utf-8", "replace") for each, text in texts.items()})
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+def _contents(commit: str, names: Sequence[str]) -> Iterator[bytes]:
+    """Content of each file of a commit."""
+    asked = "".join(f"{commit}:{name}\n" for name in names).encode()
+    told = subprocess.run(["git", "cat-file", "--batch"], cwd=ROOT, input=asked, capture_output=True, check=True).stdout
+    at = 0
+    for _ in names:
+        end = told.index(b"\n", at)
+        size = int(told[at:end].split()[2])
+        yield told[end + 1 : end + 1 + size]
+        at = end + size + 2
+
+
+def metrics(tree: Tree) -> dict[str, str]:
+    """Every figure of the table, by its name."""
+    return {
+        **{f"lines of code: {part}": f"{_lines(tree, part):,}" for part in PARTS},
+        "Python modules of the product": str(len(list(tree.python(*PRODUCT)))),
+        "public names at the top of modules": str(sum(1 for _ in _public(tree))),
+        "type names with two meanings": _named(doubled(tree)),
+        "module names with two meanings": _named(_doubled_modules(tree)),
+        "isinstance on concrete rigs and devices": str(isinstances(tree)),
+        "imports that run upwards": _named([f"{a} to {b}" for a, b in upward(arrows(tree))]),
+        "circles of imports between folders": _named([" ".join(sorted(circle)) for circle in circles(arrows(tree))]),
+        "docstrings": f"{len(_docstrings(tree)):,}",
+        "docstrings with a bad first word": f"{share_of_bad(tree):.1%}",
+        "most frequent first words": ", ".join(word for word, _ in _first_words(tree).most_common(6)),
+        "dependencies, without extras": str(
+            len(tomllib.loads(tree.files["pyproject.toml"])["project"]["dependencies"])
+        ),
+        "words of documentation": f"{_words(tree):,}",
+        "lines of README.md": f"{len(tree.files['README.md'].splitlines()):,}",
+    }
+
+
+def _named(names: Sequence[str]) -> str:
+    return f"{len(names)}" + (f" ({', '.join(names)})" if 0 < len(names) <= 6 else "")
+
+
+def _lines(tree: Tree, part: str) -> int:
+    wanted = [text for name, text in tree.files.items() if name.startswith(f"{part}/") and CODE.search(name)]
+    return sum(text.count("\n") for text in wanted)
+
+
+def _words(tree: Tree) -> int:
+    return sum(len(text.split()) for name, text in tree.files.items() if name.endswith(".md"))
+
+
+def _public(tree: Tree) -> Iterator[str]:
+    for _, module in tree.python(*PRODUCT):
+        for node in module.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                yield node.name
+
+
+def doubled(tree: Tree) -> list[str]:
+    """Names of classes of the product that are defined more than once."""
+    classes = [
+        node.name for _, module in tree.python(*PRODUCT) for node in ast.walk(module) if isinstance(node, ast.ClassDef)
+    ]
+    return sorted(name for name, times in Counter(classes).items() if times > 1)
+
+
+def _doubled_modules(tree: Tree) -> list[str]:
+    names = [Path(path).stem for path, _ in tree.python(*PRODUCT)]
+    return sorted(name for name, times in Counter(names).items() if times > 1 and not name.startswith("__"))
+
+
+def isinstances(tree: Tree) -> int:
+    """Number of isinstance calls on the classes of CONCRETE."""
+    return sum(
+        1
+        for _, module in tree.python(*PRODUCT)
+        for node in ast.walk(module)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "isinstance"
+        and CONCRETE.search(ast.unparse(node.args[1]))
+    )
+
+
+def _docstrings(tree: Tree) -> list[str]:
+    """Docstrings of modules, classes and functions, and the texts below attributes."""
+    found = []
+    for _, module in tree.python(*PRODUCT):
+        for node in ast.walk(module):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                found.append(ast.get_docstring(node) or "")
+            body = getattr(node, "body", [])
+            pairs = itertools.pairwise(body) if isinstance(body, list) else ()
+            found += [
+                below.value.value
+                for above, below in pairs
+                if isinstance(above, ast.Assign | ast.AnnAssign)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+                and isinstance(below.value.value, str)
+            ]
+    return [text.strip() for text in found if text.strip()]
+
+
+def share_of_bad(tree: Tree) -> float:
+    """Share of the docstrings that begin with a word of BAD_START, 0 to 1."""
+    docstrings = _docstrings(tree)
+    return sum(1 for text in docstrings if BAD_START.match(text)) / len(docstrings)
+
+
+def _first_words(tree: Tree) -> Counter[str]:
+    return Counter(text.split()[0] for text in _docstrings(tree))
+
+
+Arrows = Mapping[tuple[str, str], Sequence[tuple[str, str]]]
+"""Imports from one folder of ``analogrig`` to another, each from module to module."""
+
+
+def arrows(tree: Tree) -> Arrows:
+    """Imports between the folders of ``analogrig``, those within functions included."""
+    package = next(
+        (each for each in ("harness/analogrig", "harness") if f"{each}/__init__.py" in tree.files), "harness"
+    )
+    root = Path(package).name
+    modules = {
+        path.removeprefix(f"{package}/").removesuffix(".py").removesuffix("/__init__").replace("/", "."): module
+        for path, module in tree.python("harness")
+        if path.startswith(f"{package}/")
+    }
+    found: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for name, module in modules.items():
+        own = _folder(name)
+        for target in _imported(module, root, modules):
+            if _folder(target) != own:
+                found.setdefault((own, _folder(target)), []).append((name, target))
+    return {pair: sorted(set(imports)) for pair, imports in sorted(found.items())}
+
+
+def _folder(module: str) -> str:
+    """Folder of a module, or its own name at the top of the package."""
+    top = module.partition(".")[0]
+    return "analogrig" if top == "__init__" else top
+
+
+def _imported(module: ast.Module, root: str, modules: Mapping[str, ast.Module]) -> Iterator[str]:
+    """Modules of the package that a module imports."""
+    for node in ast.walk(module):
+        if isinstance(node, ast.Import):
+            for each in node.names:
+                if each.name.startswith(f"{root}."):
+                    yield each.name.removeprefix(f"{root}.")
+        if isinstance(node, ast.ImportFrom) and node.module and f"{node.module}.".startswith(f"{root}."):
+            base = node.module.removeprefix(root).lstrip(".")
+            for each in node.names:
+                inner = f"{base}.{each.name}".lstrip(".")
+                yield inner if inner in modules else base or "__init__"
+
+
+def upward(found: Arrows) -> list[tuple[str, str]]:
+    """Arrows that run from a lower level to a higher one."""
+    rank = {name: number for number, level in enumerate(LEVELS) for name in level}
+    return [(a, b) for a, b in found if rank.get(b, -1) > rank.get(a, len(LEVELS))]
+
+
+def circles(found: Arrows) -> list[set[str]]:
+    """Sets of folders that import each other, directly or through others."""
+    reached: dict[str, set[str]] = {}
+    for start, _ in found:
+        reached[start], ahead = set(), {b for a, b in found if a == start}
+        while ahead:
+            reached[start] |= ahead
+            ahead = {b for a, b in found if a in ahead} - reached[start]
+    of = {a: {b for b in reached[a] if a in reached.get(b, ())} for a in reached}
+    return [set(each) for each in sorted({frozenset(circle) for circle in of.values() if circle}, key=sorted)]
+
+
+def show_metrics(trees: Sequence[Tree]) -> None:
+    columns = [metrics(tree) for tree in trees]
+    print(f"| | {' | '.join(tree.name for tree in trees)} |")
+    print("|---" * (len(trees) + 1) + "|")
+    for name in columns[0]:
+        print(f"| {name} | {' | '.join(column[name] for column in columns)} |")
+
+
+def show_arrows(tree: Tree) -> None:
+    found = arrows(tree)
+    wrong = set(upward(found))
+    for pair, imports in found.items():
+        inner = "; ".join(f"{a} imports {b}" for a, b in imports) if pair in wrong else ""
+        print(f"{'UP ' if pair in wrong else '   '}{pair[0]} -> {pair[1]} {len(imports)}  {inner}".rstrip())
+
+
+def main(arguments: Sequence[str]) -> None:
+    commits = [each for each in arguments if each != "--arrows"]
+    trees = [read(commit) for commit in commits] or [read(None)]
+    if "--arrows" in arguments:
+        for tree in trees:
+            show_arrows(tree)
+    else:
+        show_metrics(trees)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
