@@ -39,7 +39,7 @@ def test_fault_at_every_step_leads_to_what_is_documented(link: LinkKind, exchang
         assert outcomes_everywhere(link, kind, exchange, stride).total() > 20
 
 
-@pytest.mark.parametrize("first", range(0, 3000, 500))
+@pytest.mark.parametrize("first", range(0, 1000, 500))
 def test_faults_by_chance_never_lead_to_a_wrong_estimate(first: int) -> None:
     assert outcomes_by_chance(range(first, first + 500)).total() == 500
 

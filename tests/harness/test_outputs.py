@@ -186,7 +186,7 @@ def long_run(folder: Path) -> Iterator[subprocess.Popen[str]]:
         while True:
             assert process.poll() is None and time.monotonic() < deadline_s
             pids = descendants(process.pid)[1:]  # behind the tether
-            if pids and int(Path(f"/proc/{pids[0]}/stat").read_text().split()[13]) >= 40:
+            if pids and int(Path(f"/proc/{pids[0]}/stat").read_text().split()[13]) >= 4:
                 break
             time.sleep(0.01)
         yield process
