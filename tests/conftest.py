@@ -35,6 +35,9 @@ LACKING = pytest.StashKey[tuple[str, ...]]()
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "tools(*names): programs or files of tests/tools.py that the test needs")
+    config.addinivalue_line(
+        "markers", "equipped: needs a tool that a bare machine lacks; added to such tests by itself"
+    )
     for number in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_IGN:
             # Under nohup or in the background. Children inherit an ignored signal, but not a handler: with one, a test
@@ -54,6 +57,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             lacking = tools.missing(needed)
         except KeyError as error:
             raise pytest.UsageError(f"{item.nodeid} needs {error}: tests/tools.py has no such tool") from error
+        if set(needed) - tools.BARE:
+            item.add_marker(pytest.mark.equipped)
         if lacking:
             item.stash[LACKING] = lacking
             item.add_marker(pytest.mark.skip(reason=tools.reason(lacking)))

@@ -55,6 +55,9 @@ PACKAGES = {
 }
 """Packages of each program, separated by blanks."""
 
+BARE = {"gcc", "gcov"}
+"""Programs that a machine with a C compiler has."""
+
 ALTERNATIVES = {"chromium": ("chromium", "google-chrome")}
 """Other names of a program."""
 
