@@ -69,7 +69,7 @@ TESTS = (
     *("tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_est_adversarial.py"),
     *("tests/estimator_c/test_numerics.py", "tests/harness/test_reference.py"),
 )
-LONG = "not ten_million and not long_free_running and not rarer_than_promised"
+LONG = "not millions_of_samples and not long_free_running and not rarer_than_promised"
 DEADLINE_S = 8
 """A mutant may not come to an end. For each test, the longest of which takes two; in seconds of the processor: the
 machine may be busy."""
