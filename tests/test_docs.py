@@ -20,7 +20,7 @@ from analogrig.devices.registry import from_table
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.hardware.simulator.rig import ServedDescription
 from analogrig.hardware.wiring import RealDescription
-from analogrig.rigs.description import described
+from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
 
@@ -88,7 +88,7 @@ def test_every_toml_file_of_a_page_is_accepted(page: Path, tmp_path: Path) -> No
                 rest = {key: value for key, value in red_pitaya().items() if key not in rig}
                 config.build(RealDescription, {**rest, **rig}, "rig")
         elif table.get("kind") == "emulator":
-            assert described(str(path))
+            describe(str(path))
         elif "trials" in table:
             CampaignSpec.load(str(path))
         elif "kind" in table:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from analogrig import config
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.wiring import RealDescription
-from analogrig.rigs.description import described, open_rig
+from analogrig.rigs.description import describe, open_rig
 from analogrig.rigs.rig import Rig
 
 
 def named_by(rig: str) -> tuple[str, ...]:
     """Names of the things that the file of a rig names; none if it is wrong."""
     try:
-        table, where, file = described(rig)
-        things = config.build(RealDescription, table, where).placed(file.parent).things
+        things = describe(rig).things
     except ConfigurationError:
         return ()
     return tuple(thing.name for thing in things)

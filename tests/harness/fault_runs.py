@@ -18,8 +18,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
 from analogrig.protocol.exchange import Replies
-from analogrig.rigs.rig import Block, Hindsight, Performance
+from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Channel, Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
@@ -101,7 +100,7 @@ CODES = signals()
 FORCE, DISPLACEMENT = (CODES[:, CHANNELS.index(name)] for name in ("force", "displacement"))
 
 
-class SignalsRig:
+class SignalsRig(Rig):
     """Plays CODES, whatever the scenario."""
 
     capabilities: frozenset[str] = frozenset()
@@ -117,14 +116,6 @@ class SignalsRig:
 
     def description(self) -> Mapping[str, Any]:
         return {"name": "signals"}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing is held."""
 
 
 EXCITATION = Excitation(low_v=0.0, high_v=1.0, frequency_hz=200.0)

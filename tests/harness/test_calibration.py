@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ from analogrig.hardware.calibration.recordings import (
 )
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
-from analogrig.rigs.rig import Block, Hindsight, Performance
+from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.scenario import PlantChoice
 from analogrig_emulator import Card, Excitation, SuspensionComputer, acquired, probes_per_sample
@@ -189,7 +189,7 @@ def test_card_whose_samples_do_not_fit_the_periods_is_rejected(recordings: list[
         calibrate(alter(recordings, sample_period_s=lambda _: 1.0 / 12345.0))
 
 
-class FaultyRig:
+class FaultyRig(Rig):
     """Rig with a lit lamp, a caveat, or samples of two records."""
 
     capabilities = frozenset({"excite"})
@@ -208,12 +208,6 @@ class FaultyRig:
 
     def description(self) -> dict[str, Any]:
         return {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analogrig import config
 from analogrig.bench import Bench
 from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
@@ -26,8 +25,7 @@ from analogrig.hardware.real import RealRig
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
-from analogrig.rigs.description import described as described_rig
-from analogrig.rigs.description import open_rig
+from analogrig.rigs.description import describe, open_rig
 from analogrig.rigs.rig import Performance
 from analogrig.run import Run
 from analogrig.scenario import PlantChoice, PotChange, Scenario
@@ -244,7 +242,8 @@ def test_displaced_changes_of_the_instrument_are_detected(late_s: float, said: s
         return instrument
 
     scenario = dataclasses.replace(THESIS, samples=1600, tweaks=THESIS.tweaks[:1])
-    description = config.build(RealDescription, described_rig(bench).table, "bench")
+    description = describe(bench)
+    assert isinstance(description, RealDescription)
     with RealRig(description, connected) as rig, open_dut("inproc") as dut:
         verdict = judge(Bench(rig, dut).play(scenario, 1))
     assert verdict.outcome == "inconclusive"

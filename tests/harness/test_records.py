@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from analogrig.scenario import PotChange, Scenario
 RECORD_N = 700
 
 
-class Recorder:
+class Recorder(Rig):
     """Rig that plays the scenario on the emulated computer once for each record, from rest."""
 
     capabilities = frozenset({"tweak"})
@@ -47,12 +47,6 @@ class Recorder:
 
     def description(self) -> Mapping[str, Any]:
         return self._rig.description()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 SCENARIO = dataclasses.replace(

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def emulate(
     return EmulatorRig(EmulatorDescription(card, computer=computer, name="drawn"))
 
 
-class Altered:
+class Altered(Rig):
     """Rig whose codes or scenario are altered."""
 
     def __init__(
@@ -73,12 +73,6 @@ class Altered:
         )
         codes = self._codes(codes.copy())
         yield Block(0, volts[: len(codes)], codes, clipped[: len(codes)])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 def wrong_titles(rig: Rig, program: str = "front", seed: int = 1) -> list[str]:

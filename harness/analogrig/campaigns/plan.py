@@ -23,11 +23,9 @@ from analogrig.campaigns.spec import AXES, MAX_CELLS, MAX_TRIALS, CampaignSpec
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.real import RealRig
-from analogrig.hardware.wiring import RealDescription
+from analogrig.rigs.description import from_table as rig_of
 from analogrig.rigs.description import open_rig
-from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, is_emulated
-from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.emulator import is_emulated
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import PotChange, Scenario
 from analogrig.trust import Trust
@@ -229,9 +227,7 @@ def open_table(table: Mapping[str, Any]) -> Rig:
 
     :raises ConfigurationError: it is wrong.
     """
-    if "card" in table:
-        return EmulatorRig(config.build(EmulatorDescription, table, f"rig {table['name']}"))
-    return RealRig(config.build(RealDescription, table["described"], f"rig {table['name']}"))
+    return rig_of(table.get("described", table), f"rig {table['name']}").open()
 
 
 def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
@@ -276,7 +272,7 @@ def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]
     :raises ConfigurationError: there is none, or it can play but one scenario, or it names what is not allowed.
     """
     with open_rig(name, allow=allow) as rig:
-        if isinstance(rig, RecordingRig):
+        if rig.recorded is not None:
             raise ConfigurationError(
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
             )

@@ -208,17 +208,15 @@ def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]
     from dataclasses import replace
 
     from analogrig.rigs.description import DEFAULT_RIG, open_rig
-    from analogrig.rigs.recording import RecordingRig
     from analogrig.scenario import DEFAULT_SEED, Scenario
 
     asked = None if arguments.scenario is None else Scenario.load(arguments.scenario)
     with open_rig(arguments.rig or (asked.rig if asked else "") or DEFAULT_RIG, allow=trust_of(arguments)) as rig:
-        recording = rig if isinstance(rig, RecordingRig) else None
-        scenario = asked or (recording.scenario() if recording else Scenario.load(DEFAULT_SCENARIO))
+        recorded, recorded_seed = rig.recorded or (None, None)
+        scenario = asked or recorded or Scenario.load(DEFAULT_SCENARIO)
         if arguments.program is not None:
             scenario = replace(scenario, plant=replace(scenario.plant, set=arguments.program))
-        recorded = None if recording is None else recording.run.conditions.seed
-        seeds = (arguments.seed, scenario.seed, recorded, DEFAULT_SEED)
+        seeds = (arguments.seed, scenario.seed, recorded_seed, DEFAULT_SEED)
         yield rig, scenario, next(seed for seed in seeds if seed is not None)
 
 

@@ -13,7 +13,7 @@ import dataclasses
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
@@ -25,7 +25,7 @@ from analogrig.hardware.self_test.conduct import self_test
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant
-from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
+from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
 from analogrig.run import MEASURED
 from analogrig.scenario import Scenario
 
@@ -37,7 +37,7 @@ _AFTER_N = 0.05
 _log = logging.getLogger(__name__)
 
 
-class RealRig:
+class RealRig(Rig):
     """Rig of a description and the instrument that it names; connects when the first block is requested."""
 
     def __init__(self, description: RealDescription, connect: Callable[[str, float], Instrument] | None = None) -> None:
@@ -197,9 +197,6 @@ class RealRig:
             if check.name == "noise" and check.state == "well"
         }
         self._caveats = tuple(f"the rig's self-test: {reason}" for reason in findings.reasons)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self._instrument is not None:

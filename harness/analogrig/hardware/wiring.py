@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import Datasheet, find_driver
 from analogrig.hardware.pots import PotsDescription
+from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.run import MEASURED
 from analogrig.trust import Thing
 from analogrig_emulator import SuspensionComputer
@@ -99,9 +100,10 @@ class Scaling:
 
 
 @dataclass(frozen=True)
-class RealDescription:
+class RealDescription(RigDescription):
     """A rig of the kind ``real``: a table of a rigs file, or a file of its own."""
 
+    has_one_owner: ClassVar[bool] = True
     kind: Literal["real"]
     instrument: str
     """URL: ``redpitaya://HOST``."""
@@ -147,6 +149,14 @@ class RealDescription:
     def placed(self, folder: Path) -> Self:
         """The same with absolute paths, where its own are relative to ``folder``."""
         return dataclasses.replace(self, pots=self.pots.placed(folder))
+
+    def check(self) -> None:
+        self.pots.check()
+
+    def open(self, *, self_test: bool = True) -> Rig:
+        from analogrig.hardware.real import RealRig
+
+        return RealRig(dataclasses.replace(self, self_test=self.self_test and self_test))
 
 
 def check_wiring(description: RealDescription, instrument: Datasheet) -> None:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import os
-from collections.abc import Iterable, Iterator, Mapping
+import pkgutil
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.real import RealRig
-from analogrig.hardware.wiring import RealDescription
-from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig, emulator_errors
-from analogrig.rigs.recording import RecordingRig
-from analogrig.rigs.rig import Rig
+from analogrig.rigs.recording import RecordingDescription
+from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.trust import Trust
+
+KINDS: Mapping[str, str] = {
+    "emulator": "analogrig.rigs.emulator:EmulatorDescription",
+    "real": "analogrig.hardware.wiring:RealDescription",
+}
+"""Subclass of ``RigDescription`` for each ``kind``, imported on use."""
 
 DEFAULT_RIG = "emulator"
 """Rig used if neither the user nor the scenario names one."""
@@ -37,52 +39,44 @@ def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] 
     :raises ConfigurationError: no such rig, its description is wrong, or it names what is not allowed.
     :raises RecordingError: the recording cannot be read.
     """
-    return _made(name, Trust.of(allow), self_test=self_test)
-
-
-def looked_at(name: str) -> Rig:
-    """Rig as from ``open_rig``, for inspection only; every name in a file is accepted."""
-    return _made(name, None)
-
-
-def _made(name: str, trust: Trust | None, *, self_test: bool = True) -> Rig:
-    kind, _, rest = name.partition(":")
-    if kind == "recording" and rest:
-        return RecordingRig.open(Path(rest))
-    table, where, file = described(name)
-    if table.get("kind", "emulator") != "real":
-        emulated = config.build(EmulatorDescription, table, where)
-        with emulator_errors(f"{where}: "):
-            return EmulatorRig(emulated)
-    with _names(where):
-        description = config.build(RealDescription, table, where).placed(file.parent)
-        if trust is not None:
-            trust.check(description.things, str(file), where)
-            description.pots.check()
-        return RealRig(dataclasses.replace(description, self_test=description.self_test and self_test))
-
-
-@contextlib.contextmanager
-def _names(where: str) -> Iterator[None]:
-    """Prefix errors with the place."""
+    description, where, file = _read(name)
     try:
-        yield
+        Trust.of(allow).check(description.things, file, where)
+        description.check()
+        return description.open(self_test=self_test)
     except ConfigurationError as error:
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
 
 
-class Described(NamedTuple):
-    """A rig as a file describes it."""
+def describe(name: str) -> RigDescription:
+    """Description of a rig, by its name as for ``open_rig``. Nothing that a file names is checked.
 
-    table: Mapping[str, Any]
-    """Table of the rig, with its name."""
-    where: str
-    """File and table, for errors."""
-    file: Path
+    :raises ConfigurationError: no such rig, or its description is wrong.
+    """
+    return _read(name)[0]
 
 
-def described(name: str) -> Described:
-    """The table that describes the rig ``name``, and where it is.
+def from_table(table: Mapping[str, Any], where: str) -> RigDescription:
+    """Description from plain values; ``where`` begins every error message.
+
+    :raises ConfigurationError: they describe no rig.
+    """
+    kind = config.converted(Literal[tuple(KINDS)], table.get("kind", "emulator"), f"{where}: kind")
+    described: type[RigDescription] = pkgutil.resolve_name(KINDS[kind])
+    return config.build(described, table, where)
+
+
+def _read(name: str) -> tuple[RigDescription, str, str]:
+    """Description of a rig, its place for errors, and its file; no file for a recording."""
+    kind, _, recording = name.partition(":")
+    if kind == "recording" and recording:
+        return RecordingDescription(Path(recording)), name, ""
+    table, where, file = _find(name)
+    return from_table(table, where).placed(file.parent), where, str(file)
+
+
+def _find(name: str) -> tuple[Mapping[str, Any], str, Path]:
+    """Table of a rig, with its name; file and table, for errors; and the file.
 
     :raises ConfigurationError: there is none.
     """
@@ -99,7 +93,7 @@ def described(name: str) -> Described:
             raise ConfigurationError(f"no rig is called {name!r} in {own}, nor is one shipped: there are {there}")
     path = config.locate("rigs", name)
     table = config.read_toml(path)
-    return _one_of(path, table, None) if "rig" in table else Described({"name": path.stem, **table}, str(path), path)
+    return _one_of(path, table, None) if "rig" in table else ({"name": path.stem, **table}, str(path), path)
 
 
 def own_rigs() -> tuple[str, Mapping[str, Any]]:
@@ -134,11 +128,11 @@ def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
     return rigs
 
 
-def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> Described:
+def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> tuple[Mapping[str, Any], str, Path]:
     rigs = _named(path, table)
     if wanted is None and len(rigs) > 1:
         raise ConfigurationError(f"{path}: holds {len(rigs)} rigs: say {path}:NAME, one of {', '.join(rigs)}")
     name = wanted or next(iter(rigs))
     if name not in rigs:
         raise ConfigurationError(f"{path}: holds no rig {name!r}: there are {', '.join(rigs)}")
-    return Described({"name": name, **rigs[name]}, f"{path}: rig.{name}", path)
+    return {"name": name, **rigs[name]}, f"{path}: rig.{name}", path

@@ -9,7 +9,7 @@ import functools
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, Self, TypeGuard
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
 from analogrig.plant import Plant
-from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig
+from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig, RigDescription
 from analogrig.run import CHANNELS, Channel, Segment
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
@@ -229,7 +229,7 @@ class CardDescription:
 
 
 @dataclass(frozen=True)
-class EmulatorDescription:
+class EmulatorDescription(RigDescription):
     """``fixtures/rigs/*.toml``, or a user's own file."""
 
     card: CardDescription
@@ -237,6 +237,10 @@ class EmulatorDescription:
     computer: ComputerDescription = field(default_factory=ComputerDescription)
     description: str = ""
     name: str = ""
+
+    def open(self, *, self_test: bool = True) -> EmulatorRig:  # noqa: ARG002 - for real rigs
+        with emulator_errors():
+            return EmulatorRig(self)
 
 
 class Stream(enum.IntEnum):
@@ -279,10 +283,11 @@ class _Prepared(NamedTuple):
         )
 
 
-class EmulatorRig:
+class EmulatorRig(Rig):
     """The emulated analogue computer and its card."""
 
     capabilities = frozenset({"tweak", "excite"})
+    computes_circuit = True
 
     def __init__(self, description: EmulatorDescription) -> None:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
@@ -418,16 +423,10 @@ class EmulatorRig:
             for i, name in enumerate(CHANNELS)
         }
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
 
 def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
     """True for the emulated rig, the only one with a circuit, exact components and block sizes."""
-    return isinstance(rig, EmulatorRig)
+    return rig.computes_circuit
 
 
 def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:

@@ -4,20 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance
+from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig, RigDescription
 from analogrig.run import CHANNELS, Run
 from analogrig.scenario import Scenario
 from analogrig.trust import FiledName
 
 
-class RecordingRig:
+@dataclass(frozen=True)
+class RecordingDescription(RigDescription):
+    """Recording in a file."""
+
+    path: Path
+
+    def as_table(self) -> Mapping[str, Any]:
+        """:raises RecordingError: the file cannot be read."""
+        return RecordingRig.open(self.path).description()
+
+    def open(self, *, self_test: bool = True) -> Rig:  # noqa: ARG002 - for real rigs
+        """:raises RecordingError: the file cannot be read, or there is nothing in it to play."""
+        return RecordingRig.open(self.path)
+
+
+class RecordingRig(Rig):
     """Recorded run as a rig; it plays only its own scenario."""
 
     capabilities: frozenset[str] = frozenset()
@@ -48,6 +64,10 @@ class RecordingRig:
         dut = FiledName(scenario.dut, str(self.path))
         return dataclasses.replace(scenario, samples=self.run.conditions.samples_asked, dut=dut)
 
+    @property
+    def recorded(self) -> tuple[Scenario, int]:
+        return self.scenario(), self.run.conditions.seed
+
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         conditions = self.run.conditions
         if scenario != self.scenario():
@@ -77,9 +97,3 @@ class RecordingRig:
             channels[name].volts(codes[:, i]) if name in channels else unmeasured for i, name in enumerate(CHANNELS)
         ]
         return np.stack(volts, axis=1)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass

@@ -1,22 +1,24 @@
 """Interface of a rig: it performs a scenario and yields blocks of samples.
 
-A rig is opened by name, performs scenarios, and is closed. The emulated computer, a recording and a real computer are
-classes with these methods. Callers do not depend on the class of a rig. Code that needs a particular one, such as the
-emulator's circuit or the file of a recording, asks for that class.
+A description is read from a file and opens the rig, which performs scenarios until it is closed. Callers do not depend
+on the class of a rig or a description: both state what they are capable of.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.run import Channel, Segment
 from analogrig.scenario import Scenario
+from analogrig.trust import Thing
 
 BLOCK_SAMPLES = 256
 """Block length in samples from rig to device: long enough to be fast, short enough to show progress and lose little."""
@@ -76,6 +78,13 @@ class Rig(Protocol):
 
     capabilities: frozenset[str]
     """Capabilities beyond sampling, of ``analogrig.rigs.CAPABILITIES``."""
+    computes_circuit: bool = False
+    """True for ``EmulatorRig``, the only rig with a circuit, exact components and block sizes."""
+
+    @property
+    def recorded(self) -> tuple[Scenario, int] | None:
+        """Scenario and seed of a recording, which plays no others; None for a rig that plays any."""
+        return None
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         """Begin to play; blocks are produced on demand.
@@ -87,9 +96,52 @@ class Rig(Protocol):
     def description(self) -> Mapping[str, Any]:
         """Name and settings in plain values, for the record."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Leave the rig safe: outputs off, connections closed."""
+        return
+
+
+@dataclass(frozen=True)
+class RigDescription:
+    """Base of the dataclasses that describe a rig: a table of a file. ``analogrig.rigs.description.KINDS`` lists them.
+
+    The defaults are those of a kind that names nothing outside analogrig.
+    """
+
+    has_one_owner: ClassVar[bool] = False
+    """True if one process at a time can play on it."""
+
+    def as_table(self) -> Mapping[str, Any]:
+        """Plain values that a run on the rig records."""
+        return dataclasses.asdict(self)
+
+    @property
+    def things(self) -> tuple[Thing, ...]:
+        """Things that playing on the rig would run or connect to.
+
+        :raises ConfigurationError: the description names them wrongly.
+        """
+        return ()
+
+    def placed(self, folder: Path) -> Self:  # noqa: ARG002 - overridden
+        """The same with absolute paths, where its own are relative to ``folder``."""
+        return self
+
+    def check(self) -> None:
+        """Check what can be known before anything is played. Call it for trusted descriptions: it may open files.
+
+        :raises ConfigurationError: the rig cannot be played on.
+        """
+
+    def open(self, *, self_test: bool = True) -> Rig:
+        """Rig of the description.
+
+        :param self_test: False: skip the self-test that the description may ask for.
+        :raises ConfigurationError: the description contradicts itself.
+        """
+        raise NotImplementedError

@@ -15,7 +15,7 @@ from typing import Any
 
 from analogrig import config
 from analogrig.devices.registry import describe, recorded
-from analogrig.hardware.wiring import RealDescription
+from analogrig.rigs import description as rigs
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.trust import Thing
@@ -98,7 +98,7 @@ class Counterexample:
         name = str(conditions.rig["name"])
         if name in config.names("rigs") and _is_rig(name, self.run):
             scenario["rig"] = name
-        elif conditions.rig.get("kind") in ("emulator", "real"):
+        elif conditions.rig.get("kind") in rigs.KINDS:
             scenario["rig"] = RIG_FILE
             tables[RIG_FILE] = {key: value for key, value in conditions.rig.items() if key != "name"}
         if self.statement is not None:
@@ -120,10 +120,10 @@ def _named_paths(device: str) -> list[str]:
 def _rig_things(run: Run) -> tuple[Thing, ...]:
     """Things that the rig of a run stated."""
     table = run.conditions.rig
-    if table.get("kind") != "real":
+    if table.get("kind") not in rigs.KINDS:
         return ()
     plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
-    return config.build(RealDescription, plain, "the recorded rig").things
+    return rigs.from_table(plain, "the recorded rig").things
 
 
 def _allowed(option: str, things: Iterable[Thing]) -> list[str]:
@@ -172,10 +172,9 @@ def _is_scenario(name: str, run: Run) -> bool:
 
 def _is_rig(name: str, run: Run) -> bool:
     from analogrig.errors import AnalogrigError
-    from analogrig.rigs.description import looked_at
 
     try:
-        return dict(looked_at(name).description()) == dict(run.conditions.rig)
+        return dict(rigs.describe(name).as_table()) == dict(run.conditions.rig)
     except AnalogrigError:
         return False
 

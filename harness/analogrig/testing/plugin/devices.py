@@ -182,13 +182,13 @@ def _single(rig: str, dut: str) -> str:
         return ""
     from analogrig.devices.registry import describe
     from analogrig.errors import AnalogrigError
-    from analogrig.rigs.description import described
+    from analogrig.rigs.description import describe as describe_rig
     from analogrig_emulator import EmulatorError
 
     with contextlib.suppress(AnalogrigError, EmulatorError):
         if dut and describe(dut).only_one:
             return f"device {dut}: one worker owns it"
     with contextlib.suppress(AnalogrigError, EmulatorError):
-        if rig and not rig.startswith("recording:") and described(rig)[0].get("kind") == "real":
+        if rig and describe_rig(rig).has_one_owner:
             return f"rig {rig}: one worker owns it"
     return ""
