@@ -10,6 +10,7 @@ import pytest
 
 from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradictions
 from analogrig.hardware.dating.two_filter import Signals
+from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import VirtualClock
 from analogrig.plant import Plant
 from analogrig.scenario import PotChange
@@ -19,7 +20,7 @@ RATE_HZ = 20e3
 
 
 @dataclasses.dataclass
-class Hand:
+class Hand(Pots):
     """Pots that take ``takes_s`` for each change."""
 
     clock: VirtualClock
@@ -29,9 +30,6 @@ class Hand:
     def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - dials, words
         assert recording
         self.clock.advance(self.takes_s)
-
-    def close(self) -> None:
-        pass
 
 
 def turned(tweaks: Sequence[PlannedChange], takes_s: float, *, slow: bool = False) -> HandChanges:

@@ -137,8 +137,8 @@ def test_killed_command_is_an_error_with_the_signal(tmp_path: Path) -> None:
 
 def test_hanging_command_is_killed_with_its_children(tmp_path: Path) -> None:
     hanging = f"sleep 600 & echo $$ $! > {shlex.quote(str(tmp_path / 'pids'))}; wait"  # a shell is up at once
-    pots = opened(kind="command", arguments=["sh", "-c", hanging, "{pot}", "{dial}"], timeout_s=5.0)
-    with pytest.raises(RigError, match=r"pot K to 0\.5000: .*: not done within 5 s, killed"):
+    pots = opened(kind="command", arguments=["sh", "-c", hanging, "{pot}", "{dial}"], timeout_s=2.0)
+    with pytest.raises(RigError, match=r"pot K to 0\.5000: .*: not done within 2 s, killed"):
         pots.set({"K": 0.5}, WORDS, recording=True)
     assert all(ends(int(pid)) for pid in (tmp_path / "pids").read_text().split())
 

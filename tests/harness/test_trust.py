@@ -783,6 +783,6 @@ def pots_classes() -> list[type]:
 def thing_of(url: str) -> str:
     from analogrig.hardware.wiring import Input
 
-    inputs = {"force": Input(1, "HV"), "displacement": Input(2, "HV")}
+    inputs = {"force": Input(input=1, range="HV"), "displacement": Input(input=2, range="HV")}
     description = RealDescription("real", url, inputs, InstrumentPots("instrument"))
     return description.things[0].name

@@ -198,7 +198,7 @@ def connect_often(served: Served, draw: random.Random, stop: Stop) -> int:
         count += 1
         if len(kept) > draw.randrange(1, 100):
             kept.pop(draw.randrange(len(kept))).close()
-        if stop() and count >= 1000:
+        if stop() and count >= 300:
             for connection in kept:
                 connection.close()
             return count

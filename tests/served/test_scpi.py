@@ -8,7 +8,6 @@ from analogrig.hardware.simulator.scpi import (
     MOST_ARGUMENTS,
     MOST_ERRORS,
     VOLTS,
-    Broken,
     Call,
     Command,
     DropOut,
@@ -36,13 +35,16 @@ class Lamp:
             "LAMP:BULB#:AGE?": (0, lambda call: str(call.numbers[0])),
             "LAMP:STEPs": (1, lambda call: self._raise(call.whole(0, 0, 9))),
             "LAMP:SPECtrum?": (0, lambda _: b"\x00\n;\xff"),
-            "LAMP:FLICker?": (1, lambda call: Broken("0123456789", hangs_up=call.switch(0))),
+            "LAMP:FLICker?": (1, self._flicker),
             "LAMP:MODE": (1, lambda call: self._raise(call.word(0, ("DAY", "NIGHT")))),
         }
 
     def _set(self, call: Call) -> Response:
         self.level = call.number(0, 0.0, 10.0)
         return None
+
+    def _flicker(self, call: Call) -> Response:
+        raise DropOut("0123456789", hangs_up=call.switch(0))
 
     def _raise(self, what: object) -> Response:
         raise ScpiError(-221, f"it has no {what}")

@@ -10,9 +10,9 @@ import hashlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,49 +51,37 @@ class DialChange(NamedTuple):
     dial: float
 
 
-class Pots(Protocol):
-    """Pots that can be set."""
+class Pots:
+    """Pots that are set one after another. These need no setting: they are assumed to stand as wanted."""
 
-    slow: bool
-    """True if a hand turns them for many samples; otherwise each jumps, one after the other."""
+    slow: bool = False
+    """True if a hand turns them for many samples; otherwise each jumps."""
 
-    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:
+    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - for an operator
         """Set pots by name, and return when they stand.
 
         :param words: the target values for the operator prompt: ``M 115 kg, K 24500 N/m``.
         :param recording: True if a record is being taken, so that they must move at once.
         :raises RigError: they could not be set.
         """
+        for pot, dial in dials.items():
+            self.set_one(pot, dial)
+
+    def set_one(self, pot: str, dial: float) -> None:
+        """Set a pot. :raises RigError: that failed."""
 
     def close(self) -> None:
         """Release the connection to the pots."""
 
 
-class PotsOneByOne(ABC):
-    """Pots that are set one after another."""
-
-    slow = False
-
-    def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:  # noqa: ARG002 - for an operator
-        for pot, dial in dials.items():
-            self.set_one(pot, dial)
-
-    @abstractmethod
-    def set_one(self, pot: str, dial: float) -> None:
-        """Set a pot. :raises RigError: that failed."""
-
-    def close(self) -> None:  # noqa: B027
-        """Do nothing, unless overridden."""
-
-
-class PotBox(PotsOneByOne):
+class PotBox(Pots):
     """Pots that an instrument sets itself."""
 
     names: tuple[str, ...]
 
-    @abstractmethod
     def schedule(self, changes: Sequence[DialChange]) -> None:
         """Replace the changes that the box makes at exact instants within the next record, and in no later one."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -150,6 +138,16 @@ class Instrument(ABC):
         self._excitation = Excitation()
         self._digests: deque[bytes] = deque(maxlen=_REMEMBERED)
         """Digests of the codes of earlier records."""
+
+    def find_pots(self, names: Iterable[str]) -> PotBox:
+        """Pots of the instrument, which are to have these names.
+
+        :raises RigError: some are lacking.
+        """
+        lacking = sorted(set(names) - set(self.pots.names if self.pots else ()))
+        if self.pots is None or lacking:
+            raise RigError(f"{self.name}: lacks the pots {', '.join(lacking)}")
+        return self.pots
 
     @classmethod
     @abstractmethod

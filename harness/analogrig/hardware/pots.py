@@ -6,25 +6,23 @@ Dials go from 0 to 1. The caller checks the limits of each pot before anything m
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import re
-import select
 import shlex
 import signal
 import subprocess
+import tempfile
 import termios
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import IO, ClassVar, Literal, Self
 
 import serial
 
 from analogrig.errors import ConfigurationError, LinkError, RigError
-from analogrig.hardware.instrument import Instrument, Pots, PotsOneByOne
+from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import DEFAULT_BAUD, PortWire
 from analogrig.trust import Thing, placed, placed_port
 
@@ -67,16 +65,12 @@ class PotsKind:
         """
 
     def open(self) -> Pots:
-        """Connect to the pots.
+        """Connect to the pots. Those of kind ``instrument`` come with the instrument.
 
         :raises RigError: the connection failed.
         :raises ConfigurationError: a prerequisite is missing.
         """
-        raise NotImplementedError
-
-    def open_on(self, instrument: Instrument, names: tuple[str, ...]) -> Pots:  # noqa: ARG002 - overridden
-        """Connect to the pots ``names`` of a rig with this instrument. Raises what ``open`` raises."""
-        return self.open()
+        return Pots()
 
 
 @dataclass(frozen=True)
@@ -85,14 +79,6 @@ class InstrumentPots(PotsKind):
 
     exact = True
     kind: Literal["instrument"]
-
-    def open_on(self, instrument: Instrument, names: tuple[str, ...]) -> Pots:
-        """:raises RigError: the instrument lacks some of these pots."""
-        box = instrument.pots
-        lacking = sorted(set(names) - set(box.names if box else ()))
-        if box is None or lacking:
-            raise RigError(f"{instrument.name}: lacks the pots {', '.join(lacking)}")
-        return box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +108,7 @@ class _SteppedPots(PotsKind):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommandPots(_SteppedPots):
+class CommandPots(_SteppedPots, Pots):
     """A program of the user that sets one pot, and ends with status 0 when it stands."""
 
     kind: Literal["command"]
@@ -148,7 +134,18 @@ class CommandPots(_SteppedPots):
         return dataclasses.replace(self, arguments=(placed(program, folder) if "/" in program else program, *rest))
 
     def open(self) -> Pots:
-        return _Command(self)
+        return self
+
+    def set_one(self, pot: str, dial: float) -> None:
+        arguments = [self.fill(each, pot, dial) for each in self.arguments]
+        where = f"pot {pot} to {dial:.{DECIMALS}f}: {shlex.join(arguments)}"
+        with tempfile.TemporaryFile() as output:
+            status = _run(arguments, output, self.timeout_s, where)
+            output.seek(0)
+            text = output.read(_MOST_REPLY_BYTES)
+        if status:
+            how = f"status {status}" if status > 0 else f"signal {-status}"
+            raise RigError(f"{where}: ended with {how}{_quote(text)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,9 +212,6 @@ class NoPots(PotsKind):
     changeable = False
     kind: Literal["none"]
 
-    def open(self) -> Pots:
-        return _FixedPots()
-
 
 PotsDescription = InstrumentPots | CommandPots | SerialPots | OperatorPots | NoPots
 """Table ``[rig.NAME.pots]``, by its ``kind``."""
@@ -234,63 +228,29 @@ def _check_placeholders(key: str, template: str, *, needed: bool = True) -> None
         raise ValueError(f"{key} must have {{pot}}, and {{dial}} or {{step}}, in it")
 
 
-class _Command(PotsOneByOne):
-    def __init__(self, description: CommandPots) -> None:
-        self._description = description
+def _run(arguments: list[str], output: IO[bytes], timeout_s: float, where: str) -> int:
+    """Run a command in a process group of its own, which is killed unless the command ends. Return its status.
 
-    def set_one(self, pot: str, dial: float) -> None:
-        arguments = [self._description.fill(each, pot, dial) for each in self._description.arguments]
-        where = f"pot {pot} to {dial:.{DECIMALS}f}: {shlex.join(arguments)}"
-        with _start(arguments, where) as process:
-            try:
-                output = _read_output(process, self._description.timeout_s)
-            except subprocess.TimeoutExpired:
-                raise RigError(f"{where}: not done within {self._description.timeout_s:g} s, killed") from None
-        if process.returncode:
-            how = f"status {process.returncode}" if process.returncode > 0 else f"signal {-process.returncode}"
-            raise RigError(f"{where}: ended with {how}{_quote(output)}")
-
-
-def _read_output(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
-    """Await the end of a process. Return the beginning of its output.
-
-    :raises subprocess.TimeoutExpired: it has not ended in time.
+    :raises RigError: it cannot be started, or does not end in time.
     """
-    assert process.stdout is not None  # noqa: S101 - _start asks for it
-    output, deadline_s = b"", time.monotonic() + timeout_s
-    while select.select([process.stdout], [], [], max(0.0, deadline_s - time.monotonic()))[0]:
-        if not (received := os.read(process.stdout.fileno(), _MOST_REPLY_BYTES)):
-            process.wait(max(0.0, deadline_s - time.monotonic()))
-            return output
-        output = (output + received)[:_MOST_REPLY_BYTES]
-        if time.monotonic() > deadline_s:
-            break
-    raise subprocess.TimeoutExpired(process.args, timeout_s)
-
-
-@contextlib.contextmanager
-def _start(arguments: list[str], where: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a process in a process group of its own; kill the group if it still runs at the end."""
     try:
         process = subprocess.Popen(
-            arguments,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
+            arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
         )
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise RigError(f"{where}: cannot be started: {reason}") from error
-    with process:
-        try:
-            yield process
-        finally:
-            if process.returncode is None:
-                os.killpg(process.pid, signal.SIGKILL)
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        raise RigError(f"{where}: not done within {timeout_s:g} s, killed") from None
+    finally:
+        if process.returncode is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
-class _Box(PotsOneByOne):
+class _Box(Pots):
     def __init__(self, description: SerialPots) -> None:
         self._description = description
         try:
@@ -332,7 +292,7 @@ class _Box(PotsOneByOne):
         self._wire.close()
 
 
-class _Operator:
+class _Operator(Pots):
     slow = True
 
     def __init__(self, terminal: Path) -> None:
@@ -369,13 +329,6 @@ class _Operator:
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
-
-
-class _FixedPots(PotsOneByOne):
-    """Pots that are assumed to stand as wanted."""
-
-    def set_one(self, pot: str, dial: float) -> None:
-        pass
 
 
 def _list_dials(dials: Mapping[str, float]) -> str:

@@ -174,7 +174,8 @@ class RealRig(Rig):
         if self._instrument is None:
             self._instrument = self._connect(self._address, description.timeout_s)
         if self._pots is None:
-            self._pots = description.pots.open_on(self._instrument, description.pot_names)
+            own = description.pots.exact
+            self._pots = self._instrument.find_pots(description.pot_names) if own else description.pots.open()
         return self._instrument, self._pots
 
     def _test(self) -> None:

@@ -37,16 +37,14 @@ class Stage:
         return (output_v - self.offset_v) / self.gain
 
 
-@dataclass(frozen=True)
-class Input:
+@dataclass(frozen=True, kw_only=True)
+class Input(Stage):
     """Path of a channel from the computer to an input of the instrument."""
 
     input: int
     """Number of the input, as printed on the instrument."""
     range: str
     """The instrument's own name of the range."""
-    gain: float = 1.0
-    offset_v: float = 0.0
     least_v: float = -1.0
     """Lowest voltage at the computer that is not clipped. Codes count from here: the larger the code of 0 V, the larger
     the offset that the estimator has to learn."""
@@ -54,14 +52,13 @@ class Input:
     """rms noise before quantisation; the self-test measures it."""
 
     def __post_init__(self) -> None:
-        Stage(self.gain, self.offset_v)
+        super().__post_init__()
         check_range(self, "least_v", -_MOST_VOLTS, _MOST_VOLTS)
         check_range(self, "noise_lsb", 0.0, 1e5)
 
     def ends_v(self, instrument: Datasheet) -> list[float]:
         """Lowest and highest voltage at the computer within the range of the input."""
-        stage = Stage(self.gain, self.offset_v)
-        return sorted(stage.input_v(end_v) for end_v in instrument.ranges_v[self.range])
+        return sorted(self.input_v(end_v) for end_v in instrument.ranges_v[self.range])
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,7 +42,7 @@ from analogrig.hardware.simulator.acquisition import (
 )
 from analogrig.hardware.simulator.computer import WiredComputer, Wiring
 from analogrig.hardware.simulator.inputs import RANGES_V, Codes, InputFaults
-from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Broken, Call, Command, Response, ScpiError
+from analogrig.hardware.simulator.scpi import HERTZ, VOLTS, Call, Command, DropOut, Response, ScpiError
 from analogrig.links.wire import Clock
 from analogrig_emulator import EmulatorError, Excitation, SuspensionComputer
 
@@ -50,13 +50,44 @@ MOST_SCHEDULED = 64
 MOST_DELAY_S = 1e4
 MOST_OUTPUT_V = 1.0
 MOST_LEVEL_V = max(RANGES_V.values())
-SHAPES = ("SQUARE", "PWM", "DC")
 _ROUNDING_V = 1e-9
 _ORDERS = {"BEND": ">", "LEND": "<"}
 _IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
 
 Commands = dict[str, tuple[int, Command]]
 """By pattern: the largest number of arguments, and the action."""
+
+
+def _number(low: float, high: float, suffixes: Mapping[str, float] | None = None) -> Callable[[Call], float]:
+    return lambda call: call.number(0, low, high, suffixes)
+
+
+def _word(*allowed: str) -> Callable[[Call], str]:
+    return lambda call: call.word(0, allowed)
+
+
+_Settings = tuple[tuple[str, str, Callable[[Call], Any]], ...]
+"""Pattern, field of the dataclass, and the value of an argument."""
+
+_GENERATOR_SETTINGS: _Settings = (
+    ("OUTPUT#:STATE", "on", lambda call: call.switch(0)),
+    ("SOUR#:FUNC", "shape", _word("SQUARE", "PWM", "DC")),
+    ("SOUR#:FREQ[:FIX]", "frequency_hz", _number(1e-3, 1e6, HERTZ)),
+    ("SOUR#:VOLT", "amplitude_v", _number(0.0, MOST_OUTPUT_V, VOLTS)),
+    ("SOUR#:VOLT:OFFS", "offset_v", _number(-MOST_OUTPUT_V, MOST_OUTPUT_V, VOLTS)),
+    ("SOUR#:PHAS", "phase_deg", _number(-360.0, 360.0)),
+    ("SOUR#:DCYC", "duty", _number(0.001, 0.999)),
+)
+
+_ACQUISITION_SETTINGS: _Settings = (
+    ("ACQ:DEC[:Factor]", "decimation", lambda call: call.whole(0, LEAST_DECIMATION, MOST_DECIMATION)),
+    ("ACQ:AVG", "averages", lambda call: call.switch(0)),
+    ("ACQ:TRig:LEV", "level_v", _number(-MOST_LEVEL_V, MOST_LEVEL_V, VOLTS)),
+    ("ACQ:TRig:DLY", "delay_n", lambda call: call.whole(0, LEAST_DELAY_N, MOST_DELAY_N)),
+    ("ACQ:DATA:Units", "units", _word("VOLTS", "RAW")),
+    ("ACQ:DATA:FORMAT", "form", _word("ASCII", "BIN")),
+    ("ACQ:DATA:BYTE:ORDER", "order", _word(*_ORDERS)),
+)
 
 
 @dataclass(frozen=True)
@@ -134,15 +165,39 @@ class ServedRedPitaya:
 
     @property
     def commands(self) -> Commands:
-        commands = self._general() | self._generator_commands() | self._acquisition_commands() | self._pot_commands()
-        return {pattern: (most, functools.partial(_run, command)) for pattern, (most, command) in commands.items()}
-
-    def _general(self) -> Commands:
-        return {
+        acquisition, scheduled = self._acquisition, self._scheduled
+        commands: Commands = {
             "*IDN?": (0, lambda _: _IDENTITY),
             "*OPC?": (0, lambda _: "1"),
             "*RST": (0, lambda _: self._reset()),
+            "GEN:RST": (0, lambda _: self._reset_generator()),
+            "SOUR#:TRig:INT": (0, self._trigger_generator),
+            "ACQ:RST": (0, lambda _: acquisition.reset()),
+            "ACQ:START": (0, lambda _: acquisition.start()),
+            "ACQ:STOP": (0, lambda _: acquisition.stop()),
+            "ACQ:TRig": (1, lambda call: acquisition.arm(call.word(0, TRIGGERS))),
+            "ACQ:TRig:STAT?": (0, lambda _: self._trigger_state()),
+            "ACQ:TRig:FILL?": (0, lambda _: self._fill_state()),
+            "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
+            "ACQ:SRATe?": (0, lambda _: f"{_show(CLOCK_HZ / acquisition.settings.decimation)} Hz"),
+            "ACQ:SOUR#:GAIN": (1, self._set_range),
+            "ACQ:SOUR#:GAIN?": (0, lambda call: acquisition.settings.switches[_channel(call)]),
+            "ACQ:SOUR#:DATA?": (0, lambda call: self._data(call, slice(None))),
+            "ACQ:SOUR#:DATA:STArt:N?": (2, self._part_of_data),
+            "ACQ:SOUR#:DATA:Old:N?": (1, lambda call: self._data(call, slice(call.whole(0, 1, BUFFER_N)))),
+            "ACQ:SOUR#:DATA:LATest:N?": (1, lambda call: self._data(call, slice(-call.whole(0, 1, BUFFER_N), None))),
+            "POT:CATalog?": (0, lambda _: ",".join(self._pots)),
+            "POT#:DIAL": (1, self._turn),
+            "POT#:DIAL?": (0, lambda call: _show(self._computer.dials[self._pot(call.numbers[0])])),
+            "POT:SCHedule": (3, self._schedule),
+            "POT:SCHedule:CLEar": (0, lambda _: scheduled.clear()),
+            "POT:SCHedule:COUNt?": (0, lambda _: str(len(scheduled))),
         }
+        for pattern, name, parse in _GENERATOR_SETTINGS:
+            commands |= _setting(pattern, name, self._output, self._set_generator, parse)
+        for pattern, name, parse in _ACQUISITION_SETTINGS:
+            commands |= _setting(pattern, name, lambda _: acquisition.settings, acquisition.change, parse)
+        return {pattern: (most, functools.partial(_run, command)) for pattern, (most, command) in commands.items()}
 
     def _reset(self) -> None:
         self._reset_generator()
@@ -150,24 +205,6 @@ class ServedRedPitaya:
         self._scheduled.clear()
 
     # ---- generator
-
-    def _generator_commands(self) -> Commands:
-        commands: Commands = {
-            "GEN:RST": (0, lambda _: self._reset_generator()),
-            "SOUR#:TRig:INT": (0, self._trigger_generator),
-            **_setting("OUTPUT#:STATE", "on", self._output, self._set_generator, lambda call: call.switch(0), _on_off),
-            **_setting("SOUR#:FUNC", "shape", self._output, self._set_generator, lambda call: call.word(0, SHAPES)),
-        }
-        for pattern, name, low, high, suffixes in (
-            ("SOUR#:FREQ[:FIX]", "frequency_hz", 1e-3, 1e6, HERTZ),
-            ("SOUR#:VOLT", "amplitude_v", 0.0, MOST_OUTPUT_V, VOLTS),
-            ("SOUR#:VOLT:OFFS", "offset_v", -MOST_OUTPUT_V, MOST_OUTPUT_V, VOLTS),
-            ("SOUR#:PHAS", "phase_deg", -360.0, 360.0, {}),
-            ("SOUR#:DCYC", "duty", 0.001, 0.999, {}),
-        ):
-            parse = functools.partial(Call.number, at=0, low=low, high=high, suffixes=suffixes)
-            commands |= _setting(pattern, name, self._output, self._set_generator, parse, _number)
-        return commands
 
     def _output(self, call: Call) -> Generator:
         if call.numbers[0] != 1:
@@ -192,44 +229,6 @@ class ServedRedPitaya:
 
     # ---- acquisition
 
-    def _acquisition_commands(self) -> Commands:
-        acquisition = self._acquisition
-        return {
-            "ACQ:RST": (0, lambda _: acquisition.reset()),
-            "ACQ:START": (0, lambda _: acquisition.start()),
-            "ACQ:STOP": (0, lambda _: acquisition.stop()),
-            "ACQ:TRig": (1, lambda call: acquisition.arm(call.word(0, TRIGGERS))),
-            "ACQ:TRig:STAT?": (0, lambda _: self._trigger_state()),
-            "ACQ:TRig:FILL?": (0, lambda _: self._fill_state()),
-            "ACQ:BUF:SIZE?": (0, lambda _: str(BUFFER_N)),
-            "ACQ:SRATe?": (0, lambda _: f"{_number(CLOCK_HZ / acquisition.settings.decimation)} Hz"),
-            "ACQ:SOUR#:GAIN": (1, self._set_range),
-            "ACQ:SOUR#:GAIN?": (0, lambda call: acquisition.settings.switches[_channel(call)]),
-            "ACQ:SOUR#:DATA?": (0, lambda call: self._data(call, 0, BUFFER_N)),
-            "ACQ:SOUR#:DATA:STArt:N?": (2, self._part_of_data),
-            "ACQ:SOUR#:DATA:Old:N?": (1, lambda call: self._data(call, 0, call.whole(0, 1, BUFFER_N))),
-            "ACQ:SOUR#:DATA:LATest:N?": (1, self._latest_data),
-            **self._acquisition_settings(),
-        }
-
-    def _acquisition_settings(self) -> Commands:
-        def setting(
-            pattern: str, name: str, parse: Callable[[Call], Any], show: Callable[[Any], str] = str
-        ) -> Commands:
-            return _setting(pattern, name, lambda _: self._acquisition.settings, self._acquisition.change, parse, show)
-
-        return {
-            **setting("ACQ:DEC[:Factor]", "decimation", lambda call: call.whole(0, LEAST_DECIMATION, MOST_DECIMATION)),
-            **setting("ACQ:AVG", "averages", lambda call: call.switch(0), _on_off),
-            **setting(
-                "ACQ:TRig:LEV", "level_v", lambda call: call.number(0, -MOST_LEVEL_V, MOST_LEVEL_V, VOLTS), _number
-            ),
-            **setting("ACQ:TRig:DLY", "delay_n", lambda call: call.whole(0, LEAST_DELAY_N, MOST_DELAY_N)),
-            **setting("ACQ:DATA:Units", "units", lambda call: call.word(0, ("VOLTS", "RAW"))),
-            **setting("ACQ:DATA:FORMAT", "form", lambda call: call.word(0, ("ASCII", "BIN"))),
-            **setting("ACQ:DATA:BYTE:ORDER", "order", lambda call: call.word(0, tuple(_ORDERS))),
-        }
-
     def _set_range(self, call: Call) -> None:
         settings = self._acquisition.settings
         switches = list(settings.switches)
@@ -248,20 +247,17 @@ class ServedRedPitaya:
         first, count = call.whole(0, 0, BUFFER_N - 1), call.whole(1, 1, BUFFER_N)
         if first + count > BUFFER_N:
             raise ScpiError(-222, f"{first} + {count} exceeds the buffer of {BUFFER_N}")
-        return self._data(call, first, count)
+        return self._data(call, slice(first, first + count))
 
-    def _latest_data(self, call: Call) -> Response:
-        count = call.whole(0, 1, BUFFER_N)
-        return self._data(call, BUFFER_N - count, count)
-
-    def _data(self, call: Call, first: int, count: int) -> Response:
+    def _data(self, call: Call, part: slice) -> Response:
         """Samples of the record, in the chosen units and format."""
         channel, record = _channel(call), self._acquisition.record
         if record is None:
             raise ScpiError(-230, "no record is complete")
-        data = self._format(record.codes[first : first + count, channel], record.lsb_v[channel])
-        drop_out = self._acquisition.drop_out()
-        return Broken(data, hangs_up=drop_out == "hang up") if drop_out else data
+        data = self._format(record.codes[part, channel], record.lsb_v[channel])
+        if drop_out := self._acquisition.drop_out():
+            raise DropOut(data, hangs_up=drop_out == "hang up")
+        return data
 
     def _format(self, codes: Codes, lsb_v: float) -> str | bytes:
         settings = self._acquisition.settings
@@ -272,16 +268,6 @@ class ServedRedPitaya:
         return volts.astype(f"{order}f4").tobytes() if binary else _braces(f"{v:.6g}" for v in volts.tolist())
 
     # ---- pots
-
-    def _pot_commands(self) -> Commands:
-        return {
-            "POT:CATalog?": (0, lambda _: ",".join(self._pots)),
-            "POT#:DIAL": (1, self._turn),
-            "POT#:DIAL?": (0, lambda call: _number(self._computer.dials[self._pot(call.numbers[0])])),
-            "POT:SCHedule": (3, self._schedule),
-            "POT:SCHedule:CLEar": (0, lambda _: self._scheduled.clear()),
-            "POT:SCHedule:COUNt?": (0, lambda _: str(len(self._scheduled))),
-        }
 
     def _pot(self, number: int) -> str:
         if not 1 <= number <= len(self._pots):
@@ -303,18 +289,19 @@ class ServedRedPitaya:
 
 
 def _setting(
-    pattern: str,
-    name: str,
-    get: Callable[[Call], Any],
-    put: Callable[[Any], None],
-    parse: Callable[[Call], Any],
-    show: Callable[[Any], str] = str,
+    pattern: str, name: str, get: Callable[[Call], Any], put: Callable[[Any], None], parse: Callable[[Call], Any]
 ) -> Commands:
     """Commands that set and query the field ``name`` of a dataclass, which ``get`` returns and ``put`` stores."""
     return {
         pattern: (1, lambda call: put(dataclasses.replace(get(call), **{name: parse(call)}))),
-        f"{pattern}?": (0, lambda call: show(getattr(get(call), name))),
+        f"{pattern}?": (0, lambda call: _show(getattr(get(call), name))),
     }
+
+
+def _show(value: object) -> str:
+    if isinstance(value, bool):
+        return "ON" if value else "OFF"
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
 def _run(command: Command, call: Call) -> Response:
@@ -329,14 +316,6 @@ def _channel(call: Call) -> int:
     if not 1 <= call.numbers[0] <= 2:
         raise ScpiError(-114, "the inputs are IN1 and IN2")
     return call.numbers[0] - 1
-
-
-def _number(value: float) -> str:
-    return f"{value:.9g}"
-
-
-def _on_off(on: object) -> str:
-    return "ON" if on else "OFF"
 
 
 def _braces(numbers: Iterable[str]) -> str:

@@ -70,10 +70,11 @@ class ScpiError(Exception):
 
 
 class DropOut(Exception):  # noqa: N818 - the word of the field
-    """The instrument stops in the middle of a response."""
+    """The instrument stops after the first half of a response."""
 
-    def __init__(self, *, hangs_up: bool) -> None:
+    def __init__(self, response: str | bytes, *, hangs_up: bool) -> None:
         super().__init__("the connection is closed" if hangs_up else "nothing more is sent")
+        self.response = response
         self.hangs_up = hangs_up
 
 
@@ -131,18 +132,14 @@ def _factor(suffix: str, suffixes: Mapping[str, float]) -> float:
     return suffixes[suffix] if suffix else 1.0
 
 
-@dataclass(frozen=True)
-class Broken:
-    """Response that stops after its first half; then the interpreter raises DropOut."""
-
-    response: str | bytes
-    hangs_up: bool
-
-
-Response = str | bytes | Broken | None
+Response = str | bytes | None
 """Response of a query: a text, or the content of a block of IEEE 488.2; None for a command."""
 
 Command = Callable[[Call], Response]
+"""Action of a command.
+
+:raises ScpiError: the command is refused. :raises DropOut: the instrument drops out.
+"""
 
 
 class Interpreter:
@@ -179,10 +176,11 @@ class Interpreter:
             except ScpiError as error:
                 self.refuse(error)
                 response = None
+            except DropOut as drop_out:
+                whole = _encode(drop_out.response)
+                yield separator + whole[: len(whole) // 2]
+                raise
             part = b"" if response is None else separator + _encode(response)
-            if isinstance(response, Broken):
-                yield part
-                raise DropOut(hangs_up=response.hangs_up)
             separator = b";" if part else separator
             yield part + END if separator and not left else part
 
@@ -221,11 +219,7 @@ def block(content: bytes) -> bytes:
     return f"#{len(length)}{length}".encode("ascii") + content
 
 
-def _encode(response: str | bytes | Broken) -> bytes:
-    """Bytes of a response; the first half of a broken one."""
-    if isinstance(response, Broken):
-        whole = _encode(response.response)
-        return whole[: len(whole) // 2]
+def _encode(response: str | bytes) -> bytes:
     return response.encode("ascii") if isinstance(response, str) else block(response)
 
 

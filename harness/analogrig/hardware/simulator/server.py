@@ -19,6 +19,7 @@ import itertools
 import logging
 import socket
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 from analogrig.errors import ConfigurationError
@@ -49,21 +50,18 @@ class Servable(Protocol):
         """Switch the output off."""
 
 
+@dataclass
 class _Client:
     """Connection to a client."""
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader = reader
-        self.writer = writer
-        self.heard_s = asyncio.get_running_loop().time()
-        """Time of its last complete line."""
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+    heard_s: float
+    """Time of its last complete line."""
 
     def hang_up(self) -> None:
         """Close the connection at once; unsent data is lost."""
         self.writer.transport.abort()
-
-    def note_line(self) -> None:
-        self.heard_s = asyncio.get_running_loop().time()
 
 
 class Server:
@@ -104,7 +102,7 @@ class Server:
         self._instrument.silence()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        client, task = _Client(reader, writer), asyncio.current_task()
+        client, task = _Client(reader, writer, _now_s()), asyncio.current_task()
         if task is None or not self._make_place():
             client.hang_up()
             return
@@ -133,7 +131,7 @@ class Server:
             (client for client in self._clients.values() if client is not self._responsible),
             key=lambda client: client.heard_s,
         )
-        if asyncio.get_running_loop().time() - silent.heard_s < self._idle_s:
+        if _now_s() - silent.heard_s < self._idle_s:
             return False
         silent.hang_up()
         return True
@@ -141,7 +139,7 @@ class Server:
     async def _serve(self, client: _Client) -> None:
         interpreter = Interpreter(self._instrument.commands)
         while (line := await _read_line(client.reader, interpreter)) is not None:
-            client.note_line()
+            client.heard_s = _now_s()
             try:
                 await self._execute(client, interpreter, line)
             except DropOut as drop_out:
@@ -179,6 +177,10 @@ class Server:
                 return
             if transport.get_write_buffer_size() >= left:
                 raise TimeoutError("it reads nothing")
+
+
+def _now_s() -> float:
+    return asyncio.get_running_loop().time()
 
 
 async def _read_line(reader: asyncio.StreamReader, interpreter: Interpreter) -> bytes | None:
