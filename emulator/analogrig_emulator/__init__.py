@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.components import (
 )
 from analogrig_emulator.circuit.nodal import piecewise_linear
 from analogrig_emulator.circuit.opamp import IDEAL, OpAmpModel, preset
-from analogrig_emulator.circuit.pot import PotChange, PotModel
+from analogrig_emulator.circuit.pot import PotModel, PotTurn
 from analogrig_emulator.circuit.spice import Deck, to_spice
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges, PiecewiseLinear
@@ -98,10 +98,10 @@ __all__ = [
     "Parameter",
     "PiecewiseLinear",
     "Pot",
-    "PotChange",
     "PotError",
     "PotGrade",
     "PotModel",
+    "PotTurn",
     "Program",
     "Quantity",
     "Repeat",

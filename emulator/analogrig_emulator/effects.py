@@ -28,7 +28,7 @@ from analogrig_emulator.circuit.components import (
     PotGrade,
 )
 from analogrig_emulator.circuit.opamp import IDEAL, PRESETS, OpAmpModel
-from analogrig_emulator.circuit.pot import PotChange
+from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.machine.noise import NoisySuspension
 from analogrig_emulator.machine.program import CHANNELS, Program
 from analogrig_emulator.machine.quarter_car import FRONT, SHOCK
@@ -53,11 +53,11 @@ class Effect:
     draws: int
 
 
-_FRONT_CHANGES: Sequence[PotChange] = (
-    PotChange(200, {"K_n_per_m": 18000.0}),
-    PotChange(400, {"B_n_s_per_m": 3453.0}),
-    PotChange(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotChange(600, {"M_kg": 30.0}),
+_FRONT_CHANGES: Sequence[PotTurn] = (
+    PotTurn(200, {"K_n_per_m": 18000.0}),
+    PotTurn(400, {"B_n_s_per_m": 3453.0}),
+    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    PotTurn(600, {"M_kg": 30.0}),
 )
 
 
@@ -65,8 +65,8 @@ def _in_proportion(settings: Mapping[str, float]) -> dict[str, float]:
     return {name: SHOCK.values[name] * value / FRONT.values[name] for name, value in settings.items()}
 
 
-_CHANGES: Mapping[str, Sequence[PotChange]] = {
-    "shock": tuple(PotChange(change.sample, _in_proportion(change.values)) for change in _FRONT_CHANGES[:-1]),
+_CHANGES: Mapping[str, Sequence[PotTurn]] = {
+    "shock": tuple(PotTurn(change.sample, _in_proportion(change.values)) for change in _FRONT_CHANGES[:-1]),
     "front": _FRONT_CHANGES,
 }
 
@@ -130,16 +130,16 @@ class _Setup:
         machine = SuspensionComputer(program, opamp=self.op_amp, components=components, sample_rate_hz=rate_hz)
         rng = np.random.default_rng(seed)
         machine.set(**self.operator(machine, program.values, rng))
-        changes = [PotChange(k, self.operator(machine, values, rng), n) for k, values, n in self._changes(program)]
+        changes = [PotTurn(k, self.operator(machine, values, rng), n) for k, values, n in self._changes(program)]
         played = machine if self.noise is None else NoisySuspension(machine, rng, op_amps=self.noise)
         volts = np.concatenate(list(acquired(played, self.card, Excitation(), SAMPLES, changes, rng=rng)))
         sampler = Sampler(self.card, rng)
         seen_lsb = sampler.seen_lsb(volts)
         return (sampler.convert(seen_lsb)[0] if self.quantised else seen_lsb)[:, _DISPLACEMENT].astype(np.float64)
 
-    def _changes(self, program: Program) -> Sequence[PotChange]:
+    def _changes(self, program: Program) -> Sequence[PotTurn]:
         if self.turning:
-            return [PotChange(200, {"K_n_per_m": 0.8 * program.values["K_n_per_m"]}, _SLOW_CHANGE_N)]
+            return [PotTurn(200, {"K_n_per_m": 0.8 * program.values["K_n_per_m"]}, _SLOW_CHANGE_N)]
         return _CHANGES[program.name]
 
 

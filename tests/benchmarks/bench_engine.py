@@ -31,7 +31,7 @@ from analogrig_emulator import (
     Engine,
     Excitation,
     NoisySuspension,
-    PotChange,
+    PotTurn,
     Resistor,
     Sampler,
     SuspensionComputer,
@@ -44,11 +44,11 @@ from tests.emulator.conftest import _read_raw
 
 from .figure import Figure
 
-THESIS_TWEAKS: tuple[PotChange, ...] = (
-    PotChange(200, {"K_n_per_m": 18000.0}),
-    PotChange(400, {"B_n_s_per_m": 3453.0}),
-    PotChange(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotChange(600, {"M_kg": 30.0}),
+THESIS_TWEAKS: tuple[PotTurn, ...] = (
+    PotTurn(200, {"K_n_per_m": 18000.0}),
+    PotTurn(400, {"B_n_s_per_m": 3453.0}),
+    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    PotTurn(600, {"M_kg": 30.0}),
 )
 
 REPEATS = 5
@@ -171,10 +171,10 @@ def trial_s(*, noisy: bool = False) -> float:
 # ---- ngspice
 
 
-def decks(samples: int, tweaks: Sequence[PotChange]) -> Iterator[str]:
+def decks(samples: int, tweaks: Sequence[PotTurn]) -> Iterator[str]:
     computer = SuspensionComputer("front")
     edges = {"F": Excitation().edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)}
-    turns = [PotChange(change.sample, computer.dials_for(**change.values)) for change in tweaks]
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
     for accuracy in ACCURACIES:
         deck = to_spice(computer.circuit, samples=samples, edges=edges, turns=turns, nodes=["u5"], accuracy=accuracy)
         yield from variants(deck)
@@ -212,7 +212,7 @@ def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:
     return spent_s, np.interp(np.arange(samples) / RATE_HZ, table[:, 0], table[:, names.index("v(u5)")])
 
 
-def fastest_ngspice_s(samples: int, tweaks: Sequence[PotChange]) -> float:
+def fastest_ngspice_s(samples: int, tweaks: Sequence[PotTurn]) -> float:
     """Of the decks that come within TOLERATED_LSB of the displacement at every sample."""
     exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
     runs = [simulate(deck, samples) for deck in decks(samples, tweaks)]

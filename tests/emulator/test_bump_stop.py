@@ -16,7 +16,7 @@ from analogrig_emulator import (
     Deck,
     Excitation,
     OpAmp,
-    PotChange,
+    PotTurn,
     SuspensionComputer,
 )
 
@@ -30,7 +30,7 @@ STOP = BumpStop()
 
 def deck_of(computer: SuspensionComputer, excitation: Excitation, samples: int, **dials: float) -> Deck:
     edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [PotChange(samples // 2, dials)] if dials else []
+    turns = [PotTurn(samples // 2, dials)] if dials else []
     return Deck(computer.circuit, samples, RATE_HZ, {"F": edges}, turns, title="bump stop")
 
 

@@ -17,8 +17,8 @@ from analogrig_emulator import (
     Components,
     Excitation,
     Grade,
-    PotChange,
     PotGrade,
+    PotTurn,
     SuspensionComputer,
 )
 from analogrig_emulator.effects import Effect, measure_effects
@@ -89,7 +89,7 @@ def test_the_shock_absorbers_changes_are_those_of_the_study(name: str) -> None:
 
 def volts_of(components: Components) -> NDArray[np.float64]:
     machine = SuspensionComputer("front", opamp="ideal", components=components)
-    return np.concatenate(list(machine.play(Excitation(), 250, [PotChange(100, {"K_n_per_m": 18000.0}, 40)])))
+    return np.concatenate(list(machine.play(Excitation(), 250, [PotTurn(100, {"K_n_per_m": 18000.0}, 40)])))
 
 
 AGEING = replace(REAL, resistors=replace(REAL.resistors, ageing=2e-3))

@@ -25,7 +25,7 @@ from analogrig_emulator import (
     OpAmp,
     OpAmpModel,
     Pot,
-    PotChange,
+    PotTurn,
     Resistor,
     Sampler,
     SuspensionComputer,
@@ -57,7 +57,7 @@ excitations = st.builds(
 )
 tweaks = st.lists(
     st.builds(
-        PotChange,
+        PotTurn,
         st.integers(0, 299),
         st.dictionaries(st.sampled_from(("M_dial", "B_dial", "K_dial")), st.floats(0.1, 0.9), min_size=1),
         ramp_n=st.just(0),
@@ -76,7 +76,7 @@ def scaled(program: SuspensionProgram, by: tuple[float, float, float]) -> Suspen
 
 
 def volts_of(computer: SuspensionComputer, excitation: Excitation, samples: int, block: int = 4096) -> Volts:
-    return np.concatenate(list(computer.play(excitation, samples, [PotChange(40, {"B_dial": 0.5})], block)))
+    return np.concatenate(list(computer.play(excitation, samples, [PotTurn(40, {"B_dial": 0.5})], block)))
 
 
 def kept(computer: SuspensionComputer, start: Volts, opamp_v: float) -> Volts:
@@ -140,7 +140,7 @@ def test_halving_the_block_size_changes_no_code(
     program: SuspensionProgram,
     by: tuple[float, float, float],
     excitation: Excitation,
-    turns: list[PotChange],
+    turns: list[PotTurn],
     block: int,
     seed: int,
 ) -> None:
@@ -185,7 +185,7 @@ def test_a_tweak_to_the_same_value_changes_nothing(
     program: SuspensionProgram, by: tuple[float, float, float], excitation: Excitation, sample: int, setting: str
 ) -> None:
     plain, touched = (SuspensionComputer(scaled(program, by)) for _ in range(2))
-    tweak = PotChange(sample, {setting: touched.program.values[setting]})
+    tweak = PotTurn(sample, {setting: touched.program.values[setting]})
     untouched = np.concatenate(list(plain.play(excitation, 300)))
     assert np.array_equal(np.concatenate(list(touched.play(excitation, 300, [tweak]))), untouched)
 
@@ -246,7 +246,7 @@ def test_overload_of_an_acceleration_scaled_summer_agrees_with_ngspice(ngspice: 
     # Edges come 2.5 us before a sample, when U1 stands in its clamp.
     excitation = Excitation(low_v=-10.0, high_v=10.0, clock="free", phase=0.2305)
     edges = {"F": excitation.edges(0, 300 * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)}
-    deck = to_spice(circuit, samples=300, edges=edges, turns=[PotChange(100, after)])
+    deck = to_spice(circuit, samples=300, edges=edges, turns=[PotTurn(100, after)])
     reference = ngspice(deck, ACCELERATION_SCALED, 300)
     nodal = Nodal(circuit)
     engine = Engine(nodal.at({}), ACCELERATION_SCALED)

@@ -21,9 +21,9 @@ from analogrig_emulator import (
     ModeError,
     NoisySuspension,
     OpAmpGrade,
-    PotChange,
     PotError,
     PotGrade,
+    PotTurn,
     SuspensionComputer,
     acquired,
     probes_per_sample,
@@ -34,10 +34,10 @@ Volts = NDArray[np.float64]
 LSB_V = 10.0 / 4096
 PERIOD_S = 50e-6
 BUSY = Excitation(low_v=1.0, high_v=9.0)
-K_RAMP: PotChange = PotChange(120, {"K_n_per_m": 18000.0}, 80)
+K_RAMP: PotTurn = PotTurn(120, {"K_n_per_m": 18000.0}, 80)
 
 
-def played(computer: SuspensionComputer, samples: int, tweaks: Sequence[PotChange] = (), block: int = 4096) -> Volts:
+def played(computer: SuspensionComputer, samples: int, tweaks: Sequence[PotTurn] = (), block: int = 4096) -> Volts:
     return np.concatenate(list(computer.play(BUSY, samples, tweaks, block)))
 
 
@@ -81,7 +81,7 @@ def by_equation(goal_dials: dict[str, float], sample: int, ramp_n: int, samples:
 def test_a_turning_pot_is_an_equation_with_moving_coefficients(settings: dict[str, float], ramp_n: int) -> None:
     computer = SuspensionComputer("front", opamp="ideal")
     expected = by_equation(computer.dials_for(**settings), 120, ramp_n, 230)
-    volts = played(computer, 230, [PotChange(120, settings, ramp_n)])
+    volts = played(computer, 230, [PotTurn(120, settings, ramp_n)])
     assert np.abs(volts[:, 1:3] - expected)[:, 0].max() < 0.1 * LSB_V
     assert np.abs(volts[:, 1:3] - expected)[:, 1].max() < 0.2 * LSB_V
 
@@ -96,17 +96,17 @@ def test_a_ramp_begins_at_its_sample_and_ends_with_the_pot_at_its_goal() -> None
 
 
 def test_a_ramp_of_no_length_is_a_jump_and_one_to_the_same_value_is_nothing() -> None:
-    jumped = played(SuspensionComputer("front"), 300, [PotChange(120, {"K_n_per_m": 18000.0}, 0)])
-    plain = np.concatenate(list(SuspensionComputer("front").play(BUSY, 300, [PotChange(120, {"K_n_per_m": 18000.0})])))
+    jumped = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K_n_per_m": 18000.0}, 0)])
+    plain = np.concatenate(list(SuspensionComputer("front").play(BUSY, 300, [PotTurn(120, {"K_n_per_m": 18000.0})])))
     assert np.array_equal(jumped, plain)
-    same = played(SuspensionComputer("front"), 300, [PotChange(120, {"K_n_per_m": 24500.0}, 50)])
+    same = played(SuspensionComputer("front"), 300, [PotTurn(120, {"K_n_per_m": 24500.0}, 50)])
     assert np.array_equal(same, played(SuspensionComputer("front"), 300))
 
 
 @pytest.mark.parametrize("block", [1, 7, 150])
 def test_the_size_of_the_blocks_changes_no_bit_of_ramps_that_overlap(block: int) -> None:
     built = Components(pots=PotGrade(windings=1000, wiper_noise_ohm=100.0))
-    ramps: list[PotChange] = [K_RAMP, PotChange(150, {"M_kg": 60.0}, 100), PotChange(180, {"K_n_per_m": 22000.0}, 0)]
+    ramps: list[PotTurn] = [K_RAMP, PotTurn(150, {"M_kg": 60.0}, 100), PotTurn(180, {"K_n_per_m": 22000.0}, 0)]
     whole = played(SuspensionComputer("front", components=built), 300, ramps)
     assert np.array_equal(played(SuspensionComputer("front", components=built), 300, ramps, block), whole)
 

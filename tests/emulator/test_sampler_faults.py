@@ -16,7 +16,7 @@ from analogrig_emulator import (
     CARDS,
     Card,
     Excitation,
-    PotChange,
+    PotTurn,
     Sampler,
     SamplerError,
     SuspensionComputer,
@@ -44,7 +44,7 @@ class Wave:
         self.channels = channels
 
     def play(
-        self, excitation: Excitation, samples: int, tweaks: Sequence[PotChange] = (), block_samples: int = 256
+        self, excitation: Excitation, samples: int, tweaks: Sequence[PotTurn] = (), block_samples: int = 256
     ) -> Iterator[Volts]:
         del excitation, tweaks
         times = np.arange(samples) / self.sample_rate_hz * 1e6
@@ -88,9 +88,9 @@ def test_skewed_displacement_is_that_of_a_machine_sampled_faster(skew_us: float)
     excitation, tweak = Excitation(clock="free", phase=0.3), {"K_n_per_m": 18000.0}
     machine = SuspensionComputer("front", sample_rate_hz=20e3 * count)
     rng = np.random.default_rng(1)
-    volts = np.concatenate(list(acquired(machine, card, excitation, 150, [PotChange(60, tweak)], rng=rng)))
+    volts = np.concatenate(list(acquired(machine, card, excitation, 150, [PotTurn(60, tweak)], rng=rng)))
     fast = SuspensionComputer("front", sample_rate_hz=20e3 * count)
-    every = np.concatenate(list(fast.play(excitation, 150 * count, [PotChange(60 * count, tweak)])))
+    every = np.concatenate(list(fast.play(excitation, 150 * count, [PotTurn(60 * count, tweak)])))
     np.testing.assert_allclose(volts[:, 0], every[::count, 0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(volts[:, 1], every[1::count, 1], rtol=0, atol=1e-9)
 

@@ -19,7 +19,7 @@ from analogrig_emulator import (
     Engine,
     Excitation,
     OpAmpModel,
-    PotChange,
+    PotTurn,
     SuspensionComputer,
     piecewise_linear,
     to_spice,
@@ -31,10 +31,10 @@ Volts = NDArray[np.float64]
 LSB_V = 10.0 / 4096
 SAMPLE_RATE_HZ = 20e3
 THESIS_TWEAKS = (
-    PotChange(200, {"K_n_per_m": 18000.0}),
-    PotChange(400, {"B_n_s_per_m": 3453.0}),
-    PotChange(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotChange(600, {"M_kg": 30.0}),
+    PotTurn(200, {"K_n_per_m": 18000.0}),
+    PotTurn(400, {"B_n_s_per_m": 3453.0}),
+    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    PotTurn(600, {"M_kg": 30.0}),
 )
 AMPLIFIERS = ("u1", "u2", "u3", "u4", "u5")
 
@@ -43,13 +43,13 @@ def deck_of(
     computer: SuspensionComputer,
     excitation: Excitation,
     samples: int,
-    tweaks: Sequence[PotChange] = (),
+    tweaks: Sequence[PotTurn] = (),
 ) -> str:
     return to_spice(
         computer.circuit,
         samples=samples,
         edges={"F": excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)},
-        turns=[PotChange(change.sample, computer.dials_for(**change.values)) for change in tweaks],
+        turns=[PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks],
     )
 
 
@@ -60,7 +60,7 @@ def every_amplifier(computer: SuspensionComputer, excitation: Excitation, sample
 
 @pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("front", ()), ("shock", ())])
 def test_displacement_and_velocity_agree_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, tweaks: Sequence[PotChange]
+    ngspice: NgSpice, program: str, tweaks: Sequence[PotTurn]
 ) -> None:
     computer = SuspensionComputer(program)
     reference = ngspice(deck_of(computer, Excitation(), 800, tweaks), ("u5", "u2"), 800)
@@ -70,12 +70,12 @@ def test_displacement_and_velocity_agree_with_ngspice_at_every_sample(
 
 @pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("front", ()), ("shock", ())])
 def test_every_amplifier_agrees_with_ngspice_at_every_sample(
-    ngspice: NgSpice, program: str, tweaks: Sequence[PotChange]
+    ngspice: NgSpice, program: str, tweaks: Sequence[PotTurn]
 ) -> None:
     """The edges come between samples: at an edge's own instant ngspice still shows the level before it."""
     computer, excitation = SuspensionComputer(program), Excitation(clock="free", phase=0.637)
     reference = ngspice(deck_of(computer, excitation, 800, tweaks), AMPLIFIERS, 800)
-    turns = [PotChange(change.sample, computer.dials_for(**change.values)) for change in tweaks]
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
     volts = played_with_turns(computer.circuit, excitation, 800, turns)
     assert np.abs(volts - reference).max() < 0.05 * LSB_V
 
@@ -106,7 +106,7 @@ def test_random_machines_agree_with_ngspice_at_every_amplifier(ngspice: NgSpice,
     samples = 70
     # Not right after sample 0: ngspice has no time point between the two.
     instants = np.sort(rng.choice(np.arange(1, samples - 10), 3, replace=False)).tolist()
-    turns = [PotChange(int(instant), {str(rng.choice(["M", "B", "K"])): rng.uniform(0.1, 1.0)}) for instant in instants]
+    turns = [PotTurn(int(instant), {str(rng.choice(["M", "B", "K"])): rng.uniform(0.1, 1.0)}) for instant in instants]
     edges = excitation.edges(0, samples * TICKS_PER_SAMPLE, SAMPLE_RATE_HZ)
     deck = to_spice(computer.circuit, samples=samples, edges={"F": edges}, turns=turns)
     reference = ngspice(deck, AMPLIFIERS, samples)
@@ -146,10 +146,10 @@ def random_excitation(rng: np.random.Generator) -> Excitation:
     )
 
 
-def played_with_turns(circuit: Circuit, excitation: Excitation, samples: int, turns: Sequence[PotChange]) -> Volts:
+def played_with_turns(circuit: Circuit, excitation: Excitation, samples: int, turns: Sequence[PotTurn]) -> Volts:
     engine = Engine(piecewise_linear(circuit), AMPLIFIERS)
     blocks = []
-    for sample, dials, _ in [*turns, PotChange(samples - 1, {})]:
+    for sample, dials, _ in [*turns, PotTurn(samples - 1, {})]:
         count = sample + 1 - engine.recorded
         blocks.append(engine.run(count, {"F": excitation.edges(*engine.window(count), SAMPLE_RATE_HZ)}))
         circuit = circuit.with_dials(dials)
@@ -170,7 +170,7 @@ def test_ideal_amplifiers_can_be_exported(ngspice: NgSpice) -> None:
     [
         ({"nodes": ["nowhere"]}, "no node is called 'nowhere'"),
         ({"edges": {"G": Excitation().edges(0, 1, SAMPLE_RATE_HZ)}}, "no input is called 'G'; there are F"),
-        ({"turns": [PotChange(3, {"Q": 0.5})]}, "no pot is called 'Q'; there are B, K, M"),
+        ({"turns": [PotTurn(3, {"Q": 0.5})]}, "no pot is called 'Q'; there are B, K, M"),
     ],
 )
 def test_what_the_circuit_does_not_have_is_refused_by_name(arguments: dict[str, object], message: str) -> None:

@@ -19,8 +19,8 @@ from analogrig_emulator import (
     Excitation,
     ExcitationError,
     OpAmpModel,
-    PotChange,
     PotError,
+    PotTurn,
     Program,
     SuspensionComputer,
 )
@@ -28,21 +28,21 @@ from analogrig_emulator import (
 Volts = NDArray[np.float64]
 
 LSB_V = 10.0 / 4096
-THESIS_TWEAKS: tuple[PotChange, ...] = (
-    PotChange(200, {"K_n_per_m": 18000.0}),
-    PotChange(400, {"B_n_s_per_m": 3453.0}),
-    PotChange(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
-    PotChange(600, {"M_kg": 30.0}),
+THESIS_TWEAKS: tuple[PotTurn, ...] = (
+    PotTurn(200, {"K_n_per_m": 18000.0}),
+    PotTurn(400, {"B_n_s_per_m": 3453.0}),
+    PotTurn(500, {"B_n_s_per_m": 2123.0, "K_n_per_m": 20000.0}),
+    PotTurn(600, {"M_kg": 30.0}),
 )
 
 
 def played(
-    computer: SuspensionComputer, samples: int, tweaks: Sequence[PotChange] = (), excitation: Excitation | None = None
+    computer: SuspensionComputer, samples: int, tweaks: Sequence[PotTurn] = (), excitation: Excitation | None = None
 ) -> Volts:
     return np.concatenate(list(computer.play(excitation or Excitation(), samples, tweaks)))
 
 
-def plant(program: Program, force_n: Volts, tweaks: Sequence[PotChange] = ()) -> Volts:
+def plant(program: Program, force_n: Volts, tweaks: Sequence[PotTurn] = ()) -> Volts:
     """M x'' + B x' + K x = F with F held between samples, exactly, by scipy: x in m, v in m/s, (samples, 2)."""
     values = program.values
     turns = {change.sample: change.values for change in tweaks}
@@ -60,7 +60,7 @@ def plant(program: Program, force_n: Volts, tweaks: Sequence[PotChange] = ()) ->
 
 
 @pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
-def test_with_ideal_amplifiers_it_is_the_plant(program: str, tweaks: Sequence[PotChange]) -> None:
+def test_with_ideal_amplifiers_it_is_the_plant(program: str, tweaks: Sequence[PotTurn]) -> None:
     computer = SuspensionComputer(program, opamp="ideal")
     volts = played(computer, 800, tweaks)
     scales = computer.scales
@@ -128,16 +128,14 @@ def test_all_programs_move_as_far_for_10_v(program: str) -> None:
 def test_a_tweak_at_k_shows_first_at_the_next_sample() -> None:
     computer = SuspensionComputer("front")
     plain = played(computer, 300)
-    tweaked = played(computer, 300, [PotChange(130, {"K_n_per_m": 18000.0})])
+    tweaked = played(computer, 300, [PotTurn(130, {"K_n_per_m": 18000.0})])
     assert np.array_equal(tweaked[:131], plain[:131])
     assert abs(tweaked[131, 3] - plain[131, 3]) > 1.0
 
 
 def test_a_tweak_to_the_same_value_changes_no_bit() -> None:
     plain = played(SuspensionComputer("front"), 300)
-    same = played(
-        SuspensionComputer("front"), 300, [PotChange(123, {"M_kg": FRONT.M_kg, "K_n_per_m": FRONT.K_n_per_m})]
-    )
+    same = played(SuspensionComputer("front"), 300, [PotTurn(123, {"M_kg": FRONT.M_kg, "K_n_per_m": FRONT.K_n_per_m})])
     assert np.array_equal(plain, same)
 
 
@@ -151,7 +149,7 @@ def test_the_size_of_the_blocks_changes_no_bit(block_samples: int) -> None:
 
 
 def test_setting_a_pot_between_blocks_is_a_tweak() -> None:
-    tweaked = played(SuspensionComputer("front"), 300, [PotChange(199, {"M_kg": 30.0})])
+    tweaked = played(SuspensionComputer("front"), 300, [PotTurn(199, {"M_kg": 30.0})])
     computer = SuspensionComputer("front")
     blocks = []
     for block in computer.play(Excitation(), 300, block_samples=100):
@@ -165,7 +163,7 @@ def test_every_play_starts_from_rest_with_the_pots_where_they_were_left() -> Non
     computer = SuspensionComputer("front")
     first = played(computer, 100)
     assert np.array_equal(played(computer, 100), first)
-    played(computer, 100, [PotChange(50, {"M_kg": 60.0})])
+    played(computer, 100, [PotTurn(50, {"M_kg": 60.0})])
     assert np.array_equal(played(computer, 100), played(_set(SuspensionComputer("front"), M_kg=60.0), 100))
 
 
@@ -227,18 +225,18 @@ def test_a_setting_that_cannot_be_is_refused_and_nothing_turns(settings: dict[st
         computer.set(K_n_per_m=20000.0, **settings) if "K_n_per_m" not in settings else computer.set(**settings)
     assert computer.dials == before
     with pytest.raises(PotError, match=message):
-        computer.play(Excitation(), 100, [PotChange(10, settings)])
+        computer.play(Excitation(), 100, [PotTurn(10, settings)])
 
 
 def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
     computer = SuspensionComputer("front")
     with pytest.raises(PotError, match="change of M_kg at sample 100: the run has samples 0 to 99"):
-        computer.play(Excitation(), 100, [PotChange(100, {"M_kg": 60.0})])
+        computer.play(Excitation(), 100, [PotTurn(100, {"M_kg": 60.0})])
     for sample in (5.0, 5.5, math.nan):
         with pytest.raises(PotError, match="change of M_kg at sample .*: the run has samples 0 to 99"):
-            computer.play(Excitation(), 100, [PotChange(sample, {"M_kg": 60.0})])  # type: ignore[arg-type]
+            computer.play(Excitation(), 100, [PotTurn(sample, {"M_kg": 60.0})])  # type: ignore[arg-type]
     with pytest.raises(PotError, match=r"pots M_kg: cannot turn in 2\.5 samples"):
-        computer.play(Excitation(), 100, [PotChange(5, {"M_kg": 60.0}, 2.5)])  # type: ignore[arg-type]
+        computer.play(Excitation(), 100, [PotTurn(5, {"M_kg": 60.0}, 2.5)])  # type: ignore[arg-type]
     with pytest.raises(ExcitationError, match="half the sample rate"):
         computer.play(Excitation(frequency_hz=15e3), 100)
     with pytest.raises(EngineError, match="-1 samples"):
@@ -251,7 +249,7 @@ def test_arguments_that_cannot_be_are_refused_before_the_first_sample() -> None:
 
 
 @pytest.mark.parametrize(("program", "tweaks"), [("front", THESIS_TWEAKS), ("shock", ())])
-def test_a_healthy_play_lights_no_lamp(program: str, tweaks: Sequence[PotChange]) -> None:
+def test_a_healthy_play_lights_no_lamp(program: str, tweaks: Sequence[PotTurn]) -> None:
     computer = SuspensionComputer(program, rng=np.random.default_rng(1))
     played(computer, 800, tweaks)
     assert computer.machine.lamps == dict.fromkeys(("U1", "U2", "U3", "U4", "U5"))

@@ -18,8 +18,8 @@ from analogrig_emulator import (
     Excitation,
     OpAmp,
     OpAmpModel,
-    PotChange,
     PotError,
+    PotTurn,
     SuspensionComputer,
     TwoMassParts,
     TwoMassPlant,
@@ -45,24 +45,24 @@ QUANTITIES = (
     "tyre_velocity",
     "tyre_displacement",
 )
-TWEAKS: tuple[PotChange, ...] = (
-    PotChange(120, {"K2_n_per_m": 18000.0}),
-    PotChange(200, {"M1_kg": 14.0, "B2_n_s_per_m": 3453.0}),
-    PotChange(280, {"K1_n_per_m": 150e3, "M2_kg": 90.0}),
+TWEAKS: tuple[PotTurn, ...] = (
+    PotTurn(120, {"K2_n_per_m": 18000.0}),
+    PotTurn(200, {"M1_kg": 14.0, "B2_n_s_per_m": 3453.0}),
+    PotTurn(280, {"K1_n_per_m": 150e3, "M2_kg": 90.0}),
 )
 
 
 def deck_of(
     computer: SuspensionComputer,
-    tweaks: Sequence[PotChange] = TWEAKS,
+    tweaks: Sequence[PotTurn] = TWEAKS,
     excitation: Excitation | None = None,
 ) -> Deck:
     edges = (excitation or Excitation()).edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)
-    turns = [PotChange(change.sample, computer.dials_for(**change.values)) for change in tweaks]
+    turns = [PotTurn(change.sample, computer.dials_for(**change.values)) for change in tweaks]
     return Deck(computer.circuit, SAMPLES, RATE_HZ, {"F": edges}, turns, title="two masses")
 
 
-def by_equations(program: TwoMassProgram, tweaks: Sequence[PotChange]) -> Volts:
+def by_equations(program: TwoMassProgram, tweaks: Sequence[PotTurn]) -> Volts:
     """Equ 2.1 and 2.2 stepped exactly: (samples, quantities in the order of QUANTITIES), in V at their nodes."""
     plant, scales = program.plant, program.scales
     edges = Excitation().edges(0, SAMPLES * TICKS_PER_SAMPLE, RATE_HZ)

@@ -24,7 +24,7 @@ from analogrig.hardware.dating.two_filter import (
     join,
 )
 from analogrig.plant import Plant, SampledPlant
-from analogrig_emulator import COMPONENTS, Excitation, PotChange, SuspensionComputer
+from analogrig_emulator import COMPONENTS, Excitation, PotTurn, SuspensionComputer
 from tests.harness.dating_trials import FRONT, Trial, play, scenario_of, still
 
 N_PER_LSB, M_PER_LSB, PERIOD_S = 2940.0 / 4096, 0.1996 / 4096, 0.01
@@ -153,7 +153,7 @@ def test_interval_on_a_finer_card_allows_for_real_components() -> None:
         sample, lsb_v = 1500 + 17 * seed, 20.0 / 65536
         drawn = dataclasses.replace(COMPONENTS["polyester"], seed=seed)
         computer = SuspensionComputer("front", rng=np.random.default_rng(seed), components=drawn)
-        turned = [PotChange(sample, {"B_n_s_per_m": 2123.0}), PotChange(sample + 112, {"K_n_per_m": 20000.0})]
+        turned = [PotTurn(sample, {"B_n_s_per_m": 2123.0}), PotTurn(sample + 112, {"K_n_per_m": 20000.0})]
         blocks = list(computer.play(Excitation(low_v=0.1, high_v=9.9), 3500, turned))
         volts = np.concatenate(blocks)[:, :2]
         volts = lsb_v * np.rint(volts / lsb_v + np.random.default_rng(seed).normal(size=volts.shape))

@@ -7,7 +7,7 @@ import pytest
 
 from analogrig.hardware.instrument import DialChange
 from analogrig.hardware.simulator.computer import CHUNK_N, Amplifier, Booster, WiredComputer, Wiring
-from analogrig_emulator import EmulatorError, Excitation, PotChange
+from analogrig_emulator import EmulatorError, Excitation, PotTurn
 from tests.served.talk import front
 
 RATE_HZ = 20e3
@@ -16,7 +16,7 @@ AMPLIFIED = Excitation("square", 0.1, 9.9, 100.0, clock="free")
 ROUNDING_V = 1e-9
 
 
-def played(samples: int, tweaks: tuple[PotChange, ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
+def played(samples: int, tweaks: tuple[PotTurn, ...] = (), rate_hz: float = RATE_HZ) -> np.ndarray:
     """Force and displacement of the emulator itself."""
     return np.concatenate(list(front(rate_hz).play(AMPLIFIED, samples, tweaks)))[:, :2]
 
@@ -44,7 +44,7 @@ def test_scheduled_changes_are_made_in_order_of_time_after_the_point_at_or_befor
     computer.schedule(
         [DialChange(900 / RATE_HZ, "B", 0.8), DialChange(300 / RATE_HZ, "K", 0.6), DialChange(1e3, "M", 0.1)]
     )
-    tweaks = (PotChange(300, {"K_dial": 0.6}), PotChange(900, {"B_dial": 0.8}))
+    tweaks = (PotTurn(300, {"K_dial": 0.6}), PotTurn(900, {"B_dial": 0.8}))
     assert np.abs(computer.run(1500) - played(1500, tweaks)).max() < ROUNDING_V
 
 
@@ -55,7 +55,7 @@ def test_pot_set_at_once_stays_there() -> None:
     computer.turn("K", 0.6)
     assert computer.dials["K"] == pytest.approx(0.6, abs=1e-3)
     assert (
-        np.abs(np.concatenate((first, computer.run(500))) - played(1000, (PotChange(499, {"K_dial": 0.6}),))).max()
+        np.abs(np.concatenate((first, computer.run(500))) - played(1000, (PotTurn(499, {"K_dial": 0.6}),))).max()
         < ROUNDING_V
     )
 
@@ -96,7 +96,7 @@ def test_another_rate_keeps_generator_pots_and_schedule() -> None:
     computer.schedule([DialChange(0.04, "K", 0.6)])
     computer.run(250)  # into the second period
     computer.set_rate(2 * RATE_HZ)
-    tweaks = (PotChange(0, {"B_dial": 0.8}), PotChange(1600, {"K_dial": 0.6}))
+    tweaks = (PotTurn(0, {"B_dial": 0.8}), PotTurn(1600, {"K_dial": 0.6}))
     expected = played(4500, tweaks, 2 * RATE_HZ)[500:]
     seen = computer.run(4000)
     assert np.array_equal(seen[:, 0], expected[:, 0])

@@ -14,7 +14,7 @@ from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
 from analogrig.hardware.simulator.inputs import InputFaults
 from analogrig.hardware.simulator.red_pitaya import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
 from analogrig.hardware.simulator.scpi import DropOut, Interpreter
-from analogrig_emulator import Excitation, PotChange, SuspensionComputer
+from analogrig_emulator import Excitation, PotTurn, SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 
 LSB_V = 40.0 / 2**14
@@ -28,7 +28,7 @@ RATE_HZ = 20e3
 
 def played(
     samples: int = BUFFER_N,
-    tweaks: tuple[PotChange, ...] = (),
+    tweaks: tuple[PotTurn, ...] = (),
     *,
     per_sample: int = 1,
     excitation: Excitation = EXCITATION,
@@ -298,7 +298,7 @@ def test_scheduled_changes_follow_each_trigger_of_the_generator(ask: Ask) -> Non
     say(ask, ["POT:SCHedule 3,0.638,0.1", "POT:SCH 2,0.8152,0.3"])
     say(ask, POINT_SAMPLES)
     assert ask("POT:SCH:COUN?") == "2"
-    tweaks = (PotChange(2000, {"K_dial": 0.638}), PotChange(6000, {"B_dial": 0.8152}))
+    tweaks = (PotTurn(2000, {"K_dial": 0.638}), PotTurn(6000, {"B_dial": 0.8152}))
     assert np.abs(record(ask) - played(tweaks=tweaks)).max() < ROUNDED_V
     say(ask, ["POT:SCHedule:CLEar"])
     assert ask("POT:SCH:COUN?") == "0"
@@ -441,5 +441,5 @@ def test_record_in_real_time_takes_its_time_and_shows_a_pot_set_meanwhile() -> N
     assert ask("ACQ:TRig:FILL?") == "0"
     hands.now_s = (BUFFER_N + 0.5) / RATE_HZ
     assert ask("ACQ:TRig:FILL?") == "1"
-    looks = played(tweaks=(PotChange(8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
+    looks = played(tweaks=(PotTurn(8 * 2000 - 1, {"K_dial": 0.6}),), per_sample=8)
     assert np.abs(record(ask) - looks[::8]).max() < ROUNDED_V

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.card.sampler import Card
-from analogrig_emulator.circuit.pot import PotChange
+from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine.system import Edges
 from analogrig_emulator.errors import SamplerError
 
@@ -41,7 +41,7 @@ class Playable(Protocol):
         self,
         excitation: Excitation,
         samples: int,
-        changes: Sequence[PotChange] = ...,
+        changes: Sequence[PotTurn] = ...,
         block_samples: int = ...,
     ) -> Iterator[NDArray[np.float64]]: ...
 
@@ -65,7 +65,7 @@ def acquired(
     card: Card,
     excitation: Excitation,
     samples: int,
-    changes: Sequence[PotChange] = (),
+    changes: Sequence[PotTurn] = (),
     *,
     rng: np.random.Generator,
     block_samples: int = 256,
@@ -83,7 +83,7 @@ def acquired(
         return machine.play(excitation, samples, changes, block_samples)
     clock_hz = card.rate_hz if excitation.clock == "card" else card.true_rate_hz
     slow = _OnCardClock(**dataclasses.asdict(excitation), probes=count, clock_hz=clock_hz)
-    slow_changes = [PotChange(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
+    slow_changes = [PotTurn(k * count, values, ramp_n * count) for k, values, ramp_n in changes]
     probed = machine.play(slow, samples * count, slow_changes, block_samples * count)
     return _take_samples(probed, card, count, rng)
 

@@ -27,8 +27,8 @@ END_FRACTION = 1e-6
 """Part of the track between wiper and terminal at an end stop, so that no leg is a short circuit."""
 
 
-class PotChange(NamedTuple):
-    """Values that pots take from a sample on: at once, or evenly over ramp_n samples.
+class PotTurn(NamedTuple):
+    """Settings that the pots of a machine take from a sample on: at once, or evenly over ramp_n samples.
 
     sample: last sample before the change; sample + 1 is the first that can show it. values: by setting of
     SuspensionComputer.set where a program is played, dials (0..1) by pot where a circuit is.

@@ -33,7 +33,7 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.nodal import Nodal
 from analogrig_emulator.circuit.opamp import CLAMP_RATE
-from analogrig_emulator.circuit.pot import END_FRACTION, PotChange
+from analogrig_emulator.circuit.pot import END_FRACTION, PotTurn
 from analogrig_emulator.engine.engine import Engine
 from analogrig_emulator.engine.system import TICKS_PER_SAMPLE, Edges
 from analogrig_emulator.errors import CircuitError
@@ -119,7 +119,7 @@ class Deck:
     samples: int = 0
     sample_rate_hz: float = 20e3
     edges: Mapping[str, Edges] = field(default_factory=dict)
-    turns: Sequence[PotChange] = ()
+    turns: Sequence[PotTurn] = ()
     initial_v: Mapping[str, float] = field(default_factory=dict)
     title: str = "analogue computer"
 
@@ -145,7 +145,7 @@ class Deck:
         engine = Engine(system, self.circuit.nodes if nodes is None else nodes, self.sample_rate_hz)
         engine.state = np.array([self.initial_v.get(state, 0.0) for state in system.states])
         stretches = []
-        for change in [*sorted(self.turns, key=lambda change: change.sample), PotChange(self.samples - 1, {})]:
+        for change in [*sorted(self.turns, key=lambda change: change.sample), PotTurn(self.samples - 1, {})]:
             samples = change.sample + 1 - engine.recorded
             if samples > 0:
                 window = engine.window(samples)
@@ -226,7 +226,7 @@ class _DeckWriter:
         else:
             yield f"{head} DC {_number(level)}"
 
-    def _turned_pot(self, card: str, pot: Pot, turns: Sequence[PotChange]) -> Iterator[str]:
+    def _turned_pot(self, card: str, pot: Pot, turns: Sequence[PotTurn]) -> Iterator[str]:
         dial = self._free(f"dial_{pot.name}")
         times_s = np.array([0.0] + [turn.sample * self._period_s for turn in turns])
         dials = np.array([pot.dial] + [turn.values[pot.name] for turn in turns])

@@ -25,7 +25,7 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import GROUND, Circuit, OpAmp, Pot, Resistor
 from analogrig_emulator.circuit.components import REFERENCE_C, OpAmpGrade
 from analogrig_emulator.circuit.nodal import Nodal
-from analogrig_emulator.circuit.pot import PotChange, legs_ohm
+from analogrig_emulator.circuit.pot import PotTurn, legs_ohm
 from analogrig_emulator.engine import library
 from analogrig_emulator.engine.system import PiecewiseLinear
 from analogrig_emulator.errors import CircuitError
@@ -125,7 +125,7 @@ class NoisySuspension:
         self,
         excitation: Excitation,
         samples: int,
-        changes: Sequence[PotChange] = (),
+        changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[Matrix]:
         """Play like SuspensionComputer.play. The noise ignores set() between blocks, and follows a ramp at its end."""

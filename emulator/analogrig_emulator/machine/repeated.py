@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import OpAmp
 from analogrig_emulator.circuit.nodal import Nodal
-from analogrig_emulator.circuit.pot import PotChange
+from analogrig_emulator.circuit.pot import PotTurn
 from analogrig_emulator.engine.engine import CircuitSchedule, Engine
 from analogrig_emulator.machine.machine import lamp_samples
 from analogrig_emulator.machine.program import SOURCE
@@ -29,7 +29,7 @@ class Repeat(NamedTuple):
     lamps: Mapping[str, int | None]
 
 
-def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotChange]) -> bool:
+def is_repeatable(computer: SuspensionComputer, changes: Sequence[PotTurn]) -> bool:
     """True if RepeatedPlay accepts it: no ramps, and op-amps whose offsets enter nothing but their own drives."""
     has_ramps = any(change.ramp_n for change in changes)
     return not has_ramps and all(amp.model.has_state for amp in computer.circuit.of(OpAmp))
@@ -41,7 +41,7 @@ class RepeatedPlay:
     The computer does not change. Raises PotError for impossible changes, CircuitError unless is_repeatable().
     """
 
-    def __init__(self, computer: SuspensionComputer, samples: int, changes: Sequence[PotChange] = ()) -> None:
+    def __init__(self, computer: SuspensionComputer, samples: int, changes: Sequence[PotTurn] = ()) -> None:
         turns = computer.plan(changes, samples)
         nodal, dials = Nodal(computer.circuit), dict(computer.dials)
         solved = [nodal.with_trim(dials)]

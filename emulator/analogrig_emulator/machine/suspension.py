@@ -14,7 +14,7 @@ from analogrig_emulator.card.excitation import Excitation
 from analogrig_emulator.circuit.circuit import Circuit, Pot, Resistor
 from analogrig_emulator.circuit.components import NOMINAL, Components
 from analogrig_emulator.circuit.opamp import OpAmpModel, preset
-from analogrig_emulator.circuit.pot import PotChange, PotModel, check_dial, check_ramp
+from analogrig_emulator.circuit.pot import PotModel, PotTurn, check_dial, check_ramp
 from analogrig_emulator.engine.system import Edges, is_integer
 from analogrig_emulator.errors import CircuitError, EngineError, PotError
 from analogrig_emulator.machine.machine import AnalogComputer, Mode
@@ -101,7 +101,7 @@ class SuspensionComputer:
         """Dials to which set(**settings) turns the pots."""
         return self.machine.resting(self._resolve(settings))
 
-    def plan(self, changes: Sequence[PotChange], samples: int) -> list[PotChange]:
+    def plan(self, changes: Sequence[PotTurn], samples: int) -> list[PotTurn]:
         """Dials by pot that play(..., samples, changes) sets, in order of time. Raises PotError."""
         planned = []
         for sample, settings, ramp_n in sorted(changes, key=lambda change: change.sample):
@@ -109,14 +109,14 @@ class SuspensionComputer:
                 raise PotError(
                     f"change of {', '.join(settings)} at sample {sample!r}: the run has samples 0 to {samples - 1}"
                 )
-            planned.append(PotChange(sample, self.dials_for(**settings), check_ramp(ramp_n, settings)))
+            planned.append(PotTurn(sample, self.dials_for(**settings), check_ramp(ramp_n, settings)))
         return planned
 
     def play(
         self,
         excitation: Excitation,
         samples: int,
-        changes: Sequence[PotChange] = (),
+        changes: Sequence[PotTurn] = (),
         block_samples: int = BLOCK_SAMPLES,
     ) -> Iterator[NDArray[np.float64]]:
         """Play from rest; yield the volts of CHANNELS in blocks: float64 (block_samples or, last, fewer; 4).
@@ -136,7 +136,7 @@ class SuspensionComputer:
     # ---- playing
 
     def _blocks(
-        self, play: int, excitation: Excitation, samples: int, turns: list[PotChange], block_samples: int
+        self, play: int, excitation: Excitation, samples: int, turns: list[PotTurn], block_samples: int
     ) -> Iterator[NDArray[np.float64]]:
         for start in range(0, samples, block_samples):
             stop = min(start + block_samples, samples)

@@ -6,7 +6,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
-from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotChange
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotTurn
 
 
 def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
@@ -28,16 +28,16 @@ def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
     )
 
 
-def _dial_changes(setup: SetUp, samples: int) -> list[PotChange]:
+def _dial_changes(setup: SetUp, samples: int) -> list[PotTurn]:
     """Dials after each sample at which one moves. A ramp becomes one step a sample, to the middle of its period."""
     dials = setup.computer.dials
-    turns: list[PotChange] = []
+    turns: list[PotTurn] = []
     for sample, goals, ramp_n in setup.computer.plan(setup.changes, samples):
         for k in range(min(ramp_n, samples - sample)):
             part = (k + 0.5) / ramp_n
             between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}
-            turns.append(PotChange(sample + k, setup.computer.machine.resting(between)))
+            turns.append(PotTurn(sample + k, setup.computer.machine.resting(between)))
         if sample + ramp_n < samples:
-            turns.append(PotChange(sample + ramp_n, goals))
+            turns.append(PotTurn(sample + ramp_n, goals))
         dials |= goals
     return turns

@@ -34,7 +34,7 @@ from analogrig_emulator import (
     OpAmp,
     OpAmpGrade,
     Pot,
-    PotChange,
+    PotTurn,
     RepeatedPlay,
     Resistor,
     Sampler,
@@ -261,7 +261,7 @@ class SetUp(NamedTuple):
 
     computer: SuspensionComputer
     excitation: Excitation
-    changes: tuple[PotChange, ...]
+    changes: tuple[PotTurn, ...]
 
 
 class _Prepared(NamedTuple):
@@ -317,12 +317,12 @@ class EmulatorRig(Rig):
         with emulator_errors(f"scenario {scenario.name}: "):
             computer = self._computer(scenario, seed)
             excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
-        changes: list[PotChange] = []
+        changes: list[PotTurn] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
                 settings = self._settings(computer, tweak.overrides())
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
-            changes.append(PotChange(tweak.sample, settings, tweak.ramp_n))
+            changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
 
     def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
