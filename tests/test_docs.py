@@ -18,7 +18,7 @@ from analogrig import cli, config
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.devices.registry import from_table
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.hardware.simulator.rig import ServedDescription
+from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.hardware.wiring import RealDescription
 from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues

@@ -16,11 +16,11 @@ from analogrig.hardware.instrument import DRIVERS, DialChange, InputRecord, Inst
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.scpi_connection import ScpiConnection
-from analogrig.hardware.simulator.acquisition import AcquisitionFaults
 from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
 from analogrig.hardware.simulator.inputs import InputFaults
-from analogrig.hardware.simulator.red_pitaya import InstrumentDescription, ServedRedPitaya
+from analogrig.hardware.simulator.records import AcquisitionFaults
 from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import Excitation, SuspensionComputer, preset
 from tests.harness.ni_stand_in import Card, library
 

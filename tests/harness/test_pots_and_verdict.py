@@ -1,9 +1,10 @@
-"""Pots set by a command at unknown instants, up to the verdict: a real process, an emulated computer."""
+"""Pots set by a user's command while a record is taken, up to the verdict; the harness dates the changes."""
 
 from __future__ import annotations
 
 import dataclasses
 import stat
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from analogrig.run import Run
 from analogrig.scenario import PotChange as Asked
 from analogrig.scenario import Scenario
 from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
+from tests.harness.allowed import open_allowed
+from tests.harness.served import served
 
 SAMPLES, ASKED_AT = 10_000, 3000
 INSTANTS = (3215, 3311)
@@ -138,3 +141,51 @@ def test_change_that_a_command_did_not_make_is_not_judged(program: Path) -> None
     assert verdict.tweaks[0].result == "not judged"
     assert verdict.outcome != "passed"
     assert "shows that the plant has changed" in verdict.reasons[-1]
+
+
+def test_command_that_fails_makes_the_run_inconclusive(program: Path) -> None:
+    program.write_text("#!/bin/sh\necho no box at this address\nexit 1\n")
+    verdict = judge(played(program, Asked(ASKED_AT, stiffness_n_per_m=18000.0)))
+    assert verdict.outcome == "inconclusive"
+    assert "ended with status 1, output: no box at this address" in verdict.reasons[0]
+
+
+# ---- in real time, on a box of pots in the network
+
+
+PROGRAM = """\
+import socket, sys
+address, pot, dial = sys.argv[1:]
+host, _, port = address.rpartition(":")
+with socket.create_connection((host, int(port))) as connection:
+    lines = connection.makefile("rwb")
+    lines.write(b"POT:CATalog?\\r\\n"); lines.flush()
+    number = lines.readline().decode().strip().split(",").index(pot) + 1
+    lines.write(f"POT{number}:DIAL {dial}\\r\\nPOT{number}:DIAL?\\r\\n".encode()); lines.flush()
+    assert abs(float(lines.readline()) - float(dial)) < 1e-3
+"""
+"""Program of a user with a box of digital pots on the network."""
+
+
+def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> None:
+    tweaks = (Asked(4000, stiffness_n_per_m=18000.0), Asked(11_000, damping_n_s_per_m=2200.0))
+    scenario = dataclasses.replace(Scenario.load("thesis"), samples=16_000, tweaks=tweaks)
+    script = tmp_path / "turn.py"
+    script.write_text(PROGRAM)
+    with served("--rig", "emulator-real", "--real-time") as instrument:
+        file = instrument.rigs_file(tmp_path)
+        arguments = [sys.executable, str(script), instrument.address, "{pot}", "{dial}"]
+        pots = f'pots.kind = "command"\npots.arguments = {arguments}'
+        file.write_text(file.read_text().replace('pots.kind = "instrument"', pots))
+        with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
+            run = Bench(rig, dut).play(scenario, 1)
+    changes = run.conditions.segments[1:]
+    assert [change.plant for change in changes] == [each.plant for each in scenario.segments()[1:]]
+    for tweak, change in zip(tweaks, changes, strict=True):
+        assert change.start_low is not None
+        assert change.start_high is not None
+        assert tweak.sample < change.start_low <= change.start <= change.start_high  # the program takes its time
+        assert change.start_high - change.start_low < 100
+        noticed = run.alarm_index[run.alarm_index >= change.start_low]
+        assert noticed[0] - change.start < 100, "the device has noticed another change than the harness has"
+    assert judge(run).outcome == "passed", judge(run).reasons

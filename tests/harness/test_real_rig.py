@@ -20,8 +20,7 @@ from analogrig.bench import Bench
 from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
 from analogrig.hardware.instrument import DialChange, PotBox
-from analogrig.hardware.plan import LEAD_N, split_records
-from analogrig.hardware.real import RealRig
+from analogrig.hardware.real import LEAD_N, RealRig, split_records
 from analogrig.hardware.red_pitaya import RedPitaya
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.verdict import judge
@@ -327,6 +326,7 @@ def test_interrupted_run_leaves_the_generator_off(number: signal.Signals, tmp_pa
     silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
     with served(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
+        file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 10.0"))
         command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
         with subprocess.Popen(
             [*command, "--rig", str(file), "--allow", instrument.address],

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.hardware.simulator.red_pitaya import InstrumentDescription, ServedRedPitaya
 from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import SuspensionComputer
 
 SEQUENCE = (

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.hardware.simulator.acquisition import BUFFER_N, MIDDLE_N, AcquisitionFaults
 from analogrig.hardware.simulator.computer import Amplifier, Booster, Wiring
 from analogrig.hardware.simulator.inputs import InputFaults
-from analogrig.hardware.simulator.red_pitaya import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
+from analogrig.hardware.simulator.records import BUFFER_N, MIDDLE_N, AcquisitionFaults
 from analogrig.hardware.simulator.scpi import DropOut, Interpreter
+from analogrig.hardware.simulator.served import MOST_SCHEDULED, InstrumentDescription, ServedRedPitaya
 from analogrig_emulator import Excitation, PotTurn, SuspensionComputer
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, Ask, asking, front, interpreter, numbers, record, say
 

@@ -14,8 +14,8 @@ import pytest
 import pyvisa
 
 from analogrig.cli import main
-from analogrig.hardware.simulator.rig import ServedDescription
 from analogrig.hardware.simulator.scpi import Interpreter
+from analogrig.hardware.simulator.served import ServedDescription
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
@@ -105,8 +105,8 @@ def test_faults_of_the_card_are_added_to_the_instrument_and_others_are_named() -
     inputs = description.combined_instrument().inputs
     assert inputs.skew_s == pytest.approx(12e-6)
     assert inputs.noise_v == pytest.approx((12 / 4096, np.hypot(10 / 4096, 0.004)))
-    assert description.left_out == ()
-    assert "card.levels_lsb" in ServedDescription.load("emulator-real").left_out
+    assert description.unsupported == ()
+    assert "card.levels_lsb" in ServedDescription.load("emulator-real").unsupported
 
 
 # ---- the command

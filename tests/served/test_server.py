@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.hardware.simulator.acquisition import AcquisitionFaults
-from analogrig.hardware.simulator.red_pitaya import InstrumentDescription, ServedRedPitaya
+from analogrig.hardware.simulator.records import AcquisitionFaults
 from analogrig.hardware.simulator.scpi import Call, Command, Response
+from analogrig.hardware.simulator.served import InstrumentDescription, ServedRedPitaya
 from analogrig.hardware.simulator.server import BUFFERED_BYTES, MOST_CLIENTS, Servable, Server
 from tests.harness.processes import LONG_S
 from tests.served.talk import SEQUENCE, front

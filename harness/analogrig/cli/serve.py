@@ -72,15 +72,15 @@ def port(text: str) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from analogrig.hardware.simulator.rig import ServedDescription
+    from analogrig.hardware.simulator.served import ServedDescription
     from analogrig.hardware.simulator.server import Server
     from analogrig.scenario import DEFAULT_SEED
 
     drawn_from = DEFAULT_SEED if arguments.seed is None else arguments.seed
     described = ServedDescription.load(arguments.rig, arguments.defect)
     server = Server(described.set_up(arguments.plant, drawn_from, time.monotonic if arguments.real_time else None))
-    if described.left_out:
-        complain(f"{described.name}: the instrument has no {', '.join(described.left_out)}", PASSED)
+    if described.unsupported:
+        complain(f"{described.name}: the instrument has no {', '.join(described.unsupported)}", PASSED)
     names = {"rig": described.name, "plant": arguments.plant, "seed": drawn_from}
     return asyncio.run(_serve(server, arguments, names))
 

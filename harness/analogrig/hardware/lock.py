@@ -37,12 +37,12 @@ def lock_instrument(url: str) -> Iterator[None]:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise RigClosed(f"instrument {url}: in use by another process or rig on this machine") from error
-        with _handled_signals():
+        with _exit_at_signals():
             yield
 
 
 @contextlib.contextmanager
-def _handled_signals() -> Iterator[None]:
+def _exit_at_signals() -> Iterator[None]:
     """Exit in good order at signals that have no handler yet; in the main thread only, as Python requires."""
     is_main = threading.current_thread() is threading.main_thread()
     free = [number for number in _ENDING if is_main and signal.getsignal(number) is signal.SIG_DFL]

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from analogrig.errors import ConfigurationError, RecordStale, RigError, SelfTestError
@@ -20,21 +22,40 @@ from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradiction
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
-from analogrig.hardware.plan import Planner, PlayPlan, split_records
 from analogrig.hardware.self_test.conduct import self_test
-from analogrig.hardware.wiring import RealDescription
+from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant
+from analogrig.rigs.emulator import Stream, emulator_errors, settings_of
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
-from analogrig.run import MEASURED
+from analogrig.run import MEASURED, Segment
 from analogrig.scenario import Scenario
+from analogrig_emulator import Excitation, SuspensionComputer
 
 SELF_TEST_SEED = 0
+
+LEAD_N = 500
+"""Least number of samples in a record before a change, in which the device learns the plant."""
 
 _AFTER_N = 0.05
 """Delay of a scheduled pot change after its sample, in samples."""
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PlayPlan:
+    """A checked scenario, and what its play has shown so far."""
+
+    computer: SuspensionComputer
+    """Nominal computer with the pots of the first sample."""
+    excitation: Excitation
+    """Waveform at the computer."""
+    changes: tuple[PlannedChange, ...]
+    contradictions: list[str]
+    """Evidence of the samples against the instants of the instrument's own pots."""
+    dated: list[Segment] | None
+    """Segments dated by the samples; None if the instrument's instants are exact."""
 
 
 class RealRig(Rig):
@@ -47,7 +68,7 @@ class RealRig(Rig):
         """
         self.capabilities = frozenset({"excite", "tweak"} if description.pots.changeable else {"excite"})
         kind, self._address = find_driver(description.instrument)
-        self._planner = Planner(description, kind)
+        check_wiring(description)
         self._datasheet = kind.datasheet
         self._description = description
         self._connect = connect or kind.open
@@ -67,16 +88,62 @@ class RealRig(Rig):
 
     def perform(self, scenario: Scenario, seed: int) -> Performance:
         """Begin to play, as Rig.perform. The first play begins with the self-test, whose findings are caveats."""
-        plan = self._planner.plan(scenario, seed)
+        plan = self._plan(scenario, seed)
         return Performance(
             sample_period_s=1.0 / self._datasheet.rate_hz,
-            time_scale=self._planner.time_scale(plan.computer),
-            channels=self._planner.channels(plan.computer, self._noise_lsb),
+            time_scale=self._description.time_scale(plan.computer),
+            channels=self._description.channels(plan.computer, self._noise_lsb),
             blocks=self._blocks(scenario, plan),
             hindsight=lambda: Hindsight(
-                plan.truth(), caveats=(*(self._caveats or ()), *plan.contradictions), noise_lsb=self._noise_lsb
+                segments=scenario.segments() if plan.dated is None else tuple(plan.dated),
+                caveats=(*(self._caveats or ()), *plan.contradictions),
+                noise_lsb=self._noise_lsb,
             ),
         )
+
+    # ---- before it plays
+
+    def _plan(self, scenario: Scenario, seed: int) -> PlayPlan:
+        """:raises ConfigurationError: the rig cannot play the scenario, or it would exceed the limits."""
+        description, where = self._description, f"scenario {scenario.name}: "
+        if scenario.plant.set != description.plant:
+            raise ConfigurationError(
+                f"{where}wants the program {scenario.plant.set!r}; {description.name or 'the rig'} has"
+                f" {description.plant!r} patched"
+            )
+        computer = SuspensionComputer(scenario.plant.set)
+        with emulator_errors(where):
+            computer.set(**settings_of(computer, scenario.plant.overrides()))
+            excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
+        self._check_force(excitation, where)
+        description.check_dials(computer.dials, where)
+        changes: list[PlannedChange] = []
+        plant = scenario.plant.plant()
+        for i, tweak in enumerate(scenario.tweaks):
+            place = f"{where}tweaks[{i}] at sample {tweak.sample}: "
+            if not description.pots.changeable:
+                raise ConfigurationError(f'{place}the pots of this rig cannot be changed: they have kind = "none"')
+            if tweak.ramp_n:
+                raise ConfigurationError(f"{place}the pots of this rig jump, they do not turn evenly: leave out ramp_n")
+            with emulator_errors(place):
+                dials = computer.dials_for(**settings_of(computer, tweak.overrides()))
+            description.check_dials(dials, place)
+            before, plant = plant, dataclasses.replace(plant, **tweak.overrides())
+            changes.append(PlannedChange(tweak.sample, dials, before, plant))
+        dated = None if description.pots.exact else [Segment(0, scenario.plant.plant())]
+        return PlayPlan(computer, excitation, tuple(changes), [], dated)
+
+    def _check_force(self, excitation: Excitation, where: str) -> None:
+        low_v, high_v = self._description.limits.force_v
+        if excitation.low_v < low_v or excitation.high_v > high_v:
+            raise ConfigurationError(
+                f"{where}the force of {excitation.low_v:g} V to {excitation.high_v:g} V exceeds limits.force_v,"
+                f" {low_v:g} V to {high_v:g} V"
+            )
+        try:
+            self._description.driver.check(self._description.at_generator(excitation))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}{error}") from error
 
     # ---- while it plays
 
@@ -86,21 +153,21 @@ class RealRig(Rig):
         instrument, pots = self._open()
         inputs = [self._description.inputs[name] for name in MEASURED]
         instrument.set_inputs([(each.input, each.range) for each in inputs])
-        instrument.set_excitation(self._planner.at_generator(plan.excitation))
-        channels = self._planner.channels(plan.computer, self._noise_lsb)
-        period_s = self._planner.time_scale(plan.computer) / self._datasheet.rate_hz
+        instrument.set_excitation(self._description.at_generator(plan.excitation))
+        channels = self._description.channels(plan.computer, self._noise_lsb)
+        period_s = self._description.time_scale(plan.computer) / self._datasheet.rate_hz
         cuts = split_records(scenario.samples, self._datasheet.record_n, [change.sample for change in plan.changes])
         dials, plant = dict(plan.computer.dials), scenario.plant.plant()
         for record, (start, end) in enumerate(cuts):
             changes = [dataclasses.replace(c, sample=c.sample - start) for c in plan.changes if start <= c.sample < end]
-            with self._left_safe(instrument):
+            with self._leave_safe(instrument):
                 self._settle(instrument, pots, dials, plant)
                 self._standing = {}  # unknown unless the record is completed
                 taken, by_hand = self._record(instrument, pots, end - start, changes)
             for change in changes:
                 dials, plant = {**dials, **change.dials}, change.after
             self._standing = dials
-            volts, codes, clipped = self._planner.convert(taken, channels)
+            volts, codes, clipped = self._description.convert(taken, channels)
             measured = Signals.of(codes, clipped, channels, period_s)
             if plan.dated is not None:
                 plan.dated.extend(by_hand.date(measured, start))
@@ -137,18 +204,16 @@ class RealRig(Rig):
         return taken, by_hand
 
     @contextlib.contextmanager
-    def _left_safe(self, instrument: Instrument) -> Iterator[None]:
+    def _leave_safe(self, instrument: Instrument) -> Iterator[None]:
         """Make the instrument safe after the block, however it ends; add a failure to do so to the block's error."""
         try:
             yield
-        except RigError as error:
+        except BaseException as error:
             warning = _switch_off(instrument)
             self._disconnect()  # a late answer would be taken for that to a later query
-            if warning:
+            if warning and isinstance(error, RigError):
                 raise type(error)(f"{error}; {warning}") from error
-            raise
-        except BaseException:
-            _log_warning(_switch_off(instrument))
+            _log_warning(warning)
             raise
         instrument.make_safe()
 
@@ -229,3 +294,18 @@ def _switch_off(instrument: Instrument) -> str:
 def _log_warning(warning: str) -> None:
     if warning:
         _log.warning("%s", warning)
+
+
+def split_records(samples: int, most_n: int, changes: list[int]) -> list[tuple[int, int]]:
+    """Divide samples into as few records (start, end) as possible, none longer than ``most_n``.
+
+    Where possible, a record starts LEAD_N samples or more before a change.
+    """
+    cuts = [0]
+    while samples - cuts[-1] > most_n:
+        start, end = cuts[-1], cuts[-1] + most_n
+        for change in sorted(changes, reverse=True):
+            if start + LEAD_N < change - LEAD_N < end <= change + LEAD_N:
+                end = change - LEAD_N
+        cuts.append(end)
+    return list(itertools.pairwise([*cuts, samples]))

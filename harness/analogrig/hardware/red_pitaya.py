@@ -1,7 +1,7 @@
 """Driver of a Red Pitaya STEMlab 125-14 through its SCPI server: generator OUT1, inputs IN1 and IN2, 20 kS/s.
 
 Commands and their order follow https://redpitaya.readthedocs.io (OS 2.0). A box of digital pots on the same server
-(``POT:...``, harness/analogrig/hardware/simulator/red_pitaya.py) is used if there is one.
+(``POT:...``, harness/analogrig/hardware/simulator/served.py) is used if there is one.
 """
 
 from __future__ import annotations

@@ -49,27 +49,19 @@ class ScpiConnection:
 
     def next_line(self, query: str) -> str:
         """Next line of the answer to ``query``, without its end."""
-        end = self._until(lambda: self._input.find(b"\n"), query)
-        line = bytes(self._input[:end]).rstrip(b"\r")
-        del self._input[: end + 1]
+        line = self._receive(lambda: self._input.find(b"\n") + 1 or None, query).rstrip(b"\r\n")
         return "".join(character if character.isprintable() else "?" for character in line.decode("ascii", "replace"))
 
     def ask_block(self, query: str) -> bytes:
         """Send a query. Return the content of the definite-length block (IEEE 488.2, 8.7.9) that answers it."""
         self.send(query)
-        self._need(2, query)
-        head = bytes(self._input[:2])
+        head = self._take(2, query)
         if head[:1] != b"#" or not head[1:].isdigit() or head == b"#0":
             raise RigError(f"instrument {self.name}: {query}: expected a block, received {head!r}")
-        digits = int(head[1:])
-        self._need(2 + digits, query)
-        length = bytes(self._input[2 : 2 + digits])
+        length = self._take(int(head[1:]), query)
         if not length.isdigit() or int(length) > _MOST_ANSWER_BYTES:
             raise RigError(f"instrument {self.name}: {query}: invalid block length {length!r}")
-        start, end = 2 + digits, 2 + digits + int(length)
-        self._need(end, query)
-        content = bytes(self._input[start:end])
-        del self._input[:end]
+        content = self._take(int(length), query)
         self.next_line(query)
         return content
 
@@ -84,13 +76,13 @@ class ScpiConnection:
         with contextlib.suppress(OSError):
             self._socket.close()
 
-    def _need(self, count: int, query: str) -> None:
-        self._until(lambda: count if len(self._input) >= count else -1, query)
+    def _take(self, count: int, query: str) -> bytes:
+        return self._receive(lambda: count if len(self._input) >= count else None, query)
 
-    def _until(self, found: Callable[[], int], query: str) -> int:
-        """Receive until ``found`` returns an index, at most for the time-out. Return that index."""
+    def _receive(self, available: Callable[[], int | None], query: str) -> bytes:
+        """Receive until ``available`` returns a number of bytes, at most for the time-out. Return and forget these."""
         deadline_s = self._clock() + self._timeout_s
-        while (at := found()) < 0:
+        while (count := available()) is None:
             if len(self._input) > 2 * _MOST_ANSWER_BYTES:
                 raise RigError(f"instrument {self.name}: {query}: the answer has no end")
             left_s = deadline_s - self._clock()
@@ -108,4 +100,6 @@ class ScpiConnection:
             if not received:
                 raise RigClosed(f"instrument {self.name}: connection closed at {query}")
             self._input += received
-        return at
+        taken = bytes(self._input[:count])
+        del self._input[:count]
+        return taken

@@ -1,22 +1,27 @@
-"""Descriptions of real rigs: the tables of a rigs file, and the check for contradictions."""
+"""Descriptions of real rigs: tables of a rigs file, the check for contradictions, and conversions by the wiring."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import Datasheet, find_driver
+from analogrig.hardware.instrument import Datasheet, InputRecord, Instrument, find_driver
 from analogrig.hardware.pots import PotsDescription
-from analogrig.rigs.rig import Rig, RigDescription
-from analogrig.run import MEASURED
+from analogrig.rigs.rig import CHANNEL_UNITS, Rig, RigDescription
+from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.trust import Thing
-from analogrig_emulator import SuspensionComputer
+from analogrig_emulator import Excitation, SuspensionComputer
 
+_MOST_CODE = 0xFFFF
 _MOST_GAIN, _MOST_OFFSET_V, _MOST_VOLTS = 1e4, 100.0, 1e3
 
 
@@ -130,6 +135,14 @@ class RealDescription(RigDescription):
         check_range(self, "timeout_s", 0.01, 3600.0)
 
     @property
+    def driver(self) -> type[Instrument]:
+        """Driver of the instrument.
+
+        :raises ConfigurationError: the URL of the instrument is wrong.
+        """
+        return find_driver(self.instrument)[0]
+
+    @property
     def pot_names(self) -> tuple[str, ...]:
         """Names of the pots of the program."""
         return tuple(SuspensionComputer(self.plant).dials)
@@ -155,12 +168,77 @@ class RealDescription(RigDescription):
 
         return RealRig(dataclasses.replace(self, self_test=self.self_test and self_test))
 
+    def at_generator(self, excitation: Excitation) -> Excitation:
+        """Waveform at the instrument that becomes ``excitation`` at the computer.
 
-def check_wiring(description: RealDescription, instrument: Datasheet) -> None:
+        :raises ConfigurationError: the stage between them cannot give the shape.
+        """
+        stage = self.generator
+        low_v, high_v = (stage.input_v(volts) for volts in (excitation.low_v, excitation.high_v))
+        if low_v <= high_v:
+            return dataclasses.replace(excitation, low_v=low_v, high_v=high_v)
+        if excitation.shape != "square":
+            raise ConfigurationError(f"generator: a stage that inverts cannot give the shape {excitation.shape!r}")
+        return dataclasses.replace(excitation, low_v=high_v, high_v=low_v, phase=(excitation.phase + 0.5) % 1.0)
+
+    def check_dials(self, dials: Mapping[str, float], where: str) -> None:
+        """:raises ConfigurationError: a dial exceeds the limits; ``where`` begins the message."""
+        for pot, dial in dials.items():
+            least, most = self.limits.dials.get(pot, (0.0, 1.0))
+            if not least <= dial <= most:
+                raise ConfigurationError(
+                    f"{where}pot {pot} would stand at {dial:.4g}, and limits.dials allow {least:g} to {most:g}"
+                )
+
+    def channels(self, computer: SuspensionComputer, noise_lsb: Mapping[str, float]) -> dict[str, Channel]:
+        """Measured channels, in volts at the computer.
+
+        :param noise_lsb: measured noise by channel; for others that of the description is used.
+        """
+        scaling, datasheet = self.scaling, self.driver.datasheet
+        full = {"force": scaling.force_n, "displacement": scaling.displacement_m}
+        out = {}
+        for name in MEASURED:
+            wired = self.inputs[name]
+            ends_v = wired.ends_v(datasheet)
+            low_v, lsb_v = max(ends_v[0], wired.least_v), (ends_v[1] - ends_v[0]) / (1 << datasheet.bits)
+            out[name] = Channel(
+                low_v=low_v,
+                lsb_v=lsb_v,
+                unit=CHANNEL_UNITS[name],
+                unit_per_v=(full[name] or computer.scales.full(name)) / 10.0,
+                noise_lsb=noise_lsb.get(name, wired.noise_lsb),
+                codes=math.ceil((ends_v[1] - low_v) / lsb_v),
+            )
+        return out
+
+    def time_scale(self, computer: SuspensionComputer) -> float:
+        """Speed of the machine relative to the system that it models."""
+        return self.scaling.time or computer.scales.time
+
+    def convert(
+        self, taken: InputRecord, channels: Mapping[str, Channel]
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint16], NDArray[np.bool_]]:
+        """Volts at the computer, codes and clipping of a record, each (n, 4)."""
+        n = len(taken.volts)
+        volts = np.full((n, len(CHANNELS)), np.nan)
+        codes = np.zeros((n, len(CHANNELS)), np.uint16)
+        clipped = np.zeros((n, len(CHANNELS)), np.bool_)
+        for column, name in enumerate(MEASURED):
+            wired, channel, at = self.inputs[name], channels[name], CHANNELS.index(name)
+            volts[:, at] = (taken.volts[:, column] - wired.offset_v) / wired.gain
+            exact = np.rint((volts[:, at] - channel.low_v) / channel.lsb_v)
+            codes[:, at] = np.clip(exact, 0.0, _MOST_CODE)
+            clipped[:, at] = taken.clipped[:, column] | (exact < 0.0) | (exact > _MOST_CODE)
+        return volts, codes, clipped
+
+
+def check_wiring(description: RealDescription) -> None:
     """Check a description against the datasheet of its instrument.
 
     :raises ConfigurationError: they contradict each other; the message names the key.
     """
+    instrument = description.driver.datasheet
     for name, wired in description.inputs.items():
         if wired.input not in instrument.inputs:
             has = " and ".join(map(str, instrument.inputs))

@@ -86,10 +86,10 @@ def _find(name: str) -> tuple[Mapping[str, Any], str, Path]:
     own = _rigs_file()
     if own is not None and "/" not in name and not name.endswith(".toml"):
         table = config.read_toml(own)
-        if name in _named(own, table):
+        if name in _rig_tables(own, table):
             return _one_of(own, table, name)
         if name not in config.names("rigs"):
-            there = ", ".join([*_named(own, table), *config.names("rigs")])
+            there = ", ".join([*_rig_tables(own, table), *config.names("rigs")])
             raise ConfigurationError(f"no rig is called {name!r} in {own}, nor is one shipped: there are {there}")
     path = config.locate("rigs", name)
     table = config.read_toml(path)
@@ -102,7 +102,7 @@ def own_rigs() -> tuple[str, Mapping[str, Any]]:
     :raises ConfigurationError: the file that the variable names is not there, or is no rigs file.
     """
     own = _rigs_file()
-    return ("", {}) if own is None else (str(own), _named(own, config.read_toml(own)))
+    return ("", {}) if own is None else (str(own), _rig_tables(own, config.read_toml(own)))
 
 
 def _rigs_file() -> Path | None:
@@ -114,7 +114,7 @@ def _rigs_file() -> Path | None:
     return Path(RIGS_FILE) if Path(RIGS_FILE).is_file() else None
 
 
-def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
+def _rig_tables(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
     """Rigs of a rigs file, by name.
 
     :raises ConfigurationError: it is none.
@@ -129,7 +129,7 @@ def _named(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> tuple[Mapping[str, Any], str, Path]:
-    rigs = _named(path, table)
+    rigs = _rig_tables(path, table)
     if wanted is None and len(rigs) > 1:
         raise ConfigurationError(f"{path}: holds {len(rigs)} rigs: say {path}:NAME, one of {', '.join(rigs)}")
     name = wanted or next(iter(rigs))

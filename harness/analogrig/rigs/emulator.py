@@ -126,7 +126,7 @@ class ComputerDescription:
     noise: bool = False
     """Thermal noise of resistors and noise of the amplifiers; costs about 8 us a sample and instant of the card."""
 
-    def fitted(self, seed: int) -> Components:
+    def components_for(self, seed: int) -> Components:
         """Components of the machine: as measured, or drawn from the seed.
 
         :raises CircuitError: a value is out of range.
@@ -142,7 +142,7 @@ class ComputerDescription:
         stock = dataclasses.replace(stock, op_amps=OP_AMP_GRADES[self.op_amp]) if graded else stock
         return stock if self.values is None else self.values.put_in(stock)
 
-    def wired(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
+    def machine(self, program: str, seed: int, sample_rate_hz: float) -> SuspensionComputer:
         """Machine drawn from the seed of a run, wired as a program, with the program's pots.
 
         :raises EmulatorError: it cannot be.
@@ -153,9 +153,16 @@ class ComputerDescription:
             opamp=preset(self.op_amp),
             rng=Stream.COMPONENTS.generator(specimen),
             offset_v=self.offset_v,
-            components=self.fitted(specimen),
+            components=self.components_for(specimen),
             sample_rate_hz=sample_rate_hz,
         )
+
+    def add_noise(self, computer: SuspensionComputer, seed: int) -> SuspensionComputer | NoisySuspension:
+        """The machine, with the noise of its components if that is described."""
+        if not self.noise:
+            return computer
+        grade = OP_AMP_GRADES.get(self.op_amp, OpAmpGrade())
+        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=self.temperature_c)
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
@@ -267,20 +274,13 @@ class SetUp(NamedTuple):
 class _Prepared(NamedTuple):
     """Data that all plays of one scenario share, for every seed."""
 
-    scenario: Scenario
+    key: tuple[object, ...]
+    """Parts of the scenario on which the data depend."""
     computer: SuspensionComputer
     play: RepeatedPlay | None
     """Repeated play; None where more than offsets and phase depends on the seed."""
     channels: Mapping[str, Channel]
     segments: tuple[Segment, ...]
-
-    def serves(self, scenario: Scenario) -> bool:
-        """True if another scenario has the same prepared data."""
-        own = self.scenario
-        return scenario is own or (
-            (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
-            == (own.samples, own.plant, own.tweaks, own.excitation)
-        )
 
 
 class EmulatorRig(Rig):
@@ -320,7 +320,7 @@ class EmulatorRig(Rig):
         changes: list[PotTurn] = []
         for i, tweak in enumerate(scenario.tweaks):
             with emulator_errors(f"scenario {scenario.name}: tweaks[{i}] at sample {tweak.sample}: "):
-                settings = self._settings(computer, tweak.overrides())
+                settings = self._pot_settings(settings_of(computer, tweak.overrides()), scenario.plant.set)
                 computer.dials_for(**settings)  # refuses here what play() would, so that the tweak can be named
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
@@ -331,12 +331,12 @@ class EmulatorRig(Rig):
         Data for a scenario that fits in one block are prepared once for all seeds.
         """
         if scenario.samples <= block_samples:
-            prepared = self._prepared(scenario, seed)
+            prepared = self._prepare(scenario, seed)
             if prepared.play is not None:
-                return self._repeated(prepared, prepared.play, scenario, seed)
+                return self._repeat(prepared, prepared.play, scenario, seed)
         computer, excitation, changes = self.set_up(scenario, seed)
         with emulator_errors(f"scenario {scenario.name}: "):
-            machine = self._noisy(computer, seed) if self._description.computer.noise else computer
+            machine = self._description.computer.add_noise(computer, seed)
             jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
                 machine, self._card, excitation, scenario.samples, changes, rng=jitter, block_samples=block_samples
@@ -345,21 +345,22 @@ class EmulatorRig(Rig):
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=computer.scales.time,
             channels=self._channels(computer),
-            blocks=_sampled(volts, self.sampler(Stream.CARD.generator(seed))),
+            blocks=_sample(volts, self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(
-                scenario.segments(), _lit(computer.machine.lamps, probes_per_sample(self._card))
+                scenario.segments(), _lit_lamps(computer.machine.lamps, probes_per_sample(self._card))
             ),
         )
 
-    def _prepared(self, scenario: Scenario, seed: int) -> _Prepared:
-        """Prepared data of the scenario; the last set is reused if it serves."""
-        if self._last_prepared is None or not self._last_prepared.serves(scenario):
+    def _prepare(self, scenario: Scenario, seed: int) -> _Prepared:
+        """Prepared data of the scenario; the last set is reused for the same key."""
+        key = (scenario.samples, scenario.plant, scenario.tweaks, scenario.excitation)
+        if self._last_prepared is None or self._last_prepared.key != key:
             computer, excitation, changes = self.set_up(scenario, seed)
             with emulator_errors(f"scenario {scenario.name}: "):
                 excitation.edges(0, 1, computer.sample_rate_hz)
                 able = self._draws_offsets_alone and is_repeatable(computer, changes)
                 play = RepeatedPlay(computer, scenario.samples, changes) if able else None
-            self._last_prepared = _Prepared(scenario, computer, play, self._channels(computer), scenario.segments())
+            self._last_prepared = _Prepared(key, computer, play, self._channels(computer), scenario.segments())
         return self._last_prepared
 
     @property
@@ -369,7 +370,7 @@ class EmulatorRig(Rig):
         is_nominal &= drawn.specimen is None and drawn.values is None
         return is_nominal and probes_per_sample(card) == 1 and card.clock_drift_ppm == 0
 
-    def _repeated(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
+    def _repeat(self, prepared: _Prepared, play: RepeatedPlay, scenario: Scenario, seed: int) -> Performance:
         count, offset_v = prepared.computer.program.amplifiers, self._description.computer.offset_v
         offsets_v = drawn_offsets_v(self._amplifier, count, Stream.COMPONENTS.generator(seed), offset_v)
         excitation = scenario.draw_excitation(Stream.EXCITATION.generator(seed))
@@ -377,38 +378,30 @@ class EmulatorRig(Rig):
 
         def volts() -> Iterator[NDArray[np.float64]]:
             repeat = play.play(excitation, offsets_v)
-            lit.update(_lit(repeat.lamps, 1))
+            lit.update(_lit_lamps(repeat.lamps, 1))
             yield repeat.volts
 
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,
             time_scale=prepared.computer.scales.time,
             channels=prepared.channels,
-            blocks=_sampled(volts(), self.sampler(Stream.CARD.generator(seed))),
+            blocks=_sample(volts(), self.sampler(Stream.CARD.generator(seed))),
             hindsight=lambda: Hindsight(prepared.segments, lit),
         )
 
     def _computer(self, scenario: Scenario, seed: int) -> SuspensionComputer:
         rate_hz = self._card.true_rate_hz * probes_per_sample(self._card)
-        computer = self._description.computer.wired(scenario.plant.set, seed, rate_hz)
+        computer = self._description.computer.machine(scenario.plant.set, seed, rate_hz)
         start = settings_of(computer, scenario.plant.overrides())
-        computer.set(**self._turned({**computer.program.values, **start}, scenario.plant.set))
+        computer.set(**self._pot_settings({**computer.program.values, **start}, scenario.plant.set))
         return computer
 
-    def _settings(self, computer: SuspensionComputer, given: Mapping[str, float]) -> dict[str, float]:
-        return self._turned(settings_of(computer, given), computer.program.name)
-
-    def _turned(self, settings: dict[str, float], program: str) -> dict[str, float]:
+    def _pot_settings(self, settings: dict[str, float], program: str) -> dict[str, float]:
         """Pot settings for these parameters, as coefficients or as dials."""
         if self._description.computer.pots == "coefficient":
             return settings
         dials = _nominal(program).dials_for(**settings)
         return {f"{pot}_dial": dial for pot, dial in dials.items()}
-
-    def _noisy(self, computer: SuspensionComputer, seed: int) -> NoisySuspension:
-        drawn = self._description.computer
-        grade = OP_AMP_GRADES.get(drawn.op_amp, OpAmpGrade())
-        return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=drawn.temperature_c)
 
     def _channels(self, computer: SuspensionComputer) -> dict[str, Channel]:
         return {
@@ -429,12 +422,12 @@ def is_emulated(rig: Rig) -> TypeGuard[EmulatorRig]:
     return rig.computes_circuit
 
 
-def _lit(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
+def _lit_lamps(lamps: Mapping[str, int | None], probes: int) -> dict[str, int]:
     """Lit lamps, with the card's sample; the machine takes `probes` for each of those."""
     return {amplifier: -(-probe // probes) for amplifier, probe in lamps.items() if probe is not None}
 
 
-def _sampled(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
+def _sample(volts: Iterator[NDArray[np.float64]], sampler: Sampler) -> Iterator[Block]:
     first = 0
     with emulator_errors(as_error=RigError):
         for block in volts:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.config import check_range
+from analogrig.hardware.simulator.computer import WiredComputer
 from analogrig_emulator import Card, Sampler
 
 BITS = 14
@@ -53,10 +54,11 @@ class InputFaults:
 
 
 class Inputs:
-    """Samplers and converters of both channels."""
+    """Samplers and converters of both channels of a computer."""
 
-    def __init__(self, faults: InputFaults, rng: np.random.Generator) -> None:
+    def __init__(self, computer: WiredComputer, faults: InputFaults, rng: np.random.Generator) -> None:
         """``rng`` draws the noise."""
+        self._computer = computer
         self._faults = faults
         self._rng = rng
         self._oversampling = LEAST_OVERSAMPLING
@@ -64,28 +66,39 @@ class Inputs:
         self._ahead: Volts = np.empty((0, CHANNELS_N))
         """Points of the next samples that are already taken: the later channel needs them early."""
 
-    def set_rate(self, oversampling: int, sample_rate_hz: float) -> None:
-        """Set the number of points in a sample, and the samples per second."""
+    def set_rate(self, sample_rate_hz: float) -> None:
+        """Set the samples per second; the computer restarts from rest.
+
+        :raises EmulatorError: the generator is too fast for the rate; then nothing changes.
+        """
+        oversampling = _choose_oversampling(self._faults, sample_rate_hz)
+        self._computer.set_rate(oversampling * sample_rate_hz)
         self._oversampling = oversampling
         self._delay_n = abs(self._faults.skew_s) * sample_rate_hz * oversampling
         self.forget()
 
-    def samples_in(self, points: int) -> int:
-        """Number of whole samples that end within the next ``points`` points."""
-        return (points + len(self._ahead)) // self._oversampling
+    def samples_to_period(self) -> int | None:
+        """Number of whole samples until the generator begins a period; None if it is silent."""
+        points = self._computer.points_to_period()
+        return None if points is None else (points + len(self._ahead)) // self._oversampling
+
+    def pause(self, duration_s: float) -> None:
+        """Let machine time pass without a sample."""
+        self._computer.run(round(duration_s * self._computer.rate_hz))
+        self.forget()
 
     def forget(self) -> None:
         """Discard points that were taken ahead."""
         self._ahead = self._ahead[:0]
 
-    def sample(self, run: Callable[[int], Volts], count: int, *, averages: bool) -> Volts:
-        """The next samples, (count, 2), from consecutive points: ``run(n)`` returns n of them, (n, 2).
+    def sample(self, count: int, *, averages: bool) -> Volts:
+        """The next samples, (count, 2): each is the mean of its points, or the first of them.
 
-        A sample is the mean of its points, or the first of them. The later channel is interpolated between two points.
+        The later channel is interpolated between two points.
         """
         own = count * self._oversampling
         lacking = own + math.ceil(self._delay_n) - len(self._ahead)
-        taken = np.concatenate((self._ahead, run(lacking))) if count else self._ahead
+        taken = np.concatenate((self._ahead, self._computer.run(lacking))) if count else self._ahead
         points, self._ahead = taken[:own].copy(), taken[own:]
         if self._delay_n and count:
             later = 1 if self._faults.skew_s > 0.0 else 0
@@ -114,7 +127,7 @@ class Inputs:
         return first_v, second_v
 
 
-def choose_oversampling(faults: InputFaults, sample_rate_hz: float) -> int:
+def _choose_oversampling(faults: InputFaults, sample_rate_hz: float) -> int:
     """Number of points in a sample at which the later channel's instant is that of a point, or else close to one."""
     part = abs(faults.skew_s) * sample_rate_hz
     counts = range(LEAST_OVERSAMPLING, MOST_OVERSAMPLING + 1)

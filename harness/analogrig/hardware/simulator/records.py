@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 
 from analogrig.config import check_range
-from analogrig.hardware.simulator.computer import WiredComputer
-from analogrig.hardware.simulator.inputs import Codes, InputFaults, Inputs, Volts, choose_oversampling
+from analogrig.hardware.simulator.inputs import Codes, Inputs, Volts
 from analogrig.hardware.simulator.scpi import ScpiError
 from analogrig.links.wire import Clock
 
@@ -123,23 +122,12 @@ class _BufferFill:
 class Acquisition:
     """Records of two channels of a computer."""
 
-    def __init__(
-        self,
-        computer: WiredComputer,
-        inputs: tuple[InputFaults, np.random.Generator],
-        faults: AcquisitionFaults,
-        clock: Clock | None = None,
-    ) -> None:
-        """``inputs``: their faults, and the random numbers of their noise.
-
-        Without a ``clock`` a record takes no time.
-        """
+    def __init__(self, inputs: Inputs, faults: AcquisitionFaults, clock: Clock | None = None) -> None:
+        """Without a ``clock`` a record takes no time."""
         self._clock = clock
         self.settings = Settings()
         self.record: Buffer | None = None
-        self._computer = computer
-        self._input_faults = inputs[0]
-        self._inputs = Inputs(*inputs)
+        self._inputs = inputs
         self._faults = faults
         self._state: _TriggerWait | _BufferFill | None = None
         self._records = 0
@@ -196,8 +184,7 @@ class Acquisition:
 
     def start(self) -> None:
         """Discard the record, and get ready for a trigger."""
-        self._computer.run(round(PAUSE_S * self._computer.rate_hz))
-        self._inputs.forget()
+        self._inputs.pause(PAUSE_S)
         self.record, self._state = None, _TriggerWait()
 
     def stop(self) -> None:
@@ -236,10 +223,9 @@ class Acquisition:
         return _TriggerWait(trigger, self._sample(0 if trigger == "DISABLED" else self.settings.before_n + 1))
 
     def _wait_for_period(self, state: _TriggerWait) -> None:
-        left = self._computer.points_to_period()
-        if left is None:
+        left_n = self._inputs.samples_to_period()
+        if left_n is None:
             return
-        left_n = self._inputs.samples_in(left)
         self._extend(state, min(left_n, BUFFER_N))
         if left_n <= BUFFER_N:
             self._trigger(state.taken, len(state.taken))
@@ -290,11 +276,8 @@ class Acquisition:
         self.record, self._state = self._buffers[0 if is_faulty else -1], None
 
     def _sample(self, count: int) -> Volts:
-        return self._inputs.sample(self._computer.run, count, averages=self.settings.averages)
+        return self._inputs.sample(count, averages=self.settings.averages)
 
     def _set_rate(self, decimation: int) -> None:
         """:raises EmulatorError: the generator is too fast for the rate; then nothing changes."""
-        true_rate_hz = CLOCK_HZ / decimation * (1.0 + 1e-6 * self._faults.clock_ppm)
-        oversampling = choose_oversampling(self._input_faults, true_rate_hz)
-        self._computer.set_rate(oversampling * true_rate_hz)
-        self._inputs.set_rate(oversampling, true_rate_hz)
+        self._inputs.set_rate(CLOCK_HZ / decimation * (1.0 + 1e-6 * self._faults.clock_ppm))
