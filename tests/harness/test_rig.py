@@ -1,4 +1,4 @@
-"""The rigs: the same seed the same codes, and what they say of themselves."""
+"""The rigs: the same seed the same codes, real components, and the faults of a card."""
 
 from __future__ import annotations
 
@@ -11,26 +11,32 @@ import pytest
 from analogrig import config
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
+from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Rig
 from analogrig.run import CHANNELS
 from analogrig.scenario import PotChange, Scenario
+from analogrig_emulator import Capacitor, OpAmp, Resistor
+
+NEEDED = "[card.range_v]"
 
 
 def blocks(rig: Rig, scenario: Scenario, seed: int) -> list[Block]:
     return list(rig.perform(scenario, seed).blocks)
 
 
-def codes(name: str, scenario: Scenario, seed: int) -> np.ndarray:
+def codes(name: str, seed: int = 1, scenario: str = "healthy") -> np.ndarray:
     with open_rig(name) as rig:
-        return np.concatenate([block.codes for block in blocks(rig, scenario, seed)])
+        return np.concatenate([block.codes for block in blocks(rig, Scenario.load(scenario), seed)])
 
 
-def test_same_seed_gives_the_same_codes_and_another_seed_others() -> None:
-    thesis = Scenario.load("thesis")
-    first = codes("emulator", thesis, 7)
-    assert first.tobytes() == codes("emulator", thesis, 7).tobytes()
-    assert first.tobytes() != codes("emulator", thesis, 8).tobytes()
+@pytest.mark.parametrize(
+    ("rig", "scenario"), [("emulator", "thesis"), ("emulator-real", "healthy"), ("emulator-skewed", "healthy")]
+)
+def test_same_seed_gives_the_same_codes_and_another_seed_others(rig: str, scenario: str) -> None:
+    first = codes(rig, 7, scenario)
+    assert np.array_equal(first, codes(rig, 7, scenario))
+    assert not np.array_equal(first, codes(rig, 8, scenario))
 
 
 def test_blocks_are_consecutive_and_complete() -> None:
@@ -105,3 +111,142 @@ def test_recording_plays_its_own_scenario_and_no_other(recorded_thesis: Path) ->
         rig.perform(Scenario.load("healthy"), 1)
     again = np.concatenate([block.codes for block in blocks(rig, rig.scenario(), rig.run.conditions.seed)])
     assert again.tobytes() == rig.run.codes.tobytes()
+
+
+# ---- faults of the card
+
+
+def described(folder: Path, faults: str) -> str:
+    """The rig "emulator" with more lines in its card."""
+    path = folder / "own.toml"
+    path.write_text(config.locate("rigs", "emulator").read_text().replace(NEEDED, f"{faults}\n{NEEDED}"))
+    return str(path)
+
+
+def test_a_skewed_rig_sees_the_displacement_later_and_the_force_at_the_same_instant() -> None:
+    """Same noise, same offsets: what differs is when the channels are taken, up to 46 LSB of displacement and 1 more
+    for rounding."""
+    differences = codes("emulator-skewed").astype(int) - codes("emulator")
+    assert not differences[:, CHANNELS.index("force")].any()
+    assert 20 < np.abs(differences[:, CHANNELS.index("displacement")]).max() < 60
+
+
+def test_a_fault_in_the_description_reaches_the_codes(tmp_path: Path) -> None:
+    assert np.all(codes(described(tmp_path, "faults = { stuck_high = 1 }")) & 1)
+
+
+def test_noise_of_the_machine_moves_a_code_now_and_then_by_one(tmp_path: Path) -> None:
+    """0.027 LSB rms: nearly all codes stay as they are, and the force, which no amplifier carries, all of them."""
+    noisy = tmp_path / "noisy.toml"
+    text = config.locate("rigs", "emulator").read_text()
+    noisy.write_text(text.replace("[computer]", "[computer]\nnoise = true"))
+    differences = codes(str(noisy)).astype(int) - codes("emulator")
+    displacement = np.abs(differences[:, CHANNELS.index("displacement")])
+    assert not differences[:, CHANNELS.index("force")].any()
+    assert displacement.max() == 1 and displacement.mean() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("faults = { stuck = 1 }", "card: faults: unknown key 'stuck'"),
+        ("faults = { stuck_high = 5000 }", "card: stuck_high must be a mask"),
+        ("faults = { skew_s = [0.0, 1e-5] }", "card: skew_s must have 4 channels"),
+        ('faults = { acquisition = "slow" }', "card: faults: "),
+        ("faults = { throughput_hz = 5e4 }", "card: throughput_hz 50000 does not carry 4 channels"),
+        ('model = "dt9999"', "card: model: must be one of 'ideal', 'dt2821', 'skewed'"),
+    ],
+)
+def test_a_wrong_fault_is_refused_by_name(tmp_path: Path, fault: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        open_rig(described(tmp_path, fault))
+
+
+# ---- a machine that was measured
+
+VALUES = """
+[computer.values]
+deviation = { RF = 0.01, C1 = -0.02 }
+offset_v = { U1 = 2e-3 }
+bandwidth = { U1 = 0.1 }
+slew = { U1 = -0.1 }
+
+[card]"""
+
+
+def own(folder: Path, computer: str, name: str = "own") -> str:
+    """The rig "emulator" with another [computer]."""
+    path = folder / f"{name}.toml"
+    card = config.locate("rigs", "emulator").read_text().partition("[card]")[2]
+    path.write_text(f"[computer]\n{computer}\n[card]{card}")
+    return str(path)
+
+
+def elements(rig: str, seed: int) -> dict[str, object]:
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        return {each.name: each for each in opened.set_up(Scenario.load("healthy"), seed).computer.circuit.elements}
+
+
+def test_measured_values_are_those_of_the_machine_whatever_the_seed(tmp_path: Path) -> None:
+    rig = own(tmp_path, 'components = "polyester"' + VALUES.removesuffix("[card]"))
+    there = elements(rig, 1)
+    assert there == elements(rig, 2)
+    force, capacitor, summer = there["RF"], there["C1"], there["U1"]
+    assert isinstance(force, Resistor) and force.ohm == pytest.approx(101e3)
+    assert isinstance(capacitor, Capacitor) and capacitor.farad == pytest.approx(0.98e-9)
+    assert isinstance(summer, OpAmp)
+    assert (summer.model.vos_v, summer.model.gbw_hz) == pytest.approx((2e-3, 3.3e6))
+    assert summer.model.slew_v_per_s == pytest.approx(11.7e6)
+    other = there["RB"]
+    assert isinstance(other, Resistor) and other.ohm == 33.2e3
+
+
+def test_runs_of_one_specimen_are_of_the_same_machine_with_other_noise(tmp_path: Path) -> None:
+    drawn = 'components = "polyester"\noffset_v = 0.003'
+    one = own(tmp_path, f"{drawn}\nspecimen = 7", "one")
+    assert elements(one, 1) == elements(one, 2) == elements(own(tmp_path, drawn, "drawn"), 7)
+    assert not np.array_equal(codes(one, 1), codes(one, 2))
+
+
+def test_noise_can_be_given_channel_by_channel(tmp_path: Path) -> None:
+    text = config.locate("rigs", "emulator").read_text()
+    by_name = "noise_lsb = { force = 0.0, displacement = 1.0, velocity = 1.0, net_force = 1.0 }"
+    path = tmp_path / "own.toml"
+    path.write_text(text.replace("noise_lsb = 1.0", by_name))
+    assert len(np.unique(codes(str(path))[:, CHANNELS.index("force")])) == 2
+    assert np.array_equal(codes(str(path))[:, 1:], codes("emulator")[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("computer", "message"),
+    [
+        ("values = { deviation = { R99 = 0.1 } }", "values: deviation: unknown key 'R99'"),
+        ("values = { deviation = { U1 = 0.1 } }", "values: deviation: unknown key 'U1'"),
+        ("values = { offset_v = { RF = 0.1 } }", r"values: offset_v: unknown key 'RF' \(known: U1, U2"),
+        ("values = { offsets = { U1 = 0.1 } }", "values: unknown key 'offsets'"),
+        ("values = { deviation = { RF = -1.0 } }", r"values: deviation.RF must be within \+-0.9, not -1"),
+        ("values = { slew = { U1 = nan } }", "values: slew.U1: must be a number"),
+        ("specimen = 3\nvalues = { }", "offset_v and specimen are for what is drawn"),
+        ("specimen = -3", "specimen must be 0 to"),
+    ],
+)
+def test_wrong_measured_values_are_refused_by_name(tmp_path: Path, computer: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=f"own.toml: computer.*{message}"):
+        open_rig(own(tmp_path, computer))
+
+
+@pytest.mark.parametrize(("pots", "at_start", "after"), [("coefficient", 0.83, 0.6098), ("dial", 0.8199, 0.5966)])
+def test_a_pot_set_by_its_dial_passes_what_track_and_load_make_of_it(
+    tmp_path: Path, pots: str, at_start: float, after: float
+) -> None:
+    """Pot K at 24500 and 18000 N/m (facts 1: coefficients .8300 and .6098, dials .8511 and .6380) with a track of 15k
+    into 49.9k: .8511 / (1 + .8511 x .1489 x 15 / 49.9) = .8199, likewise .5966."""
+    rig = own(tmp_path, f'pots = "{pots}"\nvalues = {{ deviation = {{ K = 0.5 }} }}')
+    scenario = dataclasses.replace(Scenario.load("healthy"), tweaks=(PotChange(100, stiffness_n_per_m=18000.0),))
+    with open_rig(rig) as opened:
+        assert isinstance(opened, EmulatorRig)
+        computer, _, tweaks = opened.set_up(scenario, 1)
+    assert computer.coefficients["K"] == pytest.approx(at_start, abs=1e-4)
+    computer.set(**tweaks[0][1])
+    assert computer.coefficients["K"] == pytest.approx(after, abs=1e-4)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,6 @@ class Scaling:
 class RealDescription(RigDescription):
     """A rig of the kind ``real``: a table of a rigs file, or a file of its own."""
 
-    has_one_owner: ClassVar[bool] = True
     kind: Literal["real"]
     instrument: str
     """URL: ``redpitaya://HOST``."""
@@ -141,6 +140,10 @@ class RealDescription(RigDescription):
         :raises ConfigurationError: the URL of the instrument is wrong.
         """
         return find_driver(self.instrument)[0]
+
+    @property
+    def only_one(self) -> str:
+        return self.instrument
 
     @property
     def pot_names(self) -> tuple[str, ...]:

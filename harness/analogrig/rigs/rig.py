@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,8 +113,10 @@ class RigDescription:
     The defaults are those of a kind that names nothing outside analogrig.
     """
 
-    has_one_owner: ClassVar[bool] = False
-    """True if one process at a time can play on it."""
+    @property
+    def only_one(self) -> str:
+        """Place that only one process at a time can use; "" if there is none."""
+        return ""
 
     def as_table(self) -> Mapping[str, Any]:
         """Plain values that a run on the rig records."""

@@ -189,6 +189,6 @@ def _single(rig: str, dut: str) -> str:
         if dut and describe(dut).only_one:
             return f"device {dut}: one worker owns it"
     with contextlib.suppress(AnalogrigError, EmulatorError):
-        if rig and describe_rig(rig).has_one_owner:
+        if rig and describe_rig(rig).only_one:
             return f"rig {rig}: one worker owns it"
     return ""
