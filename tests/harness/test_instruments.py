@@ -181,8 +181,8 @@ def test_each_driver_checks_its_own_addresses(address: str, monkeypatch: pytest.
 
     class Adalm2000(NiDaqmx):
         @classmethod
-        def is_address(cls, address: str) -> bool:
-            return address.startswith(("ip:", "usb:"))
+        def place(cls, address: str) -> str:
+            return address if address.startswith(("ip:", "usb:")) else ""
 
     monkeypatch.setattr("analogrig.hardware.ni_daqmx.NiDaqmx", Adalm2000)
     assert find_driver(f"nidaqmx://{address}") == (Adalm2000, address)

@@ -89,6 +89,11 @@ class Excitation:
         self._require("seed", isinstance(self.seed, int), "must be an integer")
         self._require("seed", 0 <= self.seed < 2**63, "must be 0 to 2^63 - 1")
 
+    @property
+    def true_frequency_hz(self) -> float:
+        """Frequency with the drift of the generator's clock."""
+        return self.frequency_hz * (1.0 + 1e-6 * self.drift_ppm)
+
     def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
         """Edges at ticks start_tick <= t < stop_tick, t >= 0. The edge at tick 0 switches the generator on.
 
@@ -100,7 +105,7 @@ class Excitation:
             raise ExcitationError(
                 f"excitation: frequency_hz {self.frequency_hz!r} exceeds half the sample rate of {sample_rate_hz!r} Hz"
             )
-        period = TICKS_PER_SAMPLE * sample_rate_hz / (self.frequency_hz * (1.0 + 1e-6 * self.drift_ppm))
+        period = TICKS_PER_SAMPLE * sample_rate_hz / self.true_frequency_hz
         if not period <= _MOST_TICKS:
             raise ExcitationError(
                 f"excitation: frequency_hz {self.frequency_hz!r} is too low at {sample_rate_hz!r} samples/s: "

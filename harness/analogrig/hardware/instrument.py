@@ -151,13 +151,11 @@ class Instrument(ABC):
 
     @classmethod
     @abstractmethod
-    def is_address(cls, address: str) -> bool:
-        """True if ``address``, which follows ``scheme://``, is well formed."""
-
-    @classmethod
     def place(cls, address: str) -> str:
-        """Value of the option ``--allow`` that permits ``open`` to connect to an address."""
-        return address
+        """Value of ``--allow`` that permits ``open`` to connect to ``address``, which follows ``scheme://``.
+
+        Empty if the address is malformed.
+        """
 
     @classmethod
     @abstractmethod
@@ -243,7 +241,7 @@ def find_driver(url: str) -> tuple[type[Instrument], str]:
     known = DRIVERS.get(scheme.lower())
     if known is not None and rest.startswith("//"):
         kind: type[Instrument] = pkgutil.resolve_name(known[0])
-        if kind.is_address(address := rest.removeprefix("//")):
+        if kind.place(address := rest.removeprefix("//")):
             return kind, address
     forms = DRIVERS if known is None else {scheme: known}
     written = " or ".join(f"{scheme}://{form}" for scheme, (_, form) in forms.items())

@@ -57,12 +57,8 @@ class NiDaqmx(Instrument):
         self.make_safe()
 
     @classmethod
-    def is_address(cls, address: str) -> bool:
-        return re.fullmatch(r"[A-Za-z0-9][\w-]*", address) is not None
-
-    @classmethod
     def place(cls, address: str) -> str:
-        return f"nidaqmx://{address}"
+        return f"nidaqmx://{address}" if re.fullmatch(r"[A-Za-z0-9][\w-]*", address) else ""
 
     @classmethod
     def open(cls, address: str, timeout_s: float) -> NiDaqmx:

@@ -60,17 +60,13 @@ class RedPitaya(Instrument):
         self._box = self.pots = _ScpiPots.find(self._scpi)
 
     @classmethod
-    def is_address(cls, address: str) -> bool:
-        try:
-            split = urlsplit(f"//{address}")
-            found = bool(split.hostname) and (split.port is None or split.port > 0)
-        except ValueError:
-            return False
-        return found and not (split.path or split.query or split.fragment or split.username or " " in address)
-
-    @classmethod
     def place(cls, address: str) -> str:
-        host, port = _host_and_port(address)
+        try:
+            split, (host, port) = urlsplit(f"//{address}"), _host_and_port(address)
+        except ValueError:
+            return ""
+        if not (host and port) or split.path or split.query or split.fragment or split.username or " " in address:
+            return ""
         return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
     @classmethod
@@ -139,7 +135,7 @@ class RedPitaya(Instrument):
             "ACQ:RST",
             f"SOUR1:FUNC {'SQUARE' if excitation.shape == 'square' else 'PWM'}",
             f"SOUR1:DCYC {excitation.duty:.12g}",
-            f"SOUR1:FREQ:FIX {self._frequency_hz:.15g}",
+            f"SOUR1:FREQ:FIX {self._excitation.true_frequency_hz:.15g}",
             f"SOUR1:VOLT {excitation.high_v - middle_v:.12g}",
             f"SOUR1:VOLT:OFFS {middle_v:.12g}",
             f"SOUR1:PHAS {360.0 * self._phase():.15g}",
@@ -151,10 +147,6 @@ class RedPitaya(Instrument):
         scheduled_n = 0 if self._box is None else self._box.send_schedule()
         self._scpi.check("the set-up of the record")
         return scheduled_n
-
-    @property
-    def _frequency_hz(self) -> float:
-        return self._excitation.frequency_hz * (1.0 + 1e-6 * self._excitation.drift_ppm)
 
     def _phase(self) -> float:
         """Phase at the first sample, in periods; on the card's clock the edges coincide with samples."""
@@ -196,9 +188,9 @@ class RedPitaya(Instrument):
         for query, wanted in settings.items():
             if (answer := self._scpi.ask(query)) not in wanted:
                 raise RigRefused(f"{changed}: {query} answered {answer[:20]!r}, not {wanted[0]}")
-        frequency_hz = self._scpi.ask("SOUR1:FREQ:FIX?")
-        if not _is_close(frequency_hz, self._frequency_hz):
-            raise RigRefused(f"{changed}: its generator gives {frequency_hz[:20]} Hz, not {self._frequency_hz:g} Hz")
+        answer, wanted_hz = self._scpi.ask("SOUR1:FREQ:FIX?"), self._excitation.true_frequency_hz
+        if not _is_close(answer, wanted_hz):
+            raise RigRefused(f"{changed}: its generator gives {answer[:20]} Hz, not {wanted_hz:g} Hz")
 
     def _codes(self) -> NDArray[np.int32]:
         return self._data("RAW", ">i2").astype(np.int32)
@@ -227,7 +219,7 @@ class RedPitaya(Instrument):
 
 def _host_and_port(address: str) -> tuple[str, int]:
     split = urlsplit(f"//{address}")
-    return str(split.hostname), split.port or PORT
+    return split.hostname or "", PORT if split.port is None else split.port
 
 
 class _ScpiPots(PotBox):

@@ -146,7 +146,7 @@ class WiredComputer:
         if self._waveform is None:
             return None
         periods = self._periods
-        left_s = (math.ceil(periods - _JUST_STARTED) - periods) / _true_frequency_hz(self._waveform)
+        left_s = (math.ceil(periods - _JUST_STARTED) - periods) / self._waveform.true_frequency_hz
         return max(round(left_s * self.rate_hz), 0)
 
     @property
@@ -155,7 +155,7 @@ class WiredComputer:
         if self._waveform is None:
             return 0.0
         since_s = (self._now_tick - self._started_tick) * self._tick_s
-        return since_s * _true_frequency_hz(self._waveform) + self._waveform.phase
+        return since_s * self._waveform.true_frequency_hz + self._waveform.phase
 
     # ---- time
 
@@ -216,7 +216,3 @@ def _check(waveform: Excitation | None, rate_hz: float) -> None:
     """:raises EmulatorError: the waveform is too fast for the rate."""
     if waveform is not None:
         waveform.edges(0, 1, rate_hz)
-
-
-def _true_frequency_hz(waveform: Excitation) -> float:
-    return waveform.frequency_hz * (1.0 + 1e-6 * waveform.drift_ppm)
