@@ -6,18 +6,20 @@ Dials go from 0 to 1. The caller checks the limits of each pot before anything m
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
+import select
 import shlex
 import signal
 import subprocess
-import tempfile
 import termios
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import serial
 
@@ -139,13 +141,10 @@ class CommandPots(_SteppedPots, Pots):
     def set_one(self, pot: str, dial: float) -> None:
         arguments = [self.fill(each, pot, dial) for each in self.arguments]
         where = f"pot {pot} to {dial:.{DECIMALS}f}: {shlex.join(arguments)}"
-        with tempfile.TemporaryFile() as output:
-            status = _run(arguments, output, self.timeout_s, where)
-            output.seek(0)
-            text = output.read(_MOST_REPLY_BYTES)
+        status, output = _run(arguments, self.timeout_s, where)
         if status:
             how = f"status {status}" if status > 0 else f"signal {-status}"
-            raise RigError(f"{where}: ended with {how}{_quote(text)}")
+            raise RigError(f"{where}: ended with {how}{_quote(output)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,26 +227,35 @@ def _check_placeholders(key: str, template: str, *, needed: bool = True) -> None
         raise ValueError(f"{key} must have {{pot}}, and {{dial}} or {{step}}, in it")
 
 
-def _run(arguments: list[str], output: IO[bytes], timeout_s: float, where: str) -> int:
-    """Run a command in a process group of its own, which is killed unless the command ends. Return its status.
+def _run(arguments: list[str], timeout_s: float, where: str) -> tuple[int, bytes]:
+    """Run a command to its end, in a process group of its own. Return its status and the beginning of its output.
 
-    :raises RigError: it cannot be started, or does not end in time.
+    :raises RigError: it cannot be started, or does not end in time; then the group is killed.
     """
     try:
         process = subprocess.Popen(
-            arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            arguments,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
         )
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise RigError(f"{where}: cannot be started: {reason}") from error
-    try:
-        return process.wait(timeout_s)
-    except subprocess.TimeoutExpired:
-        raise RigError(f"{where}: not done within {timeout_s:g} s, killed") from None
-    finally:
-        if process.returncode is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+    output, deadline_s = b"", time.monotonic() + timeout_s
+    with process, contextlib.suppress(subprocess.TimeoutExpired):
+        assert process.stdout is not None  # noqa: S101 - asked for above
+        stdout = process.stdout.fileno()
+        try:
+            while (left_s := deadline_s - time.monotonic()) > 0.0 and select.select([stdout], [], [], left_s)[0]:
+                if not (received := os.read(stdout, _MOST_REPLY_BYTES)):
+                    return process.wait(left_s), output
+                output = (output + received)[:_MOST_REPLY_BYTES]
+        finally:
+            if process.returncode is None:
+                os.killpg(process.pid, signal.SIGKILL)
+    raise RigError(f"{where}: not done within {timeout_s:g} s, killed")
 
 
 class _Box(Pots):
@@ -309,9 +317,8 @@ class _Operator(Pots):
 
     def set(self, dials: Mapping[str, float], words: str, *, recording: bool) -> None:
         order = "NOW turn to" if recording else "Set the pots to"
-        self._ask(f"{order} {_list_dials(dials)} ({words}), then press Enter: ")
-
-    def _ask(self, prompt: str) -> None:
+        targets = ", ".join(f"{pot} {dial:.{DECIMALS}f}" for pot, dial in dials.items())
+        prompt = f"{order} {targets} ({words}), then press Enter: "
         if self._fd < 0:
             raise RigError(f"pots: {self._name} was closed")
         try:
@@ -329,10 +336,6 @@ class _Operator(Pots):
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
-
-
-def _list_dials(dials: Mapping[str, float]) -> str:
-    return ", ".join(f"{pot} {dial:.{DECIMALS}f}" for pot, dial in dials.items())
 
 
 def _quote(output: bytes) -> str:
