@@ -36,10 +36,9 @@ from analogrig.judging.verdict import judge
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_link import CanLink
 from analogrig.links.faulty_bus import FaultyBus
-from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
-from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from analogrig.protocol.exchange import Replies
 from analogrig.rigs.rig import Block, Hindsight, Performance
 from analogrig.run import CHANNELS, Channel, Run

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from analogrig.devices.registry import describe
-from analogrig.links.faulty_wire import FaultyWire
-from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from tests.harness.fault_runs import (
     BACK_AT,
     FAULTY,

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import secrets
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from analogrig.catalogue import CATALOGUE_HASH
 from analogrig.devices.child import Child
 from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
 from analogrig.errors import LinkClosed
-from analogrig.links.can_bus import CanBus, WrappedBus
+from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import can
 from analogrig.links.wire import VirtualClock
@@ -125,23 +127,27 @@ class MemoryBus:
         """Do nothing: nothing is held."""
 
 
-class InhabitedBus(WrappedBus):
+class InhabitedBus(PythonCanBus):
     """A bus with a device in this process, which a thread serves over a connection of its own."""
 
-    def __init__(self, bus: CanBus, devices_bus: CanBus, boot_nonce: int) -> None:
-        """Take over both connections to the same bus, and boot the device.
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        """Open two connections to the same bus, and boot the device.
 
-        :raises LinkError: the project's library was not built.
+        :raises ConfigurationError, LinkError: as for ``PythonCanBus``, or the project's library was not built.
         """
-        super().__init__(bus)
-        self._devices_bus = devices_bus
-        self._device = LibraryCanDevice(is_fd=bus.is_fd, input_blocks=BUS_INPUT_BLOCKS)
-        self._device.boot(boot_nonce)
+        super().__init__(config)
+        self._device = LibraryCanDevice(is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
+        self._device.boot(secrets.randbits(32))
+        try:
+            self._devices_bus = PythonCanBus(config)
+        except BaseException:
+            super().close()
+            raise
         self._sent: dict[tuple[int, int], bytes] = {}
         """Latest data from the device, by identifier and sequence number."""
         self._ends = threading.Event()
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._serve, name=f"device on {bus.name}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=f"device on {self.name}", daemon=True)
         self._thread.start()
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -174,13 +180,19 @@ class InhabitedBus(WrappedBus):
         return self._sent.get((frame.arbitration_id, frame.data[0])) == bytes(frame.data)
 
 
-class ChildBus(WrappedBus):
+class ChildBus(PythonCanBus):
     """A bus to a child process, which ends when the bus is closed."""
 
-    def __init__(self, child: Child, bus: CanBus) -> None:
-        """Take over both."""
-        super().__init__(bus)
-        self.child = child
+    def __init__(
+        self, config: Mapping[str, Any], start: Callable[[PythonCanBus], Child], *, name: str | None = None
+    ) -> None:
+        """Open the bus, and take over the process that ``start`` returns for it; errors as of both."""
+        super().__init__(config, name=name)
+        try:
+            self.child = start(self)
+        except BaseException:
+            super().close()
+            raise
 
     def send(self, frame: can.Message) -> None:
         with self.child.reports_exit():

@@ -14,11 +14,10 @@ from analogrig import config
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.line import CanLine, SerialLine
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
-from analogrig.links.wire_faults import WireFaults
+from analogrig.links.wire_faults import FaultyWire, WireFaults
 from analogrig.trust import Thing
 
 if TYPE_CHECKING:  # importing python-can takes longer than all other imports together
