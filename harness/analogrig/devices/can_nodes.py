@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from analogrig.catalogue import CATALOGUE_HASH
 from analogrig.devices.child import Child
 from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
 from analogrig.errors import LinkClosed
@@ -44,12 +43,8 @@ class _Frame(ctypes.Structure):
 
 
 def _to_c(frame: can.Message) -> _Frame:
-    flags = (
-        (_EXTENDED if frame.is_extended_id else 0)
-        | (_REMOTE if frame.is_remote_frame else 0)
-        | (_FD if frame.is_fd else 0)
-        | (_ERROR if frame.is_error_frame else 0)
-    )
+    flags = _EXTENDED * frame.is_extended_id | _REMOTE * frame.is_remote_frame
+    flags |= _FD * frame.is_fd | _ERROR * frame.is_error_frame
     data = bytes(frame.data[:MOST_BYTES])
     out = _Frame(frame.arbitration_id, flags, len(data))
     ctypes.memmove(out.data, data, len(data))
@@ -68,9 +63,9 @@ def _from_c(frame: _Frame) -> can.Message:
 class LibraryCanDevice(LibraryDevice):
     """The device in the shared library, behind its CAN port."""
 
-    def __init__(self, *, is_fd: bool, catalogue_hash: int = CATALOGUE_HASH, input_blocks: int = ALWAYS_ROOM) -> None:
-        """Load a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
-        super().__init__("can", ctypes.c_bool(is_fd), catalogue_hash=catalogue_hash, input_blocks=input_blocks)
+    def __init__(self, boot_nonce: int, *, is_fd: bool, input_blocks: int = ALWAYS_ROOM) -> None:
+        """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
+        super().__init__("can", ctypes.c_bool(is_fd), boot_nonce=boot_nonce, input_blocks=input_blocks)
         self._output = (_Frame * _OUTPUT_N)()
 
     def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
@@ -93,25 +88,15 @@ class MemoryBus:
     unread_n = None
     damaged = 0
 
-    def __init__(
-        self,
-        boot_nonce: int,
-        *,
-        is_fd: bool = False,
-        line: CanLine | None = None,
-        catalogue_hash: int = CATALOGUE_HASH,
-        clock: VirtualClock | None = None,
-    ) -> None:
+    def __init__(self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None) -> None:
         """Boot a device.
 
         :raises LinkError: the project's library was not built.
         """
-        self.is_fd = is_fd
-        self.line = line
-        self.clock = VirtualClock() if clock is None else clock
-        self._device = LibraryCanDevice(is_fd=is_fd, catalogue_hash=catalogue_hash)
+        self.is_fd, self.line = is_fd, line
+        self.clock = VirtualClock()
+        self._device = LibraryCanDevice(boot_nonce, is_fd=is_fd)
         self._answers: deque[can.Message] = deque()
-        self._device.boot(boot_nonce)
 
     def send(self, frame: can.Message) -> None:
         self._answers += self._device.answers([frame])
@@ -136,9 +121,8 @@ class InhabitedBus(PythonCanBus):
         :raises ConfigurationError, LinkError: as for ``PythonCanBus``, or the project's library was not built.
         """
         super().__init__(config)
-        self._device = LibraryCanDevice(is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
-        self._device.boot(secrets.randbits(32))
         try:
+            self._device = LibraryCanDevice(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
             self._devices_bus = PythonCanBus(config)
         except BaseException:
             super().close()

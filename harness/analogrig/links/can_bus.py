@@ -111,23 +111,20 @@ class PythonCanBus:
         """Cause; the operating system's message, if there is one."""
         if self._is_socket and number in _SOCKETCAN:
             return _SOCKETCAN[number]
-        return os.strerror(number) if number else str(error) or type(error).__name__
+        return os.strerror(number) if number and number > 0 else str(error) or type(error).__name__
 
     def send(self, frame: can.Message) -> None:
         deadline_s = self.clock() + WRITE_TIMEOUT_S
-        while not self._try_send(frame, deadline_s):
+        while True:
+            try:
+                self._bus.send(frame, max(0.0, deadline_s - self.clock()))
+            except Exception as error:  # drivers raise exceptions of any type
+                number = _errno(error)
+                if number != errno.ENOBUFS or self.clock() >= deadline_s:
+                    raise self._send_error(error, number) from error
+            else:
+                return
             time.sleep(_FULL_QUEUE_S)
-
-    def _try_send(self, frame: can.Message, deadline_s: float) -> bool:
-        """Send the frame; False if the controller's queue is full."""
-        try:
-            self._bus.send(frame, max(0.0, deadline_s - self.clock()))
-        except Exception as error:  # drivers raise exceptions of any type
-            number = _errno(error)
-            if number == errno.ENOBUFS and self.clock() < deadline_s:
-                return False
-            raise self._send_error(error, number) from error
-        return True
 
     def _send_error(self, error: Exception, number: int | None) -> LinkError:
         if number == errno.ENOBUFS or isinstance(error, can.CanTimeoutError) or "buffer full" in str(error):
