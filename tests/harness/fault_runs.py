@@ -47,7 +47,7 @@ from analogrig_emulator import Excitation
 
 N = 60
 MOST_N = 480
-CHANGE_AT, BACK_AT = 40, 456
+CHANGE_AT, BACK_AT = 40, 200
 RIG_BLOCK = 112
 """A whole number of messages."""
 TIMEOUT_S = 2.0

@@ -41,15 +41,9 @@ class FrameBits(NamedTuple):
         return self.nominal / bitrate + self.data / (data_bitrate or bitrate)
 
 
-def longest_frame_s(length_bytes: int, *, fd: bool, bitrate: int, data_bitrate: int | None = None) -> float:
-    """Longest duration of a frame with this much data and an identifier of 11 bits [s]."""
-    bits = longest_fd_bits(length_bytes) if fd else longest_classic_bits(length_bytes)
-    return bits.time_s(bitrate, data_bitrate)
-
-
-def longest_classic_bits(length_bytes: int, *, extended: bool = False) -> FrameBits:
-    """Longest classic frame with this much data (Davis et al. 2007, Equ 1; see ``bus_load``)."""
-    stuffable = (54 if extended else 34) + 8 * length_bytes
+def longest_classic_bits(length_bytes: int) -> FrameBits:
+    """Longest classic frame with this much data and an identifier of 11 bits (Davis et al. 2007, Equ 1)."""
+    stuffable = 34 + 8 * length_bytes
     return FrameBits(stuffable + (stuffable - 1) // 4 + _TAIL_BITS)
 
 

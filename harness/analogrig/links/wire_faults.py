@@ -120,9 +120,9 @@ class Lane(Generic[T]):
 
     def release(self) -> None:
         """Count one frame that has passed, and queue the frames that waited for it."""
-        self.held = [(n - 1, sent) for n, sent in self.held]
-        self.put(*(sent for n, sent in self.held if n <= 0))
-        self.held = [(n, sent) for n, sent in self.held if n > 0]
+        if self.held:
+            self.put(*(sent for n, sent in self.held if n <= 1))
+            self.held = [(n - 1, sent) for n, sent in self.held if n > 1]
 
     def due(self) -> list[T]:
         """Frames that have arrived by now."""
