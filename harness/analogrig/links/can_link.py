@@ -141,8 +141,9 @@ class CanLink:
             return True
         if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame or not frame.data:
             return False
-        packet = bytes((frame.arbitration_id,)) + frame.data
-        return frame.arbitration_id in _HARNESS_IDS and self._sent.get(packet[1]) == packet
+        if frame.arbitration_id not in _HARNESS_IDS:
+            return False
+        return self._sent.get(frame.data[0]) == bytes((frame.arbitration_id,)) + frame.data
 
     def _note_error(self, frame: can.Message) -> None:
         self._counted["error_frames"] += 1
