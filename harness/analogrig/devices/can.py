@@ -69,7 +69,7 @@ class CanDevice(FrameDevice):
         return {key: value for key, value in (("interface", interface), ("channel", channel)) if value}
 
     @classmethod
-    def _grouped(cls, table: dict[str, Any]) -> dict[str, Any]:
+    def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
         """The table with the keys that are no fields collected in ``options``."""
         own = {key: value for key, value in table.items() if key in cls.__dataclass_fields__}
         return {"options": {key: value for key, value in table.items() if key not in own}, **own}

@@ -385,7 +385,7 @@ def open_dut(
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    return connect(_changed(trusted(name, Trust.of(allow)), changes), listener)
+    return connect(_override(trusted(name, Trust.of(allow)), changes), listener)
 
 
 def reopen_dut(
@@ -399,10 +399,10 @@ def reopen_dut(
     """Open the device of a record of ``Dut.description()`` in ``file``; parameters and errors as ``open_dut``."""
     described = recorded(description).placed(Path(file).parent)
     Trust.of(allow).check(described.things, file)
-    return connect(_changed(described, changes), listener)
+    return connect(_override(described, changes), listener)
 
 
-def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
+def _override(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
     """:raises ConfigurationError: a value is out of range, or this kind of device has no such field."""
     wanted = {key: value for key, value in changes.items() if value is not None}
     for key in wanted.keys() - {each.name for each in dataclasses.fields(description)}:

@@ -34,7 +34,7 @@ def _error(classes: int, controller: int = 0) -> can.Message:
     )
 
 
-def _changed(frame: can.Message, **fields: object) -> can.Message:
+def _copy_with(frame: can.Message, **fields: object) -> can.Message:
     """Copy of the frame with other values of these fields."""
     out = copy.copy(frame)
     for name, value in fields.items():
@@ -99,7 +99,7 @@ class FaultyBus(FaultyLine[CanBus, can.Message]):
         message = unpack(bytes((sent.arbitration_id & 0xFF,)) + sent.data)
         if not isinstance(message, Hello):
             return sent
-        return _changed(sent, data=bytearray(pack(message._replace(catalogue_hash=STRANGERS_HASH))[1:]))
+        return _copy_with(sent, data=bytearray(pack(message._replace(catalogue_hash=STRANGERS_HASH))[1:]))
 
     def _show(self, *frames: can.Message) -> None:
         """Deliver frames to the harness."""
@@ -132,12 +132,12 @@ class FaultyBus(FaultyLine[CanBus, can.Message]):
             case "collide":  # another node sends a similar frame, which both ends receive
                 data = bytearray(sent.data)
                 data[lane.rng.randrange(1, len(data))] ^= 1 << lane.rng.randrange(8)
-                other = _changed(sent, data=data, is_rx=True)
+                other = _copy_with(sent, data=data, is_rx=True)
                 if lane is self._lanes["to"]:
                     self._show(other)
                 return other, sent
             case "fd":
-                return (_changed(sent, is_fd=True, bitrate_switch=True),)
+                return (_copy_with(sent, is_fd=True, bitrate_switch=True),)
             case "bus-off":
                 self._show(_error(NOT_ACKNOWLEDGED | CONTROLLER, PASSIVE), _error(BUS_OFF))
                 self._off_until_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S

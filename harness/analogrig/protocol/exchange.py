@@ -287,7 +287,7 @@ class Exchange:
     def _accept(self, message: Message) -> None:
         """Accept an answer about the oldest sample, or about one whose predecessors were lost."""
         if not is_finite(message):
-            raise self._non_finite(message)
+            raise self._non_finite_error(message)
         if (
             isinstance(message, Estimate)
             and message.sample_index == self._wire_index
@@ -305,7 +305,7 @@ class Exchange:
             self._lose(lost)
             self._accept(message)
         else:
-            raise self._unexpected(message)
+            raise self._unexpected_error(message)
 
     def _ends(self, message: Stepped) -> bool:
         """True if the message completes a sample of this run."""
@@ -380,7 +380,7 @@ class Exchange:
             )
         self._lose(len(self._pending))
 
-    def _non_finite(self, message: Message) -> DeviceError:
+    def _non_finite_error(self, message: Message) -> DeviceError:
         """Error for an answer with a value that is NaN or infinite."""
         wire_index = getattr(message, "sample_index", self._answered % INDICES)
         index = index_up_to(sum(self._pending[-1]) - 1 if self._pending else self._answered, wire_index)
@@ -391,7 +391,7 @@ class Exchange:
             " which is not finite"
         )
 
-    def _unexpected(self, message: Message) -> DeviceError:
+    def _unexpected_error(self, message: Message) -> DeviceError:
         due = self._elements[self._next_element]
         wanted = "Stepped" if due == _NO_ELEMENT else f"Estimate of {Element(due).name}"
         return DeviceError(

@@ -11,20 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig import catalogue, config
-from analogrig.catalogue import (
-    CATALOGUE_HASH,
-    INDICES,
-    LAYOUTS,
-    RUN_SHIFT,
-    RUNS,
-    SEQS,
-    STEPPED_FLAGS,
-    Message,
-    brief,
-    index_up_to,
-    pack,
-    unpack,
-)
+from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.recordings.files import silence_logger
 
@@ -195,7 +182,7 @@ class CaptureDecoder:
         self._last[from_harness] = message
         if last is None or isinstance(message, catalogue.Identify | catalogue.Hello):
             return True
-        step = (message.seq - last.seq) % SEQS
+        step = (message.seq - last.seq) % catalogue.SEQS
         if step == 0:
             if type(message) is not type(last) or message != last:
                 sender = "harness" if from_harness else "device"
@@ -237,7 +224,7 @@ class CaptureDecoder:
 
     def _belongs_to_run(self, flags: int) -> bool:
         """True if the run id in ``flags`` is that of the current run, which adopts the first id if it has none."""
-        run, current = flags >> RUN_SHIFT & (RUNS - 1), self._current_run()
+        run, current = flags >> catalogue.RUN_SHIFT & (RUNS - 1), self._current_run()
         if current.run is None:
             current.run = run
         self.line["messages_of_other_runs"] += current.run != run
@@ -272,10 +259,10 @@ class CaptureDecoder:
 
         :raises RecordingError: the device uses another catalogue, and no DBC was given.
         """
-        if self._dictionary.is_own and message.catalogue_hash != CATALOGUE_HASH:
+        if self._dictionary.is_own and message.catalogue_hash != catalogue.CATALOGUE_HASH:
             raise RecordingError(
-                f"the device uses catalogue {message.catalogue_hash:#010x}, this harness {CATALOGUE_HASH:#010x}:"
-                " pass the DBC of the device with --dbc"
+                f"the device uses catalogue {message.catalogue_hash:#010x}, this harness"
+                f" {catalogue.CATALOGUE_HASH:#010x}: pass the DBC of the device with --dbc"
             )
         hello = {"catalogue_hash": message.catalogue_hash, "theta_max": message.theta_max}
         self._identity = {**self._identity, **hello}
@@ -331,6 +318,6 @@ class CaptureDecoder:
             run.incomplete.add(index)
             self._has_gap = False
         self._date_diagnosis(index)
-        step = (message.flags & STEPPED_FLAGS, message.statistic)
+        step = (message.flags & catalogue.STEPPED_FLAGS, message.statistic)
         if run.steps.setdefault(index, step) != step:
             self._add_fault(f"the step of sample {index} was sent twice with different values")
