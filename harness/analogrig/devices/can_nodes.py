@@ -6,7 +6,7 @@ import ctypes
 import secrets
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from analogrig.devices.child import Child
@@ -60,18 +60,26 @@ def _from_c(frame: _Frame) -> can.Message:
     )
 
 
-class LibraryCanDevice(LibraryDevice):
-    """The device in the shared library, behind its CAN port."""
+class MemoryBus(LibraryDevice):
+    """A bus with a device in this process as its only other node, on a virtual clock."""
 
-    def __init__(self, boot_nonce: int, *, is_fd: bool, input_blocks: int = ALWAYS_ROOM) -> None:
+    name = "memory"
+    unread_n = None
+    damaged = 0
+
+    def __init__(
+        self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None, input_blocks: int = ALWAYS_ROOM
+    ) -> None:
         """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
         super().__init__("can", ctypes.c_bool(is_fd), boot_nonce=boot_nonce, input_blocks=input_blocks)
+        self.is_fd, self.line = is_fd, line
+        self.clock = VirtualClock()
         self._output = (_Frame * _OUTPUT_N)()
+        self._answers: deque[can.Message] = deque()
 
-    def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
-        """Answers of the device to these frames."""
-        waiting = [_to_c(frame) for frame in frames]
-        out: list[can.Message] = []
+    def answers(self, frame: can.Message) -> list[can.Message]:
+        """Answers of the device to a frame."""
+        waiting, out = [_to_c(frame)], []
         while True:
             array = (_Frame * len(waiting))(*waiting)
             progress = self.run(self.state, array, len(waiting), self._output, _OUTPUT_N)
@@ -80,26 +88,8 @@ class LibraryCanDevice(LibraryDevice):
             if not progress.given and not waiting:
                 return out
 
-
-class MemoryBus:
-    """A bus with a device in this process as its only other node, on a virtual clock."""
-
-    name = "memory"
-    unread_n = None
-    damaged = 0
-
-    def __init__(self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None) -> None:
-        """Boot a device.
-
-        :raises LinkError: the project's library was not built.
-        """
-        self.is_fd, self.line = is_fd, line
-        self.clock = VirtualClock()
-        self._device = LibraryCanDevice(boot_nonce, is_fd=is_fd)
-        self._answers: deque[can.Message] = deque()
-
     def send(self, frame: can.Message) -> None:
-        self._answers += self._device.answers([frame])
+        self._answers += self.answers(frame)
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next answer. Without any, the clock advances by the whole time-out, since none can follow."""
@@ -122,7 +112,7 @@ class InhabitedBus(PythonCanBus):
         """
         super().__init__(config)
         try:
-            self._device = LibraryCanDevice(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
+            self._device = MemoryBus(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
             self._devices_bus = PythonCanBus(config)
         except BaseException:
             super().close()
@@ -151,7 +141,7 @@ class InhabitedBus(PythonCanBus):
             while not self._ends.is_set():
                 frame = self._devices_bus.receive(_POLL_S)
                 if frame is not None and not self._is_echo(frame):
-                    for answer in self._device.answers([frame]):
+                    for answer in self._device.answers(frame):
                         self._sent[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
         except Exception as error:  # noqa: BLE001 - ``receive`` reports any end of the thread

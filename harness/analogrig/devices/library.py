@@ -90,7 +90,7 @@ class LibraryDevice:
         init(self.state, ctypes.byref(identity), *arguments)
 
 
-class MemoryWire:
+class MemoryWire(LibraryDevice):
     """Wire to a device in this process: the same C code and frames as elsewhere, on a virtual clock."""
 
     name = "memory"
@@ -104,14 +104,14 @@ class MemoryWire:
         library: Path = LIBRARY,
     ) -> None:
         """Boot a device; parameters and errors as ``LibraryDevice``."""
-        self._device = LibraryDevice("serial", boot_nonce=boot_nonce, catalogue_hash=catalogue_hash, library=library)
+        super().__init__("serial", boot_nonce=boot_nonce, catalogue_hash=catalogue_hash, library=library)
         self._output = ctypes.create_string_buffer(_OUTPUT_BYTES)
         self.clock = VirtualClock() if clock is None else clock
         self._answers = b""
 
     def write(self, sent: bytes) -> None:
         while True:
-            progress = self._device.run(self._device.state, sent, len(sent), self._output, _OUTPUT_BYTES)
+            progress = self.run(self.state, sent, len(sent), self._output, _OUTPUT_BYTES)
             self._answers += ctypes.string_at(self._output, progress.given)
             sent = sent[progress.taken :]
             if not progress.given and not sent:

@@ -7,11 +7,10 @@ import gc
 import io
 import logging
 import sys
-import typing
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from analogrig.errors import RecordingError
 from analogrig.wording import number_of
@@ -88,19 +87,6 @@ LONGEST_LINE = 4096
 """Characters of a line of a candump log that are read at once; a frame has at most 200."""
 
 
-class _CountedLines(io.TextIOBase):
-    """Text file that counts the lines read, and cuts those that are longer than ``LONGEST_LINE``."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-        self.number = 0
-
-    def readline(self, _size: int | None = -1, /) -> str:  # type: ignore[override]
-        line = self._file.readline(LONGEST_LINE)
-        self.number += line != ""
-        return line
-
-
 @dataclass
 class CapturedFrames:
     """Frames of a file, read by python-can; can be iterated once."""
@@ -134,16 +120,12 @@ class CapturedFrames:
         from analogrig.links.python_can import can
 
         with self.path.open(encoding="ascii", errors="replace") as file:
-            lines = _CountedLines(file)
-            while True:
-                before = lines.number
+            lines = iter(lambda: file.readline(LONGEST_LINE), "")
+            for number, line in enumerate(lines, 1):
                 try:
-                    yield from can.CanutilsLogReader(typing.cast(TextIO, lines))
+                    yield from can.CanutilsLogReader(io.StringIO(line))
                 except Exception:  # noqa: BLE001 - python-can's exceptions for damaged lines are undocumented
-                    self.damaged.append(lines.number)
-                    if lines.number > before:
-                        continue
-                return
+                    self.damaged.append(number)
 
     def _read_binary(self) -> Iterator[can.Message]:
         """Read any other format, in which reading ends at the first fault."""
