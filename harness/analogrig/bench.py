@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
 
-from analogrig.devices.dut import Dut, Stretch
+from analogrig.devices.dut import Dut
 from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
 from analogrig.links.wire import Clock
-from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis
+from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis, Stretch
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Conditions, Run, missing_samples

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.devices.reference import ReferenceEstimator
-from analogrig.estimator_config import EstimatorConfig
 from analogrig_thesis.document import Drawing, Facts, Mark, ReproducedChapter, Signal
+from analogrig_thesis.double_precision import PlainEstimator
 from analogrig_thesis.plants import square
 from analogrig_thesis.schemes import PLAIN, schemes
 from analogrig_thesis.tracking import Track, settling_n, track
@@ -171,7 +170,7 @@ def _wind_up(example: Example) -> Facts:
     u, config = example.u.copy(), SCHEMES["forgetting"]
     u[SILENT] = 0.0
     errors = track(config, u, respond(u, example.steady, example.noise)).theta / example.steady - 1.0
-    p = _diagonals(config, u, respond(u, example.steady))
+    _, p = PlainEstimator(config).run(u, respond(u, example.steady))
     late = errors[300:600]
     return {
         "growth_of_p_in_100": float(p[380, 0] / p[280, 0]),
@@ -179,16 +178,6 @@ def _wind_up(example: Example) -> Facts:
         "spread_in_silence": float(late.std(axis=0).max()),
         "bias_in_silence": float(np.abs(late.mean(axis=0)).max()),
     }
-
-
-def _diagonals(config: EstimatorConfig, u: Signal, y: Signal) -> Signal:
-    """Diagonal of P (N, 3), which only the estimator in Python exposes."""
-    estimator, out = ReferenceEstimator(config), []
-    for pair in zip(u.tolist(), y.tolist(), strict=True):
-        estimator.step(*pair)
-        upper = np.array(estimator.covariance.u)
-        out.append((upper**2 * estimator.covariance.d).sum(axis=1) / estimator.covariance.weight)
-    return np.array(out)
 
 
 def _differences_from_plain(example: Example) -> dict[str, float]:

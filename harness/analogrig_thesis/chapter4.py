@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from analogrig.devices.reference import ReferenceEstimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import Plant
 from analogrig.run import Segment
 from analogrig_thesis.document import Drawing, Facts, ReproducedChapter, Signal
+from analogrig_thesis.double_precision import PlainEstimator
 from analogrig_thesis.plants import (
     FRONT,
     PERIOD_S,
@@ -381,8 +381,7 @@ def _extra_alarms_by_noise(simulation: Simulation, key: str) -> dict[str, dict[s
         for seed in NOISE_SEEDS if rms else (0,):
             y = simulation.y * UNITS_PER_M + np.random.default_rng(seed).normal(0.0, rms, PROFILE_N)
             single = track(config, u, y, 1.0 / UNITS_PER_M)
-            steps = ReferenceEstimator(config).run(u.tolist(), y.tolist())
-            double = dataclasses.replace(single, alarms=np.flatnonzero([step.alarm for step in steps]))
+            double = dataclasses.replace(single, alarms=PlainEstimator(config).run(u, y)[0])
             extra.append([assess(each, PROFILE).extra_alarms for each in (single, double)])
         for row, mean in zip(out.values(), np.mean(extra, axis=0).tolist(), strict=True):
             row[f"{rms:g}"] = mean

@@ -7,7 +7,7 @@
     results  what the command leaves in /run/results; its status in /run/results/status; what it prints, on the console
 
 QEMU emulates every instruction: a program takes ten to twenty times as long as outside. It runs below a tether
-(harness/analogrig/links/child.py), so that it ends with whoever started it, and may not run for longer than it was
+(harness/analogrig/devices/child.py), so that it ends with whoever started it, and may not run for longer than it was
 given.
 """
 

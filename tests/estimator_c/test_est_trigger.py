@@ -13,7 +13,6 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 import analogrig.devices.estimator
-from analogrig.devices.reference import ReferenceEstimator
 from analogrig.estimator_config import EstimatorConfig
 from tests.estimator_c.est_driver import (
     ANYWHERE,
@@ -24,6 +23,7 @@ from tests.estimator_c.est_driver import (
     PREDICTION_ERROR,
     Estimator,
 )
+from tests.estimator_c.reference import ReferenceEstimator
 
 FRONT = (115.0, 3021.0, 24500.0)
 PERIOD_S = 0.01

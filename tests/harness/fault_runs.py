@@ -35,10 +35,9 @@ from analogrig.judging.verdict import judge
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_link import CanLink
 from analogrig.links.faulty_bus import FaultyBus
-from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
-from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from analogrig.protocol.exchange import Replies
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Channel, Run
@@ -47,7 +46,7 @@ from analogrig_emulator import Excitation
 
 N = 60
 MOST_N = 480
-CHANGE_AT, BACK_AT = 40, 456
+CHANGE_AT, BACK_AT = 40, 200
 RIG_BLOCK = 112
 """A whole number of messages."""
 TIMEOUT_S = 2.0

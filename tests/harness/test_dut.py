@@ -280,14 +280,12 @@ def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
         dut.configure(EstimatorConfig(nb=7))
 
 
-def test_running_device_cannot_be_configured() -> None:
+def test_running_device_cannot_be_configured_or_started() -> None:
+    dut = started(FramedLink(MemoryWire(1)))
     with pytest.raises(DeviceRefused, match=r"^device bob: na = 2 was not applied: RUNNING, it has 2$"):
-        started(FramedLink(MemoryWire(1))).configure(EstimatorConfig())
-
-
-def test_running_device_cannot_be_started() -> None:
+        dut.configure(EstimatorConfig())
     with pytest.raises(DeviceRefused, match="^device bob: START was refused: RUNNING$"):
-        started(FramedLink(MemoryWire(1))).start()
+        dut.start()
 
 
 # ---- faults of the line
@@ -441,21 +439,16 @@ def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> N
         feed(dut, 0, N)
 
 
-def test_loss_in_a_stream_costs_no_time(line: FaultyLink) -> None:
-    """The answers to the next message tell of it."""
-    dut = started(line, exchange="stream")
-    line.to_device = about(SampleBlock, 84, lose)
+@pytest.mark.parametrize(("exchange", "kind", "cost_s"), [("stream", SampleBlock, 0.0), ("sample", Sample, 2.0)])
+def test_loss_costs_one_time_out_in_lock_step_and_none_in_a_stream(
+    line: FaultyLink, exchange: str, kind: type, cost_s: float
+) -> None:
+    """In a stream the answers to the next message tell of it."""
+    dut = started(line, exchange=exchange)
+    line.to_device = about(kind, 84, lose)
     before_s = line.clock()
     feed(dut, 0, N)
-    assert line.clock() == before_s
-
-
-def test_loss_in_lock_step_costs_one_time_out(line: FaultyLink) -> None:
-    dut = started(line)
-    line.to_device = about(Sample, 84, lose)
-    before_s = line.clock()
-    feed(dut, 0, N)
-    assert line.clock() == pytest.approx(before_s + 2.0)
+    assert line.clock() == pytest.approx(before_s + cost_s)
 
 
 def test_line_that_loses_all_samples_is_given_up(line: FaultyLink) -> None:
@@ -576,19 +569,34 @@ def test_no_more_blocks_are_on_their_way_than_the_device_can_hold(
     assert most_unanswered == most
 
 
-@pytest.mark.parametrize(("kind", "after"), [(Estimate, "Stepped 80"), (Stepped, "Estimate 81 and Hello")])
-def test_lost_answer_is_told(line: FaultyLink, kind: type, after: str) -> None:
-    dut = started(line)
-    line.from_device = about(kind, 81, lose)
-    with pytest.raises(LinkError, match=f"1 message was lost between {after}"):
-        feed(dut, 0, N)
+def instead(*fields: Any, kind: type[Message] = Stepped) -> Fault:
+    """An answer of this kind, with these fields and the number of the genuine one."""
+    return lambda message: [kind(message.seq, *fields)]
 
 
-def test_lost_answer_in_a_block_is_told(line: FaultyLink) -> None:
-    dut = started(line, exchange="block")
-    line.from_device = about(Stepped, 81, lose)
-    said = "1 message was lost between Estimate 81 and Estimate 82, or another node sends as the device"
-    with pytest.raises(LinkError, match=f"^device bob: {said}"):
+@pytest.mark.parametrize(
+    ("exchange", "kind", "fault", "error", "said"),
+    [
+        ("sample", Estimate, lose, LinkError, "1 message was lost between Stepped 80"),
+        ("sample", Stepped, lose, LinkError, "1 message was lost between Estimate 81 and Hello"),
+        ("block", Stepped, lose, LinkError, "1 message was lost between Estimate 81 and Estimate 82, or another node"),
+        ("sample", Estimate, instead(0, 81, 0.0), DeviceError, "expected Estimate of THETA_0 for sample 81, received"),
+        ("sample", Stepped, instead(0, 80, 0.0), DeviceError, "expected Stepped for sample 81, .*sample_index=80"),
+        (
+            "sample",
+            Stepped,
+            instead(Change.UNDECIDED, 80, 1.0, kind=Diagnosis),
+            DeviceError,
+            r"expected Stepped for sample 81, received Diagnosis\(.*$",
+        ),
+    ],
+)
+def test_answer_that_is_lost_or_wrong_is_told(
+    line: FaultyLink, exchange: str, kind: type, fault: Fault, error: type[Exception], said: str
+) -> None:
+    dut = started(line, exchange=exchange)
+    line.from_device = about(kind, 81, fault)
+    with pytest.raises(error, match=f"^device bob: {said}"):
         feed(dut, 0, N)
 
 
@@ -611,29 +619,6 @@ def test_repeated_everything_changes_nothing(line: FaultyLink, reference: Replie
     dut = started(line)
     assert_same(feed(dut, 0, N), reference)
     dut.stop()
-
-
-def test_answer_that_was_not_due_is_told(line: FaultyLink) -> None:
-    dut = started(line)
-    line.from_device = about(Estimate, 81, lambda message: [Stepped(message.seq, 0, 81, 0.0)])
-    with pytest.raises(
-        DeviceError, match=r"^device bob: expected Estimate of THETA_0 for sample 81, received Stepped\(.*$"
-    ):
-        feed(dut, 0, N)
-
-
-def test_diagnosis_of_nothing_is_told(line: FaultyLink) -> None:
-    dut = started(line)
-    line.from_device = about(Stepped, 81, lambda message: [Diagnosis(message.seq, Change.UNDECIDED, 80, 1.0)])
-    with pytest.raises(DeviceError, match=r"^device bob: expected Stepped for sample 81, received Diagnosis\(.*$"):
-        feed(dut, 0, N)
-
-
-def test_answer_about_another_sample_is_told(line: FaultyLink) -> None:
-    dut = started(line)
-    line.from_device = about(Stepped, 81, lambda message: [Stepped(message.seq, 0, 80, 0.0)])
-    with pytest.raises(DeviceError, match=r"^device bob: expected Stepped for sample 81, .*sample_index=80"):
-        feed(dut, 0, N)
 
 
 def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:

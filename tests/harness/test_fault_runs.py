@@ -7,12 +7,10 @@ from typing import Any
 import pytest
 
 from analogrig.devices.registry import describe
-from analogrig.links.faulty_wire import FaultyWire
-from analogrig.links.wire_faults import DIRECTIONS, Direction, WireFault, WireFaults
+from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
 from tests.harness.fault_runs import (
     BACK_AT,
     FAULTY,
-    MOST_N,
     WAYS,
     Case,
     ExchangeKind,
@@ -66,13 +64,14 @@ def test_collision_on_the_last_message_of_a_run_is_noticed() -> None:
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_diagnosis_is_that_of_a_line_without_faults_or_the_run_is_not_valid(kind: str, direction: Direction) -> None:
     """play() compares them; the plant is as before from BACK_AT on, which is diagnosed some samples later."""
-    ((said),) = reference(MOST_N, ()).diagnoses
+    n = BACK_AT + 24
+    (said,) = reference(n, ()).diagnoses
     assert BACK_AT < said.index < BACK_AT + 20
     per_sample = {"to": 1, "from": 8}[direction]
     first = steps("sample")[direction].index("samples")
     for number in range(first + (BACK_AT - 2) * per_sample, first + (said.index + 3) * per_sample):
         faults = WireFaults((WireFault(kind, direction, number),), seed=number)
-        assert play(Case(faults, samples=MOST_N)).outcome in {"as without", "lost", "inconclusive"}
+        assert play(Case(faults, samples=n)).outcome in {"as without", "lost", "inconclusive"}
 
 
 # ---- over a real line

@@ -12,9 +12,8 @@ from analogrig.catalogue import Sample, pack
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, LinkClosed
 from analogrig.links import frame
-from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.wire import VirtualClock
-from analogrig.links.wire_faults import WireFault, WireFaults
+from analogrig.links.wire_faults import FaultyWire, WireFault, WireFaults
 
 FRAMES = [frame.encode(pack(Sample(i, 0, i, 1000 + i, 2000))) for i in range(60)]
 

@@ -17,10 +17,10 @@ from scipy.signal import butter, cont2discrete, freqz, lfilter
 
 from analogrig.cli import main
 from analogrig.config import fixtures
-from analogrig.devices.reference import ReferenceEstimator
 from analogrig.run import Run
 from analogrig_thesis.chapter4 import SCHEMES
 from analogrig_thesis.reproduction import CLAIMS, PAGE, RECORDINGS, reproduce
+from tests.estimator_c.reference import ReferenceEstimator
 from tests.thesis.oracle import (
     CHANGES,
     PERIOD_S,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote, urlencode
 
+from analogrig.devices.child import Child
 from analogrig.devices.description import FrameDevice
 from analogrig.devices.host import HOST_PROGRAM, host_child
 from analogrig.devices.library import LIBRARY
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 
 _ONE_CONNECTION = frozenset({"slcan", "serial", "robotell", "seeedstudio"})
 """Interfaces of python-can behind a serial port, which only one process can open."""
+
+
+def _start_host(bus: PythonCanBus) -> Child:
+    """Start the device's process on the bus."""
+    child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])])
+    return child.connect(lambda _: child)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +69,13 @@ class CanDevice(FrameDevice):
         return {key: value for key, value in (("interface", interface), ("channel", channel)) if value}
 
     @classmethod
-    def _grouped(cls, table: dict[str, Any]) -> dict[str, Any]:
+    def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
         """The table with the keys that are no fields collected in ``options``."""
         own = {key: value for key, value in table.items() if key in cls.__dataclass_fields__}
         return {"options": {key: value for key, value in table.items() if key not in own}, **own}
 
     def bus(self) -> CanBus:
+        from analogrig.devices.can_nodes import ChildBus, InhabitedBus
         from analogrig.links.can_bus import PythonCanBus, complete_config
 
         config = complete_config(self._described_bus())
@@ -78,31 +86,16 @@ class CanDevice(FrameDevice):
             raise ConfigurationError(f"device {self.name}: {error}") from error
         if interface == "virtual" and config["channel"] is None:
             config["channel"] = f"analogrig-{secrets.token_hex(4)}"  # shared with nobody else in this process
-        bus = PythonCanBus(config)
-        try:
-            return self._with_device(bus, config)
-        except BaseException:
-            bus.close()
-            raise
+        started = self._started_device(interface)
+        if started == "inproc":
+            return InhabitedBus(config)
+        return ChildBus(config, _start_host) if started == "host" else PythonCanBus(config)
 
     def _described_bus(self) -> dict[str, Any]:
         """Arguments of the bus in python-can's terms, as far as they are described."""
         given = {**self.options, "fd": self.fd or None, "bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
         given |= {"interface": self.interface or None, "channel": self.channel or None}
         return {key: value for key, value in given.items() if value is not None}
-
-    def _with_device(self, bus: PythonCanBus, config: Mapping[str, Any]) -> CanBus:
-        """The bus, after starting the device on it that the description asks for."""
-        from analogrig.devices.can_nodes import ChildBus, InhabitedBus
-        from analogrig.links.can_bus import PythonCanBus
-
-        started = self._started_device(str(config["interface"]))
-        if started == "inproc":
-            return InhabitedBus(bus, PythonCanBus(config), boot_nonce=secrets.randbits(32))
-        if started == "none":
-            return bus
-        child = host_child(["--can", str(bus.channel), *(["--fd"] if bus.is_fd else [])])
-        return child.connect(lambda _: ChildBus(child, bus))
 
     @property
     def program(self) -> Path | None:

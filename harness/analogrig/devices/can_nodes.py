@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import secrets
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping
+from typing import Any
 
-from analogrig.catalogue import CATALOGUE_HASH
 from analogrig.devices.child import Child
 from analogrig.devices.library import ALWAYS_ROOM, LibraryDevice
 from analogrig.errors import LinkClosed
-from analogrig.links.can_bus import CanBus, WrappedBus
+from analogrig.links.can_bus import PythonCanBus
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import can
 from analogrig.links.wire import VirtualClock
@@ -42,12 +43,8 @@ class _Frame(ctypes.Structure):
 
 
 def _to_c(frame: can.Message) -> _Frame:
-    flags = (
-        (_EXTENDED if frame.is_extended_id else 0)
-        | (_REMOTE if frame.is_remote_frame else 0)
-        | (_FD if frame.is_fd else 0)
-        | (_ERROR if frame.is_error_frame else 0)
-    )
+    flags = _EXTENDED * frame.is_extended_id | _REMOTE * frame.is_remote_frame
+    flags |= _FD * frame.is_fd | _ERROR * frame.is_error_frame
     data = bytes(frame.data[:MOST_BYTES])
     out = _Frame(frame.arbitration_id, flags, len(data))
     ctypes.memmove(out.data, data, len(data))
@@ -63,18 +60,26 @@ def _from_c(frame: _Frame) -> can.Message:
     )
 
 
-class LibraryCanDevice(LibraryDevice):
-    """The device in the shared library, behind its CAN port."""
+class MemoryBus(LibraryDevice):
+    """A bus with a device in this process as its only other node, on a virtual clock."""
 
-    def __init__(self, *, is_fd: bool, catalogue_hash: int = CATALOGUE_HASH, input_blocks: int = ALWAYS_ROOM) -> None:
-        """Load a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
-        super().__init__("can", ctypes.c_bool(is_fd), catalogue_hash=catalogue_hash, input_blocks=input_blocks)
+    name = "memory"
+    unread_n = None
+    damaged = 0
+
+    def __init__(
+        self, boot_nonce: int, *, is_fd: bool = False, line: CanLine | None = None, input_blocks: int = ALWAYS_ROOM
+    ) -> None:
+        """Boot a device with or without CAN FD; parameters and errors as ``LibraryDevice``."""
+        super().__init__("can", ctypes.c_bool(is_fd), boot_nonce=boot_nonce, input_blocks=input_blocks)
+        self.is_fd, self.line = is_fd, line
+        self.clock = VirtualClock()
         self._output = (_Frame * _OUTPUT_N)()
+        self._answers: deque[can.Message] = deque()
 
-    def answers(self, frames: Iterable[can.Message]) -> list[can.Message]:
-        """Answers of the device to these frames."""
-        waiting = [_to_c(frame) for frame in frames]
-        out: list[can.Message] = []
+    def answers(self, frame: can.Message) -> list[can.Message]:
+        """Answers of the device to a frame."""
+        waiting, out = [_to_c(frame)], []
         while True:
             array = (_Frame * len(waiting))(*waiting)
             progress = self.run(self.state, array, len(waiting), self._output, _OUTPUT_N)
@@ -83,36 +88,8 @@ class LibraryCanDevice(LibraryDevice):
             if not progress.given and not waiting:
                 return out
 
-
-class MemoryBus:
-    """A bus with a device in this process as its only other node, on a virtual clock."""
-
-    name = "memory"
-    unread_n = None
-    damaged = 0
-
-    def __init__(
-        self,
-        boot_nonce: int,
-        *,
-        is_fd: bool = False,
-        line: CanLine | None = None,
-        catalogue_hash: int = CATALOGUE_HASH,
-        clock: VirtualClock | None = None,
-    ) -> None:
-        """Boot a device.
-
-        :raises LinkError: the project's library was not built.
-        """
-        self.is_fd = is_fd
-        self.line = line
-        self.clock = VirtualClock() if clock is None else clock
-        self._device = LibraryCanDevice(is_fd=is_fd, catalogue_hash=catalogue_hash)
-        self._answers: deque[can.Message] = deque()
-        self._device.boot(boot_nonce)
-
     def send(self, frame: can.Message) -> None:
-        self._answers += self._device.answers([frame])
+        self._answers += self.answers(frame)
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next answer. Without any, the clock advances by the whole time-out, since none can follow."""
@@ -125,23 +102,26 @@ class MemoryBus:
         """Do nothing: nothing is held."""
 
 
-class InhabitedBus(WrappedBus):
+class InhabitedBus(PythonCanBus):
     """A bus with a device in this process, which a thread serves over a connection of its own."""
 
-    def __init__(self, bus: CanBus, devices_bus: CanBus, boot_nonce: int) -> None:
-        """Take over both connections to the same bus, and boot the device.
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        """Open two connections to the same bus, and boot the device.
 
-        :raises LinkError: the project's library was not built.
+        :raises ConfigurationError, LinkError: as for ``PythonCanBus``, or the project's library was not built.
         """
-        super().__init__(bus)
-        self._devices_bus = devices_bus
-        self._device = LibraryCanDevice(is_fd=bus.is_fd, input_blocks=BUS_INPUT_BLOCKS)
-        self._device.boot(boot_nonce)
+        super().__init__(config)
+        try:
+            self._device = MemoryBus(secrets.randbits(32), is_fd=self.is_fd, input_blocks=BUS_INPUT_BLOCKS)
+            self._devices_bus = PythonCanBus(config)
+        except BaseException:
+            super().close()
+            raise
         self._sent: dict[tuple[int, int], bytes] = {}
         """Latest data from the device, by identifier and sequence number."""
         self._ends = threading.Event()
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._serve, name=f"device on {bus.name}", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name=f"device on {self.name}", daemon=True)
         self._thread.start()
 
     def receive(self, timeout_s: float) -> can.Message | None:
@@ -161,7 +141,7 @@ class InhabitedBus(WrappedBus):
             while not self._ends.is_set():
                 frame = self._devices_bus.receive(_POLL_S)
                 if frame is not None and not self._is_echo(frame):
-                    for answer in self._device.answers([frame]):
+                    for answer in self._device.answers(frame):
                         self._sent[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
         except Exception as error:  # noqa: BLE001 - ``receive`` reports any end of the thread
@@ -174,13 +154,19 @@ class InhabitedBus(WrappedBus):
         return self._sent.get((frame.arbitration_id, frame.data[0])) == bytes(frame.data)
 
 
-class ChildBus(WrappedBus):
+class ChildBus(PythonCanBus):
     """A bus to a child process, which ends when the bus is closed."""
 
-    def __init__(self, child: Child, bus: CanBus) -> None:
-        """Take over both."""
-        super().__init__(bus)
-        self.child = child
+    def __init__(
+        self, config: Mapping[str, Any], start: Callable[[PythonCanBus], Child], *, name: str | None = None
+    ) -> None:
+        """Open the bus, and take over the process that ``start`` returns for it; errors as of both."""
+        super().__init__(config, name=name)
+        try:
+            self.child = start(self)
+        except BaseException:
+            super().close()
+            raise
 
     def send(self, frame: can.Message) -> None:
         with self.child.reports_exit():

@@ -18,7 +18,9 @@ from typing import TypeVar
 from analogrig.errors import LinkClosed, LinkError
 from analogrig.links.wire import Wire
 
-TETHER = Path(__file__).parents[1] / "bin" / "analogrig-tether"
+PROGRAMS = Path(__file__).parents[1] / "bin"
+"""Folder of the programs that the package brings."""
+TETHER = PROGRAMS / "analogrig-tether"
 
 START_TIMEOUT_S = 5.0
 END_TIMEOUT_S = 3.0

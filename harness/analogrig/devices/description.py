@@ -14,11 +14,10 @@ from analogrig import config
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.faulty_wire import FaultyWire
 from analogrig.links.line import CanLine, SerialLine
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
-from analogrig.links.wire_faults import WireFaults
+from analogrig.links.wire_faults import FaultyWire, WireFaults
 from analogrig.trust import Thing
 
 if TYPE_CHECKING:  # importing python-can takes longer than all other imports together
@@ -72,7 +71,7 @@ class DeviceDescription:
             raise ValueError(str(error)) from error
 
     @classmethod
-    def named(cls, name: str, rest: str) -> Self:
+    def from_name(cls, name: str, rest: str) -> Self:
         """Device with the command-line name ``name``; ``rest`` is its part after the kind and the colon.
 
         :raises ConfigurationError: ``rest`` is not a place and KEY=VALUE pairs of this kind.
@@ -83,7 +82,7 @@ class DeviceDescription:
             if key in table:
                 raise ConfigurationError(f"{name}: {key} is given twice")
             table[key] = _value(cls, key, text)
-        return config.build(cls, cls._grouped(table), name)
+        return config.build(cls, cls._group_options(table), name)
 
     @classmethod
     def check_place(cls, name: str, place: str) -> None:
@@ -94,7 +93,7 @@ class DeviceDescription:
             )
 
     @classmethod
-    def _grouped(cls, table: dict[str, Any]) -> dict[str, Any]:
+    def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
         """The table with every key at its place in the description."""
         return table
 

@@ -8,12 +8,9 @@ from __future__ import annotations
 import dataclasses
 import enum
 import secrets
-import struct
-from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -46,13 +43,12 @@ from analogrig.errors import (
     LinkClosed,
     LinkError,
     LinkTimeout,
-    TimeLimitReached,
 )
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation
-from analogrig.protocol.exchange import Exchange, Packing, Replies, most_answers
+from analogrig.protocol.exchange import Exchange, Packing, Replies, Stretch, most_answers
 from analogrig.protocol.pace import Pace, check_line
 from analogrig.trust import Trust
 
@@ -62,7 +58,7 @@ _HELLO_AGAIN_S = 0.25
 
 @dataclass(frozen=True)
 class DeviceIdentity:
-    """DeviceIdentity of a device, from its answer to the handshake."""
+    """Identity of a device, from its answer to the handshake."""
 
     firmware: str
     catalogue_hash: int
@@ -72,10 +68,6 @@ class DeviceIdentity:
     """Largest number of parameters that this build can estimate."""
     input_blocks: int
     """Number of blocks of samples that fit in its input buffer."""
-
-
-Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
-"""Index of the first sample, force, displacement, missing."""
 
 
 class Dut:
@@ -151,9 +143,7 @@ class Dut:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -174,7 +164,11 @@ class Dut:
                 f"device {self.name}: exchange: a block has 64 bytes, and a frame of classic CAN carries 8: set"
                 " sample or stream, or use CAN FD (fd)"
             )
-        self._identity = self._identify(starting_s=self._description.starting_s)
+        try:
+            self._identity = self._request_identity(anew=True, starting_s=self._description.starting_s)
+        except LinkTimeout as error:
+            hint = self._description.hint(self.link_name)
+            raise LinkTimeout(f"{error}; {hint}" if hint else str(error)) from error
         self._control(Command.RESET)
         self._control(Command.REPORT_INTERVAL, self._description.report_interval_n)
         return self._identity
@@ -184,7 +178,7 @@ class Dut:
 
         :raises DeviceError: it was reset since the handshake.
         """
-        return self._check_boot(self._identify())
+        return self._check_boot(self._request_identity(anew=True))
 
     def configure(self, estimator: EstimatorConfig | None = None) -> None:
         """Set every field of the device's configuration, and check that each was applied.
@@ -195,7 +189,7 @@ class Dut:
         if estimator is not None:
             self._description = dataclasses.replace(self._description, estimator=estimator)
         for key, value in self._description.estimator.settings():
-            wanted = _float32(value)
+            wanted = float(np.float32(value))  # as the device holds it
             answer = self._talk.ask(Configure(self._talk.next_seq(), key, wanted), Configured)
             if answer.key != key or answer.result != Result.APPLIED or answer.value != wanted:
                 raise DeviceRefused(
@@ -309,19 +303,19 @@ class Dut:
             )
         return identity
 
-    def _identify(self, *, starting_s: float = 0.0) -> DeviceIdentity:
-        """DeviceIdentity of the device, after skipping messages still buffered in the line."""
-        self._talk.begin()
-        return self._request_identity(after_anything=True, starting_s=starting_s)
+    def _request_identity(self, *, anew: bool = False, starting_s: float = 0.0) -> DeviceIdentity:
+        """Identity of the device, requested repeatedly until it answers.
 
-    def _request_identity(self, *, after_anything: bool = False, starting_s: float = 0.0) -> DeviceIdentity:
-        """DeviceIdentity of the device, requested repeatedly until it answers."""
+        :param anew: skip messages that are still buffered in the line.
+        """
+        if anew:
+            self._talk.begin()
         within_s = starting_s + self._talk.timeout_s
         deadline_s = self._talk.clock() + within_s
         while True:
             try:
                 again_s = self._talk.clock() + _HELLO_AGAIN_S
-                return self._ask_identity(min(deadline_s, again_s), after_anything=after_anything)
+                return self._ask_identity(min(deadline_s, again_s), after_anything=anew)
             except LinkTimeout as error:
                 if self._talk.clock() >= deadline_s:
                     if starting_s:
@@ -372,32 +366,9 @@ class Dut:
 
         :raises TimeLimitReached: after yielding all answers that came in time, those of the last stretch in part.
         """
-        exchange = self._running()
-        waiting: deque[tuple[int, int]] = deque()
-        try:
-            for first, force, displacement, missing in stretches:
-                waiting.append((len(force), first + len(force)))
-                exchange.enter(first, force, displacement, missing)
-                while waiting and exchange.ready >= waiting[0][0]:
-                    yield exchange.take(*waiting.popleft())
-            exchange.finish()
-        except TimeLimitReached:
-            yield from _remaining(exchange, waiting)
-            raise
-        yield from _remaining(exchange, waiting)
-
-    def _running(self) -> Exchange:
-        """:raises ValueError: there is no run."""
         if self._exchange is None:
             raise ValueError("no run has been started")
-        return self._exchange
-
-
-def _remaining(exchange: Exchange, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
-    """Answers to the waiting stretches (samples, end); the last may be answered in part."""
-    for n, end in waiting:
-        answered = min(n, exchange.ready)
-        yield exchange.take(answered, end - n + answered)
+        return self._exchange.play(stretches)
 
 
 def open_dut(
@@ -414,7 +385,7 @@ def open_dut(
     :raises LinkError: the device cannot be reached.
     :raises DeviceError: it refuses the configuration, or was built from another catalogue.
     """
-    return connect(_changed(trusted(name, Trust.of(allow)), changes), listener)
+    return connect(_override(trusted(name, Trust.of(allow)), changes), listener)
 
 
 def reopen_dut(
@@ -428,10 +399,10 @@ def reopen_dut(
     """Open the device of a record of ``Dut.description()`` in ``file``; parameters and errors as ``open_dut``."""
     described = recorded(description).placed(Path(file).parent)
     Trust.of(allow).check(described.things, file)
-    return connect(_changed(described, changes), listener)
+    return connect(_override(described, changes), listener)
 
 
-def _changed(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
+def _override(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
     """:raises ConfigurationError: a value is out of range, or this kind of device has no such field."""
     wanted = {key: value for key, value in changes.items() if value is not None}
     for key in wanted.keys() - {each.name for each in dataclasses.fields(description)}:
@@ -449,27 +420,12 @@ def connect(description: DeviceDescription, listener: CanListener | None = None)
         link.listen(listener)
     dut = Dut(link, description)
     try:
-        _handshake(dut, description)
+        dut.handshake()
         dut.configure()
     except BaseException:
         dut.close()
         raise
     return dut
-
-
-def _handshake(dut: Dut, description: DeviceDescription) -> None:
-    try:
-        dut.handshake()
-    except LinkTimeout as error:
-        hint = description.hint(dut.link_name)
-        if not hint:
-            raise
-        raise LinkTimeout(f"{error}; {hint}") from error
-
-
-def _float32(value: float) -> float:
-    """Nearest number in single precision, as the device holds it."""
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
 def _word(kind: type[enum.IntEnum], value: int) -> str:

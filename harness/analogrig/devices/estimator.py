@@ -60,7 +60,7 @@ _FUNCTIONS = ("size", "init", "set", "start", "run", "theta_count", "counters")
 """Functions of estimator_c/ports/library/library.h, without their prefix."""
 
 
-def _loaded(library: Path) -> ctypes.CDLL:
+def _load(library: Path) -> ctypes.CDLL:
     c = load_library(library, (f"library_{does}" for does in _FUNCTIONS))
     c.library_size.restype = c.library_run.restype = ctypes.c_size_t
     c.library_run.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *(ctypes.c_void_p,) * 3, ctypes.POINTER(_Out)]
@@ -79,7 +79,7 @@ class Estimator:
         :raises ConfigurationError: it rejects the configuration, or the user's library is not one of a device.
         :raises LinkError: the library was not built.
         """
-        self._c = _loaded(library)
+        self._c = _load(library)
         self._state = ctypes.create_string_buffer(self._c.library_size())
         self._c.library_init(self._state)
         for key, value in (config or EstimatorConfig()).settings():
@@ -114,12 +114,13 @@ class Estimator:
         :param valid: (n,) false where the sample is missing.
         """
         n = np.size(u)
-        theta = np.empty((n, self.parameters), np.float32)
-        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
-        status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
-        out = _Out(*(array.ctypes.data for array in (theta, innovation, statistic, status, alarm)))
-        self._enter(u, y, valid, out)
-        return EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm))
+        filled: dict[str, NDArray[Any]] = {
+            "theta": np.empty((n, self.parameters), np.float32),
+            "innovation": np.empty(n, np.float32),
+            "statistic": np.empty(n, np.float32),
+            "status": np.empty(n, np.uint8),
+        }
+        return EstimatorOutput(**filled, alarms=self.alarms(u, y, valid, **filled))
 
     def alarms(
         self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, **filled: NDArray[Any]
@@ -127,10 +128,18 @@ class Estimator:
         """Indices of the samples with an alarm; several times as fast as ``run``.
 
         :param filled: arrays of the names, shapes and dtypes of ``EstimatorOutput`` to be filled as well.
+        :raises ValueError: u, y and valid differ in length.
         """
-        alarm = np.empty(np.size(u), np.uint8)
+        inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
+        mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
+        shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
+        if len(shapes) != 1 or inputs[0].ndim != 1:
+            raise ValueError("u, y and valid must be one-dimensional and of one length")
+        n, alarm = len(inputs[0]), np.empty(len(inputs[0]), np.uint8)
         out = _Out(alarm=alarm.ctypes.data, **{name: array.ctypes.data for name, array in filled.items()})
-        return np.flatnonzero(alarm) if self._enter(u, y, valid, out) else np.empty(0, np.int64)
+        valid_at = None if mask is None else mask.ctypes.data
+        alarms_n = self._c.library_run(self._state, n, *(x.ctypes.data for x in inputs), valid_at, ctypes.byref(out))
+        return np.flatnonzero(alarm) if alarms_n else np.empty(0, np.int64)
 
     def save(self) -> NDArray[np.uint8]:
         """State after the last sample, for ``branch`` of the same object; (size,)."""
@@ -158,19 +167,3 @@ class Estimator:
             self._c.library_run(state, n, u_i, y_i, mask_i, ctypes.byref(out))
             ctypes.memmove(kept, state, size)
         return statistic, alarm, after
-
-    def _enter(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None, out: _Out) -> int:
-        inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
-        mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
-        shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
-        if len(shapes) != 1 or inputs[0].ndim != 1:
-            raise ValueError("u, y and valid must be one-dimensional and of one length")
-        return int(
-            self._c.library_run(
-                self._state,
-                len(inputs[0]),
-                *(x.ctypes.data for x in inputs),
-                None if mask is None else mask.ctypes.data,
-                ctypes.byref(out),
-            )
-        )

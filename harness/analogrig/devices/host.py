@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from analogrig import device_program
-from analogrig.devices.child import Child, ChildWire
+from analogrig.devices.child import PROGRAMS, Child, ChildWire
 from analogrig.devices.description import EitherDevice
 from analogrig.errors import LinkError
 from analogrig.links.wire import PortWire
@@ -16,7 +15,7 @@ from analogrig.links.wire import PortWire
 if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
 
-HOST_PROGRAM = device_program.PROGRAM
+HOST_PROGRAM = PROGRAMS / "analogrig-device"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +35,9 @@ class HostDevice(EitherDevice):
 
     def bus(self) -> CanBus:
         from analogrig.devices.can_nodes import ChildBus
-        from analogrig.links.can_bus import PythonCanBus
 
         child = host_child(["--slcan"])
-        return child.connect(lambda port: ChildBus(child, PythonCanBus(self.slcan(port), name="slcan")))
+        return child.connect(lambda port: ChildBus(self.slcan(port), lambda _: child, name="slcan"))
 
 
 def host_child(arguments: Sequence[str] = (), program: Path = HOST_PROGRAM) -> Child:

@@ -68,11 +68,12 @@ class LibraryDevice:
         self,
         port: Literal["serial", "can"],
         *arguments: object,
+        boot_nonce: int,
         catalogue_hash: int = CATALOGUE_HASH,
         input_blocks: int = ALWAYS_ROOM,
         library: Path = LIBRARY,
     ) -> None:
-        """Load a device; ``boot`` must follow, and passes ``arguments`` on to the port.
+        """Load and boot a device; ``arguments`` go to its port.
 
         :param catalogue_hash: another one stands for a device built from another catalogue.
         :raises LinkError: the project's library was not built.
@@ -80,21 +81,16 @@ class LibraryDevice:
         """
         names = [f"{port}_device_{name}" for name in ("size", "init", "run")]
         c = load_library(library, names)
-        size, self._init, self.run = (getattr(c, name) for name in names)
+        size, init, self.run = (getattr(c, name) for name in names)
         size.restype = ctypes.c_size_t
         self.run.restype = ProgressStruct
         self.run.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t]
         self.state = ctypes.create_string_buffer(size())
-        self._arguments = arguments
-        self._catalogue_hash, self._input_blocks = catalogue_hash, input_blocks
-
-    def boot(self, boot_nonce: int) -> None:
-        """Power-cycle the device."""
-        identity = IdentityStruct(self._catalogue_hash, boot_nonce, self._input_blocks, FirmwareId.LIBRARY)
-        self._init(self.state, ctypes.byref(identity), *self._arguments)
+        identity = IdentityStruct(catalogue_hash, boot_nonce, input_blocks, FirmwareId.LIBRARY)
+        init(self.state, ctypes.byref(identity), *arguments)
 
 
-class MemoryWire:
+class MemoryWire(LibraryDevice):
     """Wire to a device in this process: the same C code and frames as elsewhere, on a virtual clock."""
 
     name = "memory"
@@ -105,25 +101,17 @@ class MemoryWire:
         *,
         catalogue_hash: int = CATALOGUE_HASH,
         clock: VirtualClock | None = None,
-        input_blocks: int = ALWAYS_ROOM,
         library: Path = LIBRARY,
     ) -> None:
         """Boot a device; parameters and errors as ``LibraryDevice``."""
-        self._device = LibraryDevice(
-            "serial", catalogue_hash=catalogue_hash, input_blocks=input_blocks, library=library
-        )
+        super().__init__("serial", boot_nonce=boot_nonce, catalogue_hash=catalogue_hash, library=library)
         self._output = ctypes.create_string_buffer(_OUTPUT_BYTES)
         self.clock = VirtualClock() if clock is None else clock
-        self.boot(boot_nonce)
-
-    def boot(self, boot_nonce: int) -> None:
-        """Power-cycle the device. Unread answers are lost."""
         self._answers = b""
-        self._device.boot(boot_nonce)
 
     def write(self, sent: bytes) -> None:
         while True:
-            progress = self._device.run(self._device.state, sent, len(sent), self._output, _OUTPUT_BYTES)
+            progress = self.run(self.state, sent, len(sent), self._output, _OUTPUT_BYTES)
             self._answers += ctypes.string_at(self._output, progress.given)
             sent = sent[progress.taken :]
             if not progress.given and not sent:

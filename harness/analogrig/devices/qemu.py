@@ -52,11 +52,10 @@ class QemuDevice(EitherDevice):
     def bus(self) -> CanBus:
         """Bus on the second UART. It is a terminal because python-can's slcan opens nothing else as fast."""
         from analogrig.devices.can_nodes import ChildBus
-        from analogrig.links.can_bus import PythonCanBus
 
         def open_bus(first_line: str) -> ChildBus:
             (terminal,) = re.findall(r"/dev/\S+", first_line) or [""]
-            return ChildBus(child, PythonCanBus(self.slcan(terminal), name="qemu slcan"))
+            return ChildBus(self.slcan(terminal), lambda _: child, name="qemu slcan")
 
         child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])
         return child.connect(open_bus)

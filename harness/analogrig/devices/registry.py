@@ -59,7 +59,7 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
     kind = re.split("[:?]", name, maxsplit=1)[0]
     if kind in KINDS and name not in config.names("devices"):
         KINDS[kind].check_place(name, name[len(kind) :].partition("?")[0])
-        return KINDS[kind].named(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
+        return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
     _check_not_compiled(name)
     path = config.locate("devices", name)
     return from_table({"name": path.stem, **config.read_toml(path)}, str(path)).placed(path.parent), str(path)

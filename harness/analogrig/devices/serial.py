@@ -25,10 +25,10 @@ class SerialDevice(ByteDevice):
 
     @classmethod
     def check_place(cls, name: str, place: str) -> None:
-        """Accept any place: ``named`` reports a missing URL."""
+        """Accept any place: ``from_name`` reports a missing URL."""
 
     @classmethod
-    def named(cls, name: str, rest: str) -> Self:
+    def from_name(cls, name: str, rest: str) -> Self:
         """Device at the URL ``rest``, which may hold question marks of its own."""
         if not rest:
             raise ConfigurationError(f"{name}: no port: use {cls.kind}:/dev/ttyACM0, or any URL of pyserial")

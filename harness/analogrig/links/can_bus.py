@@ -72,29 +72,6 @@ class CanBus(Connection, Protocol):
         """
 
 
-class WrappedBus:
-    """A bus that adds something to another one. Everything not overridden is passed through."""
-
-    def __init__(self, bus: CanBus) -> None:
-        """Take over ``bus``."""
-        self.name, self.clock, self.is_fd = bus.name, bus.clock, bus.is_fd
-        self.line, self.unread_n = bus.line, bus.unread_n
-        self._bus = bus
-
-    @property
-    def damaged(self) -> int:
-        return self._bus.damaged
-
-    def send(self, frame: can.Message) -> None:
-        self._bus.send(frame)
-
-    def receive(self, timeout_s: float) -> can.Message | None:
-        return self._bus.receive(timeout_s)
-
-    def close(self) -> None:
-        self._bus.close()
-
-
 class PythonCanBus:
     """A bus opened by python-can."""
 
@@ -109,9 +86,8 @@ class PythonCanBus:
         interface, self.channel = str(config["interface"]), config["channel"]
         where = interface if self.channel is None else f"{interface}/{self.channel}"
         self.name = where if name is None else name
-        is_socket = interface == "socketcan"
-        self._meaning = _SOCKETCAN if is_socket else {}
-        self._never_echoes = is_socket and not config.get("receive_own_messages")
+        self._is_socket = interface == "socketcan"
+        self._never_echoes = self._is_socket and not config.get("receive_own_messages")
         self.clock: Clock = time.monotonic
         self.is_fd = bool(config.get("fd"))
         self.line = _line(config)
@@ -125,33 +101,30 @@ class PythonCanBus:
         except (TypeError, ValueError) as error:
             if self.channel is None:
                 raise ConfigurationError(f"can:{self.name}: no channel given: use can:{self.name}/CHANNEL") from error
-            raise ConfigurationError(f"can:{self.name}: {_words(error)}") from error
+            raise ConfigurationError(f"can:{self.name}: {error}") from error
         except Exception as error:  # drivers raise exceptions of any type
             number = _errno(error)
             cure = "" if number is not None else "; is its driver installed, and the adapter there?"
             raise LinkError(f"cannot open can:{self.name}: {self._reason(error, number)}{cure}") from error
 
     def _reason(self, error: Exception, number: int | None) -> str:
-        """Cause in one line; the operating system's message, if there is one."""
-        if number in self._meaning:
-            return self._meaning[number]
-        return os.strerror(number) if number is not None and number > 0 else _words(error)
+        """Cause; the operating system's message, if there is one."""
+        if self._is_socket and number in _SOCKETCAN:
+            return _SOCKETCAN[number]
+        return os.strerror(number) if number and number > 0 else str(error) or type(error).__name__
 
     def send(self, frame: can.Message) -> None:
         deadline_s = self.clock() + WRITE_TIMEOUT_S
-        while not self._try_send(frame, deadline_s):
+        while True:
+            try:
+                self._bus.send(frame, max(0.0, deadline_s - self.clock()))
+            except Exception as error:  # drivers raise exceptions of any type
+                number = _errno(error)
+                if number != errno.ENOBUFS or self.clock() >= deadline_s:
+                    raise self._send_error(error, number) from error
+            else:
+                return
             time.sleep(_FULL_QUEUE_S)
-
-    def _try_send(self, frame: can.Message, deadline_s: float) -> bool:
-        """Send the frame; False if the controller's queue is full."""
-        try:
-            self._bus.send(frame, max(0.0, deadline_s - self.clock()))
-        except Exception as error:  # drivers raise exceptions of any type
-            number = _errno(error)
-            if number == errno.ENOBUFS and self.clock() < deadline_s:
-                return False
-            raise self._send_error(error, number) from error
-        return True
 
     def _send_error(self, error: Exception, number: int | None) -> LinkError:
         if number == errno.ENOBUFS or isinstance(error, can.CanTimeoutError) or "buffer full" in str(error):
@@ -264,7 +237,7 @@ def _load_config(given: dict[str, Any], context: str | None) -> dict[str, Any]:
             f" configuration (CAN_INTERFACE{suffix}, ~/can.conf{section}); python-can knows {known}"
         ) from error
     except Exception as error:  # a wrong configuration file raises exceptions of any type
-        raise ConfigurationError(f"can: python-can's configuration: {_words(error)}") from error
+        raise ConfigurationError(f"can: python-can's configuration: {error}") from error
 
 
 def _keys(interface: str) -> set[str] | None:
@@ -302,8 +275,3 @@ def _errno(error: Exception) -> int | None:
         if isinstance(each, termios.error):  # a terminal's other end has hung up; not an OSError
             return int(each.args[0])
     return None
-
-
-def _words(error: Exception) -> str:
-    """Message of the exception in one line."""
-    return " ".join(str(error).split()) or type(error).__name__

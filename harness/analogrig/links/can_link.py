@@ -112,40 +112,38 @@ class CanLink:
         )
 
     def _message(self, frame: can.Message) -> Message | None:
-        """Message of the device; None for any other frame."""
-        if not self._is_echo(frame):
+        """Message of the device; None for any other frame.
+
+        :raises LinkError: another node has sent a frame of the harness.
+        """
+        is_echo = self._is_echo(frame)
+        if not is_echo:
             self._report(frame, is_rx=True)
         if frame.is_error_frame:
             self._note_error(frame)
-        elif frame.is_extended_id or frame.arbitration_id not in _HARNESS_IDS | _DEVICE_IDS or frame.is_remote_frame:
+        elif frame.is_extended_id or frame.is_remote_frame or frame.arbitration_id not in _HARNESS_IDS | _DEVICE_IDS:
             self._counted["frames_foreign"] += 1
-        elif frame.arbitration_id in _HARNESS_IDS:
-            self._check_echo(frame)
-        else:
+        elif frame.arbitration_id in _DEVICE_IDS:
             packet = bytes((frame.arbitration_id,)) + frame.data
             message = unpack_any(packet) if self.carries_blocks or not frame.is_fd else None
             self._counted["frames_dropped"] += message is None
             return message
+        elif not is_echo:
+            raise LinkError(
+                f"{self.name}: another node uses the harness's identifiers (frame {frame.arbitration_id:#05x}"
+                f" with {frame.data.hex() or 'no data'}): another harness on the same bus?"
+            )
         return None
 
     def _is_echo(self, frame: can.Message) -> bool:
         """True for a frame of this link that the interface returns. Not all interfaces mark them."""
         if not frame.is_rx:
             return True
-        if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame:
+        if frame.is_extended_id or frame.is_remote_frame or frame.is_error_frame or not frame.data:
             return False
         if frame.arbitration_id not in _HARNESS_IDS:
             return False
-        packet = bytes((frame.arbitration_id,)) + frame.data
-        return len(packet) > 1 and self._sent.get(packet[1]) == packet
-
-    def _check_echo(self, frame: can.Message) -> None:
-        """:raises LinkError: another node has sent the frame."""
-        if not self._is_echo(frame):
-            raise LinkError(
-                f"{self.name}: another node uses the harness's identifiers (frame {frame.arbitration_id:#05x}"
-                f" with {frame.data.hex() or 'no data'}): another harness on the same bus?"
-            )
+        return self._sent.get(frame.data[0]) == bytes((frame.arbitration_id,)) + frame.data
 
     def _note_error(self, frame: can.Message) -> None:
         self._counted["error_frames"] += 1

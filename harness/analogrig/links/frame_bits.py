@@ -6,8 +6,10 @@ given frame is exact; without its contents, it is the longest possible.
 
 from __future__ import annotations
 
-import functools
+import re
 from typing import TYPE_CHECKING, NamedTuple
+
+import anycrc
 
 if TYPE_CHECKING:
     import can
@@ -18,9 +20,7 @@ CLASSIC_BYTES = 8
 ERROR_FRAME_BITS = 23
 """Longest error frame: the flags of two controllers in sequence, the delimiter, and the interframe space."""
 
-_CRC15 = 0x4599
-_RUN = 5
-"""Equal bits in a row, after which a stuff bit follows."""
+_crc15 = anycrc.Model("CRC15-CAN").calc
 
 _TAIL_BITS = 13
 """Bits without stuffing: CRC delimiter, acknowledgement and its delimiter, 7 bits of end, 3 of interframe space."""
@@ -41,15 +41,9 @@ class FrameBits(NamedTuple):
         return self.nominal / bitrate + self.data / (data_bitrate or bitrate)
 
 
-def longest_frame_s(length_bytes: int, *, fd: bool, bitrate: int, data_bitrate: int | None = None) -> float:
-    """Longest duration of a frame with this much data and an identifier of 11 bits [s]."""
-    bits = longest_fd_bits(length_bytes) if fd else longest_classic_bits(length_bytes)
-    return bits.time_s(bitrate, data_bitrate)
-
-
-def longest_classic_bits(length_bytes: int, *, extended: bool = False) -> FrameBits:
-    """Longest classic frame with this much data (Davis et al. 2007, Equ 1; see ``bus_load``)."""
-    stuffable = (54 if extended else 34) + 8 * length_bytes
+def longest_classic_bits(length_bytes: int) -> FrameBits:
+    """Longest classic frame with this much data and an identifier of 11 bits (Davis et al. 2007, Equ 1)."""
+    stuffable = 34 + 8 * length_bytes
     return FrameBits(stuffable + (stuffable - 1) // 4 + _TAIL_BITS)
 
 
@@ -68,35 +62,29 @@ def frame_bits(frame: can.Message) -> FrameBits:
     """Length of this very frame."""
     if frame.is_error_frame:
         return FrameBits(ERROR_FRAME_BITS)
-    data = b"" if frame.is_remote_frame else bytes(frame.data)
+    base, extension = divmod(frame.arbitration_id, 1 << 18) if frame.is_extended_id else (frame.arbitration_id, 0)
+    head = f"0{base:011b}11{extension:018b}" if frame.is_extended_id else f"0{base:011b}"
+    data = "" if frame.is_remote_frame else "".join(f"{byte:08b}" for byte in frame.data)
     if frame.is_fd:
-        return _fd_bits(frame, data)
-    head, width = _classic_head(frame)
-    state, stuffed, check = _head(head, width)
-    for byte in data:
-        state, more = _stuff(state, byte, 8)
-        stuffed += more
-        check = _crc15(check, byte)
-    state, more = _stuff(state, check, 15)
-    stuffed += more + (state[1] == _RUN)
-    return FrameBits(width + 8 * len(data) + 15 + stuffed + _TAIL_BITS)
+        head += f"{'' if frame.is_extended_id else '0'}010{frame.bitrate_switch:d}"
+        return _fd_bits(frame, head, f"{frame.error_state_indicator:d}{_dlc(frame):04b}{data}")
+    stuffable = f"{head}{frame.is_remote_frame:d}00{_dlc(frame):04b}{data}"
+    check = _crc15(int(stuffable, 2).to_bytes(-(-len(stuffable) // 8), "big"))  # leading zeros do not change it
+    stuffable += f"{check:015b}"
+    return FrameBits(len(stuffable) + _stuff_bits(stuffable) + _TAIL_BITS)
 
 
-def _fd_bits(frame: can.Message, data: bytes) -> FrameBits:
-    """Length of a frame of CAN FD. A stuff bit due after the last data bit is replaced by the first fixed one."""
-    switch = frame.bitrate_switch
-    if frame.is_extended_id:
-        base, extension = divmod(frame.arbitration_id, 1 << 18)
-        head, width = ((base << 2 | 0b11) << 18 | extension) << 4 | 0b0100 | switch, 36
-    else:
-        head, width = frame.arbitration_id << 5 | 0b00100 | switch, 17
-    state, in_head = _stuff(_IDLE, head, width)
-    state, in_data = _stuff(state, frame.error_state_indicator << 4 | _dlc(frame), 5)
-    for byte in data:
-        state, more = _stuff(state, byte, 8)
-        in_data += more
-    bits = FrameBits(width + in_head + _TAIL_BITS, 5 + 8 * len(data) + in_data + _fd_check_bits(len(data)))
-    return bits if switch else FrameBits(sum(bits))
+def _fd_bits(frame: can.Message, head: str, data: str) -> FrameBits:
+    """Length of a frame of CAN FD. A stuff bit due after the last data bit is replaced by the first fixed one.
+
+    :param head: bits up to the bit rate switch.
+    :param data: bits from ESI to the last data bit.
+    """
+    in_head = _stuff_bits(head[:-1])
+    in_data = _stuff_bits(head + data[:-1]) - in_head
+    checked = _fd_check_bits(len(frame.data))
+    bits = FrameBits(len(head) + in_head + _TAIL_BITS, len(data) + in_data + checked)
+    return bits if frame.bitrate_switch else FrameBits(sum(bits))
 
 
 def _fd_check_bits(length_bytes: int) -> int:
@@ -107,56 +95,16 @@ def _fd_check_bits(length_bytes: int) -> int:
 
 def _dlc(frame: can.Message) -> int:
     """The four bits of the data length code."""
-    if not frame.is_fd or len(frame.data) <= CLASSIC_BYTES:
-        return min(frame.dlc, CLASSIC_BYTES) if frame.is_remote_frame else len(frame.data)
-    return 9 + sum(len(frame.data) > length for length in (12, 16, 20, 24, 32, 48))
+    if frame.is_remote_frame:
+        return min(frame.dlc, CLASSIC_BYTES)
+    length = len(frame.data)
+    return length if length <= CLASSIC_BYTES else 9 + sum(length > each for each in (12, 16, 20, 24, 32, 48))
 
 
-def _classic_head(frame: can.Message) -> tuple[int, int]:
-    """Bits before the data, and their number. The first is the start of frame, which is 0."""
-    if frame.is_extended_id:
-        base, extension = divmod(frame.arbitration_id, 1 << 18)
-        return ((((base << 2 | 0b11) << 18 | extension) << 1 | frame.is_remote_frame) << 6) | _dlc(frame), 39
-    return (frame.arbitration_id << 7) | (frame.is_remote_frame << 6) | _dlc(frame), 19
+_RUNS = re.compile("0{5}(?:1{4}0{4})*(?:1{4})?|1{5}(?:0{4}1{4})*(?:0{4})?")
+"""Five equal bits, and the runs of four that directly follow, each of which begins with the stuff bit before it."""
 
 
-_State = tuple[int, int]
-"""The last bit, and the number of equal bits in a row up to it."""
-
-_IDLE: _State = (1, 0)
-
-
-@functools.lru_cache(maxsize=1 << 14)
-def _stuff(state: _State, value: int, width: int) -> tuple[_State, int]:
-    """State after these bits, and the number of stuff bits inserted among them."""
-    bit, run = state
-    stuffed = 0
-    for shift in reversed(range(width)):
-        if run == _RUN:
-            bit, run, stuffed = 1 - bit, 1, stuffed + 1
-        this = value >> shift & 1
-        bit, run = this, run + 1 if this == bit else 1
-    return (bit, run), stuffed
-
-
-@functools.lru_cache(maxsize=1 << 10)
-def _head(head: int, width: int) -> tuple[_State, int, int]:
-    """State, stuff bits and CRC after the head of a classic frame. Leading zeros do not change the CRC."""
-    check = 0
-    for byte in head.to_bytes(-(-width // 8), "big"):
-        check = _crc15(check, byte)
-    return *_stuff(_IDLE, head, width), check
-
-
-def _crc15(check: int, byte: int) -> int:
-    return _CRC15_OF[(check >> 7 ^ byte) & 0xFF] ^ check << 8 & 0x7FFF
-
-
-def _crc15_of(byte: int) -> int:
-    check = byte << 7
-    for _ in range(8):
-        check = check << 1 ^ (_CRC15 if check & 0x4000 else 0)
-    return check & 0x7FFF
-
-
-_CRC15_OF = [_crc15_of(byte) for byte in range(256)]
+def _stuff_bits(bits: str) -> int:
+    """Number of stuff bits in and after these bits: one after every five equal bits, stuff bits included."""
+    return sum((len(runs) - 1) // 4 for runs in _RUNS.findall(bits))

@@ -8,34 +8,17 @@ where nothing is sent before the answers have arrived.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from analogrig.catalogue import LAYOUTS, Message
 from analogrig.links import frame
-from analogrig.links.frame_bits import CLASSIC_BYTES, frame_bits, longest_frame_s
+from analogrig.links.frame_bits import CLASSIC_BYTES, frame_bits, longest_classic_bits, longest_fd_bits
 
 if TYPE_CHECKING:
     import can
 
 BITS_PER_BYTE = 10
 """8N1: a start bit and a stop bit around each byte."""
-
-
-class LineSpeed(Protocol):
-    """Speed of the line to a device."""
-
-    @property
-    def speed(self) -> str:
-        """Text for errors."""
-
-    def rates(self) -> dict[str, int]:
-        """Bit rates by name, for the record [bit/s]."""
-
-    def message_s(self, kind: type[Message]) -> float:
-        """Longest time of one message of this type [s]."""
-
-    def together_s(self, to_s: float, from_s: float) -> float:
-        """Time for traffic of these durations to and from the device [s]."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +29,11 @@ class SerialLine:
 
     @property
     def speed(self) -> str:
+        """Text for errors."""
         return f"{self.baud} baud"
 
     def rates(self) -> dict[str, int]:
+        """Bit rates by name, for the record [bit/s]."""
         return {"baud": self.baud}
 
     def bytes_s(self, n: int) -> float:
@@ -56,15 +41,17 @@ class SerialLine:
         return n * BITS_PER_BYTE / self.baud
 
     def message_s(self, kind: type[Message]) -> float:
+        """Longest time of one message of this type [s]."""
         return self.bytes_s(frame.size(kind))
 
     def together_s(self, to_s: float, from_s: float) -> float:
+        """Time for traffic of these durations to and from the device [s]."""
         return max(to_s, from_s)
 
 
 @dataclass(frozen=True)
 class CanLine:
-    """A CAN bus, which carries both directions in turn."""
+    """A CAN bus, which carries both directions in turn. It has the methods of ``SerialLine``."""
 
     bitrate: int
     data_bitrate: int | None = None
@@ -85,7 +72,12 @@ class CanLine:
 
     def message_s(self, kind: type[Message]) -> float:
         length = LAYOUTS[kind.__name__].length
-        return longest_frame_s(length, fd=length > CLASSIC_BYTES, bitrate=self.bitrate, data_bitrate=self.data_bitrate)
+        bits = longest_fd_bits(length) if length > CLASSIC_BYTES else longest_classic_bits(length)
+        return bits.time_s(self.bitrate, self.data_bitrate)
 
     def together_s(self, to_s: float, from_s: float) -> float:
         return to_s + from_s
+
+
+Line = SerialLine | CanLine
+"""Speed of the line to a device."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from analogrig.catalogue import Message, pack, unpack_any
 from analogrig.links import frame
-from analogrig.links.line import LineSpeed, SerialLine
+from analogrig.links.line import Line, SerialLine
 from analogrig.links.wire import Connection, Wire
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Link(Connection, Protocol):
         """Known problems of the line, which may explain a silent device; may be empty."""
 
     @property
-    def line(self) -> LineSpeed | None:
+    def line(self) -> Line | None:
         """Speed of the line, if it is known."""
 
     @property

@@ -146,41 +146,32 @@ class PortWire:
             raise ConfigurationError(f"{url}: not a serial port or URL that pyserial understands: {error}") from error
         # Bypass pyserial on a plain descriptor: its read() and write() cost as much as a whole exchange.
         is_plain = type(self._port) is serial.Serial
-        self._wire = DescriptorWire(self._port.fileno(), self.name) if is_plain else _UrlWire(self._port, self.name)
+        self._descriptor = DescriptorWire(self._port.fileno(), self.name) if is_plain else None
 
     def write(self, sent: bytes) -> None:
-        self._wire.write(sent)
-
-    def read(self, timeout_s: float) -> bytes:
-        return self._wire.read(timeout_s)
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._port.close()
-
-
-class _UrlWire:
-    """A wire on an object of pyserial that has no file descriptor."""
-
-    def __init__(self, port: serial.Serial, name: str) -> None:
-        self._port = port
-        self._name = name
-
-    def write(self, sent: bytes) -> None:
+        if self._descriptor is not None:
+            self._descriptor.write(sent)
+            return
         try:
             self._port.write(sent)
         except serial.SerialTimeoutException as error:
-            raise LinkError(f"{self._name}: nothing can be sent: the other end does not read") from error
+            raise LinkError(f"{self.name}: nothing can be sent: the other end does not read") from error
         except OSError as error:
-            raise LinkClosed(f"{self._name}: {_reason(error)}") from error
+            raise LinkClosed(f"{self.name}: {_reason(error)}") from error
 
     def read(self, timeout_s: float) -> bytes:
+        if self._descriptor is not None:
+            return self._descriptor.read(timeout_s)
         try:
             self._port.timeout = timeout_s
             received: bytes = self._port.read(1)
             return received + self._port.read(self._port.in_waiting) if received else received
         except OSError as error:
-            raise LinkClosed(f"{self._name}: {_reason(error)}") from error
+            raise LinkClosed(f"{self.name}: {_reason(error)}") from error
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._port.close()
 
 
 def _reason(error: OSError) -> str:

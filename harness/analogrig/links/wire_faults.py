@@ -1,4 +1,4 @@
-"""Faults of a line: their notation, and the faults that serial lines and CAN buses share.
+"""Faults of a line: their notation, those that serial lines and CAN buses share, and those of a serial line.
 
 A fault happens at a numbered frame of one direction, or at any frame with a given probability. Frames are counted from
 the opening of the line, from 0. Everything random comes from a seed.
@@ -16,8 +16,11 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+from analogrig.catalogue import CATALOGUE_HASH, Hello, pack, unpack
 from analogrig.errors import ConfigurationError, LinkClosed
-from analogrig.links.wire import Connection, VirtualClock
+from analogrig.links import frame
+from analogrig.links.line import BITS_PER_BYTE
+from analogrig.links.wire import DEFAULT_BAUD, Clock, Connection, VirtualClock, Wire
 
 Direction = Literal["to", "from"]
 """Direction to the device or from it."""
@@ -26,6 +29,7 @@ DIRECTIONS: tuple[Direction, ...] = ("to", "from")
 LONGEST_DELAY_S = 3.0
 MOST_FRAMES_LATE = 40
 MOST_FRAMES_OUT = 600
+STRANGERS_HASH = CATALOGUE_HASH ^ 0x5A5A5A5A
 
 _FAULT = re.compile(r"([a-z-]+)@(?:(to|from):([0-9]{1,12})|([0-9.]+(?:e-?[0-9]+)?))")
 _SEED = re.compile(r"seed=([0-9]{1,18})")
@@ -97,6 +101,7 @@ class Lane(Generic[T]):
 
     rng: Random
     """Generator of this direction alone: the order of frames of both directions depends on timing."""
+    clock: Clock
     frames: int = 0
     held: list[tuple[int, T]] = field(default_factory=list)
     """Delayed frames, each with the number of frames that pass before it."""
@@ -104,31 +109,36 @@ class Lane(Generic[T]):
     """Frames on their way, each with its arrival time."""
     stalled_s: float = 0.0
     """Time before which nothing arrives."""
-    babbles: bool = False
+    babble: str = ""
+    """Fault for which noise arrives; empty without noise."""
     lost_n: int = 0
     """Number of further frames to be lost."""
 
-    def put(self, sent: T, now_s: float) -> None:
-        self.queue.append((max(now_s, self.stalled_s), sent))
+    def put(self, *sent: T) -> None:
+        """Queue frames."""
+        self.queue.extend((max(self.clock(), self.stalled_s), each) for each in sent)
 
-    def release(self, now_s: float) -> None:
+    def release(self) -> None:
         """Count one frame that has passed, and queue the frames that waited for it."""
-        self.held = [(n - 1, sent) for n, sent in self.held]
-        for n, sent in self.held:
-            if n <= 0:
-                self.put(sent, now_s)
-        self.held = [(n, sent) for n, sent in self.held if n > 0]
+        if self.held:
+            self.put(*(sent for n, sent in self.held if n <= 1))
+            self.held = [(n - 1, sent) for n, sent in self.held if n > 1]
 
-    def due(self, now_s: float) -> list[T]:
+    def due(self) -> list[T]:
         """Frames that have arrived by now."""
         out = []
-        while self.queue and self.queue[0][0] <= now_s:
+        while self.queue and self.queue[0][0] <= self.clock():
             out.append(self.queue.popleft()[1])
         return out
 
 
 class FaultyLine(ABC, Generic[L, T]):
     """A line of type L that applies faults to its frames, of type T."""
+
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("drop", "duplicate", "outage", "reorder", "repeat", "delay")
+    """Kinds of faults after which the line is intact."""
+    LASTING: ClassVar[tuple[str, ...]] = ("babble", "disconnect", "hang", "stranger", "reset")
+    KINDS: ClassVar[tuple[str, ...]] = (*TRANSIENT, *LASTING)
 
     def __init__(self, open_line: Callable[[], L], faults: WireFaults) -> None:
         """Open the line. A reset of the device opens it again."""
@@ -139,10 +149,11 @@ class FaultyLine(ABC, Generic[L, T]):
         self._at = {(fault.direction, fault.frame): fault.kind for fault in faults.at}
         self._rates = dict(faults.rates)
         self._lanes: dict[Direction, Lane[T]] = {
-            direction: Lane(Random(f"{faults.seed} {direction}")) for direction in DIRECTIONS
+            direction: Lane(Random(f"{faults.seed} {direction}"), self.clock) for direction in DIRECTIONS
         }
         self._boots = 0
-        self._is_closed = self._is_silent = self._is_stranger = False
+        self._lasting: set[str] = set()
+        """Lasting faults that have happened."""
 
     @property
     def frames(self) -> Mapping[Direction, int]:
@@ -179,6 +190,7 @@ class FaultyLine(ABC, Generic[L, T]):
 
     def _boot(self) -> None:
         """Open the device again; virtual time goes on."""
+        self._boots += 1
         self._line.close()
         self._line = self._open()
         if isinstance(self.clock, VirtualClock):
@@ -200,10 +212,10 @@ class FaultyLine(ABC, Generic[L, T]):
         lane = self._lanes["from"]
         while True:
             self._deliver()
-            if lane.babbles:
+            if lane.babble:
                 self._enter("from", self._read(0.0))
-                return self._noise("from", lane.due(self.clock()))
-            received = lane.due(self.clock())
+                return self._noise("from", lane.due())
+            received = lane.due()
             if received or is_over:
                 return received
             left_s = max(0.0, deadline_s - self.clock())
@@ -212,13 +224,13 @@ class FaultyLine(ABC, Generic[L, T]):
 
     def _deliver(self) -> None:
         """Pass on to the device what is due."""
-        if self._is_closed:
+        if "disconnect" in self._lasting:
             raise LinkClosed(f"{self.name}: the line is cut")
         lane = self._lanes["to"]
-        sent = lane.due(self.clock())
-        if lane.babbles:
+        sent = lane.due()
+        if lane.babble:
             sent = self._noise("to", sent)
-        if sent and not self._is_silent:
+        if sent and "hang" not in self._lasting:
             self._write(sent)
 
     def _soon_s(self) -> float:
@@ -235,11 +247,8 @@ class FaultyLine(ABC, Generic[L, T]):
             lane.frames += 1
             passed = self._apply_lasting(lane, each)
             if passed is not None:
-                if kind is None:
-                    lane.put(passed, self.clock())
-                else:
-                    self.KINDS[kind](self, lane, passed)
-            lane.release(self.clock())
+                lane.put(*([passed] if kind is None else self._apply(kind, lane, passed)))
+            lane.release()
 
     def _due_kind(self, direction: Direction, lane: Lane[T]) -> str | None:
         kind = self._at.get((direction, lane.frames))
@@ -247,75 +256,121 @@ class FaultyLine(ABC, Generic[L, T]):
             return kind
         return next((kind for kind, rate in self._rates.items() if lane.rng.random() < rate), None)
 
+    # ---- faults
+
     def _apply_lasting(self, lane: Lane[T], sent: T) -> T | None:
         """The frame after faults that last; None if it is lost."""
-        if self._is_silent:
+        if "hang" in self._lasting:
             return None
         if lane.lost_n:
             lane.lost_n -= 1
             return None
-        return self._stranger(sent) if self._is_stranger else sent
+        return self._stranger(sent) if "stranger" in self._lasting else sent
 
-    # ---- faults of one frame
+    def _apply(self, kind: str, lane: Lane[T], sent: T) -> Sequence[T]:
+        """Begin a fault at a frame; return the frames that follow at once in its place."""
+        match kind:
+            case "duplicate":
+                return sent, sent
+            case "outage":
+                lane.lost_n = int(MOST_FRAMES_OUT ** lane.rng.random())
+            case "reorder":
+                lane.held.append((1 + lane.rng.randint(1, 3), sent))
+            case "repeat":
+                lane.held.append((1 + lane.rng.randint(1, MOST_FRAMES_LATE), sent))
+                return (sent,)
+            case "delay":
+                lane.stalled_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S
+                return (sent,)
+            case "babble" | "jam":
+                lane.babble = kind
+                return (sent,)
+            case "reset":  # everything on the way is lost, except the frame that reaches the device now
+                self._boot()
+                self._lanes["from"].queue.clear()
+                return (sent,) if lane is self._lanes["to"] else ()
+            case _ if kind not in self.TRANSIENT:
+                self._lasting.add(kind)
+        return ()
 
-    def _drop(self, lane: Lane[T], sent: T) -> None:
-        """Lose the frame."""
 
-    def _duplicate(self, lane: Lane[T], sent: T) -> None:
-        lane.put(sent, self.clock())
-        lane.put(sent, self.clock())
+_BABBLE_BYTES = 1024
 
-    def _lose_many(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002 - the frame is lost
-        lane.lost_n = int(MOST_FRAMES_OUT ** lane.rng.random())
+_FRAME = re.compile(rb"\0*[^\0]+\0")
 
-    def _reorder(self, lane: Lane[T], sent: T) -> None:
-        lane.held.append((1 + lane.rng.randint(1, 3), sent))
 
-    def _repeat(self, lane: Lane[T], sent: T) -> None:
-        lane.put(sent, self.clock())
-        lane.held.append((1 + lane.rng.randint(1, MOST_FRAMES_LATE), sent))
+def _damage(kind: str, sent: bytes, rng: Random) -> bytes:
+    """Flip up to four bits, lose up to four bytes, insert up to sixteen, or truncate."""
+    out = bytearray(sent)
+    if kind == "flip":
+        for _ in range(rng.randint(1, 4)):
+            out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
+    elif kind == "insert":
+        at = rng.randint(0, len(out))
+        out[at:at] = rng.randbytes(rng.randint(1, 16))
+    else:
+        at = rng.randrange(len(out))
+        end = at + rng.randint(1, 4) if kind == "lose" else len(out)
+        del out[at:end]
+    return bytes(out)
 
-    def _delay(self, lane: Lane[T], sent: T) -> None:
-        lane.stalled_s = self.clock() + lane.rng.random() * LONGEST_DELAY_S
-        lane.put(sent, self.clock())
 
-    def _start_babble(self, lane: Lane[T], sent: T) -> None:
-        lane.put(sent, self.clock())
-        lane.babbles = True
+class FaultyWire(FaultyLine[Wire, bytes]):
+    """A wire that applies faults to its bytes and frames."""
 
-    def _disconnect(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
-        self._is_closed = True
+    DAMAGES = ("flip", "lose", "insert", "truncate")
+    TRANSIENT = (*DAMAGES, *FaultyLine.TRANSIENT)
+    KINDS = (*TRANSIENT, *FaultyLine.LASTING, "wrong-baud")
 
-    def _hang(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
-        self._is_silent = True
+    def __init__(self, open_wire: Callable[[], Wire], faults: WireFaults) -> None:
+        """Open the wire. A reset of the device opens it again."""
+        super().__init__(open_wire, faults)
+        self._begun: dict[Direction, bytes] = dict.fromkeys(DIRECTIONS, b"")
+        """Bytes of the incomplete frame, by direction."""
 
-    def _replace_catalogue(self, lane: Lane[T], sent: T) -> None:  # noqa: ARG002
-        self._is_stranger = True
+    def write(self, sent: bytes) -> None:
+        self._send(self._split("to", sent))
 
-    def _reset(self, lane: Lane[T], sent: T) -> None:
-        """Boot the device. Everything on the way is lost, except the frame that reaches it now."""
-        self._boots += 1
-        self._boot()
-        self._lanes["from"].queue.clear()
-        if lane is self._lanes["to"]:
-            lane.put(sent, self.clock())
+    def read(self, timeout_s: float) -> bytes:
+        return b"".join(self._receive(timeout_s))
 
-    TRANSIENT: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
-        "drop": _drop,
-        "duplicate": _duplicate,
-        "outage": _lose_many,
-        "reorder": _reorder,
-        "repeat": _repeat,
-        "delay": _delay,
-    }
-    """Faults of any line after which the line is intact."""
-    LASTING: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {
-        "babble": _start_babble,
-        "disconnect": _disconnect,
-        "hang": _hang,
-        "stranger": _replace_catalogue,
-        "reset": _reset,
-    }
-    """Faults of any line that last."""
-    KINDS: ClassVar[Mapping[str, Callable[[Any, Lane[Any], Any], None]]] = {**TRANSIENT, **LASTING}
-    """All faults of this line, by kind."""
+    def _split(self, direction: Direction, sent: bytes) -> list[bytes]:
+        """Complete frames."""
+        begun = self._begun[direction] + sent
+        frames = _FRAME.findall(begun)
+        self._begun[direction] = begun[sum(map(len, frames)) :][-frame.MAX_ENCODED :]
+        return frames
+
+    def _write(self, sent: Sequence[bytes]) -> None:
+        self._line.write(b"".join(sent))
+
+    def _read(self, timeout_s: float) -> list[bytes]:
+        return self._split("from", self._line.read(timeout_s))
+
+    def _noise(self, direction: Direction, passed: list[bytes]) -> list[bytes]:
+        """Random bytes: instead of the device, or after each message to it."""
+        noise = self._lanes[direction].rng.randbytes(_BABBLE_BYTES)
+        if direction == "to":
+            return [*passed, noise]
+        self._advance(_BABBLE_BYTES * BITS_PER_BYTE / DEFAULT_BAUD)
+        return [noise]
+
+    def _apply_lasting(self, lane: Lane[bytes], sent: bytes) -> bytes | None:
+        passed = super()._apply_lasting(lane, sent)
+        if passed is None or "wrong-baud" not in self._lasting:
+            return passed
+        return lane.rng.randbytes(lane.rng.randint(1, 2 * len(sent)))
+
+    def _apply(self, kind: str, lane: Lane[bytes], sent: bytes) -> Sequence[bytes]:
+        if kind in self.DAMAGES:
+            return (_damage(kind, sent, lane.rng),)
+        return super()._apply(kind, lane, sent)
+
+    def _stranger(self, sent: bytes) -> bytes:
+        packets = frame.FrameDecoder().feed(sent)
+        message = unpack(packets[0]) if packets else None
+        if message is None:
+            return sent
+        if isinstance(message, Hello):
+            message = message._replace(catalogue_hash=STRANGERS_HASH)
+        return frame.encode(pack(message), STRANGERS_HASH)

@@ -10,8 +10,19 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from analogrig.catalogue import BLOCK_SAMPLES, LAYOUTS
-from analogrig.links.frame_bits import CLASSIC_BYTES, longest_frame_s
+from analogrig.catalogue import (
+    BLOCK_SAMPLES,
+    LAYOUTS,
+    Alarm,
+    Diagnosis,
+    Estimate,
+    Message,
+    Sample,
+    SampleBlock,
+    Stepped,
+)
+from analogrig.links.line import CanLine
+from analogrig.protocol.pace import sample_times
 from analogrig.run import Run
 
 
@@ -101,46 +112,36 @@ class BusLoad:
 
 
 def exchange_load(
-    *,
-    bitrate: int,
-    data_bitrate: int | None,
-    in_blocks: bool,
-    parameters: int,
-    report_interval_n: int,
-    period_s: float,
+    line: CanLine, *, in_blocks: bool, parameters: int, report_interval_n: int, period_s: float
 ) -> BusLoad:
     """Bus load of a sample every ``period_s``, single or in blocks of BLOCK_SAMPLES.
 
     Each ``report_interval_n`` samples, the device answers ``parameters`` elements of theta and the innovation.
     """
 
-    def stream(name: str, frames: int = 1, every_s: float = math.inf, jitter_s: float = 0.0) -> PeriodicFrames:
-        layout = LAYOUTS[name]
-        is_fd = layout.length > CLASSIC_BYTES
-        longest_s = longest_frame_s(layout.length, fd=is_fd, bitrate=bitrate, data_bitrate=data_bitrate)
-        return PeriodicFrames(layout.id, longest_s, every_s, frames, jitter_s)
+    def stream(
+        kind: type[Message], frames: int = 1, every_s: float = math.inf, jitter_s: float = 0.0
+    ) -> PeriodicFrames:
+        return PeriodicFrames(LAYOUTS[kind.__name__].id, line.message_s(kind), every_s, frames, jitter_s)
 
     together = BLOCK_SAMPLES if in_blocks else 1
-    elements = parameters + 1
-    samples = stream("SampleBlock" if in_blocks else "Sample", 1, together * period_s)
-    per_sample_s = stream("Stepped").frame_s + stream("Estimate").frame_s * elements / report_interval_n
-    per_sample_s += samples.frame_s / together
+    samples = stream(SampleBlock if in_blocks else Sample, 1, together * period_s)
 
     def answers(jitter_s: float) -> list[PeriodicFrames]:
-        reports = math.ceil(together / report_interval_n)
-        estimates = stream("Estimate", reports * elements, max(together, report_interval_n) * period_s, jitter_s)
-        stepped = stream("Stepped", together, together * period_s, jitter_s)
-        return [samples, estimates, stepped]
+        estimates_n = math.ceil(together / report_interval_n) * (parameters + 1)
+        estimates = stream(Estimate, estimates_n, max(together, report_interval_n) * period_s, jitter_s)
+        return [samples, estimates, stream(Stepped, together, together * period_s, jitter_s)]
 
-    there_s = latency_s(answers(0.0), samples.identifier, 1.0 / bitrate)
+    there_s = latency_s(answers(0.0), samples.identifier, 1.0 / line.bitrate)
     late_s = 0.0 if there_s is None else there_s - samples.frame_s
-    rare = [stream("Alarm"), stream("Diagnosis")]
-    back_s = latency_s([*rare, *answers(late_s)], LAYOUTS["Stepped"].id, 1.0 / bitrate)
+    back = [stream(Alarm), stream(Diagnosis), *answers(late_s)]
+    back_s = latency_s(back, LAYOUTS["Stepped"].id, 1.0 / line.bitrate)
+    sample_s = sum(sample_times(line, parameters=parameters, report_interval_n=report_interval_n, in_blocks=in_blocks))
     return BusLoad(
-        bitrate,
-        data_bitrate,
-        sample_s=per_sample_s,
-        utilisation=per_sample_s / period_s,
+        line.bitrate,
+        line.data_bitrate,
+        sample_s=sample_s,
+        utilisation=sample_s / period_s,
         latency_s=None if there_s is None or back_s is None else samples.frame_s + back_s,
     )
 
@@ -151,8 +152,7 @@ def load_of(run: Run) -> BusLoad | None:
     if "bitrate" not in ran.line:
         return None
     return exchange_load(
-        bitrate=ran.line["bitrate"],
-        data_bitrate=ran.line.get("data_bitrate"),
+        CanLine(ran.line["bitrate"], ran.line.get("data_bitrate")),
         in_blocks=ran.line.get("samples_per_message", 1) > 1,
         parameters=run.theta.shape[1],
         report_interval_n=int(ran.dut.get("report_interval_n", 1)),

@@ -69,7 +69,7 @@ class Conversation:
         try:
             self.link.send([message])
         except LinkError as error:
-            raise self._named(error) from error
+            raise self._with_name(error) from error
         return self.clock() + self.timeout_s
 
     def receive(self, deadline_s: float) -> Message | None:
@@ -83,7 +83,7 @@ class Conversation:
             try:
                 message = self.link.receive(left_s)
             except LinkError as error:
-                raise self._named(error) from error
+                raise self._with_name(error) from error
             if message is None:
                 break
             if self._expected is None or message.seq == self._expected:
@@ -137,5 +137,5 @@ class Conversation:
             if not after_anything and not isinstance(message, Hello | Firmware):
                 raise DeviceError(f"device {self.name}: {brief(message)} came too late")
 
-    def _named(self, error: LinkError) -> LinkError:
+    def _with_name(self, error: LinkError) -> LinkError:
         return type(error)(f"device {self.name}: {error}")

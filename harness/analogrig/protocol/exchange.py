@@ -11,7 +11,7 @@ requested again.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,7 @@ from analogrig.catalogue import (
     index_up_to,
     is_finite,
 )
-from analogrig.errors import DeviceError, LinkClosed, LinkError, LinkTimeout
+from analogrig.errors import DeviceError, LinkClosed, LinkTimeout, TimeLimitReached
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.pace import Pace
 from analogrig.run import LOST, UNREPORTED
@@ -53,6 +53,9 @@ _DECIDED = frozenset(Change) - {Change.UNDECIDED}
 
 Codes = tuple[int, int, bool]
 """Force, displacement, and True if they are missing."""
+
+Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
+"""Index of the first sample, force, displacement, missing."""
 
 
 @dataclass(frozen=True)
@@ -196,42 +199,48 @@ class Exchange:
         self._diagnosis: Diagnosis | None = None
         """A diagnosis that waits for the next Stepped, which names its sample."""
         self._timeouts = 0
-        self.next_index = 0
+        self._next_index = 0
 
-    def enter(
-        self,
-        first: int,
-        force: NDArray[np.uint16],
-        displacement: NDArray[np.uint16],
-        missing: NDArray[np.bool_],
-    ) -> None:
-        """Send consecutive samples. The device takes skipped indices as missing samples.
+    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
+        """Send consecutive stretches of samples, and yield the answers to each.
+
+        The device takes skipped indices as missing samples.
 
         :raises LinkTimeout, LinkError, DeviceError: see ``Dut.feed``.
-        :raises ValueError: the arrays differ in length, or the samples have been entered before.
+        :raises TimeLimitReached: after all answers that came in time.
+        :raises ValueError: the arrays differ in length, or the samples have been sent before.
         """
-        if first < self.next_index:
-            raise ValueError(f"sample {first} comes again: the next one is {self.next_index}")
-        samples = list(zip(force.tolist(), displacement.tolist(), missing.tolist(), strict=True))
+        waiting: deque[tuple[int, int]] = deque()
+        try:
+            for first, *arrays in stretches:
+                waiting.append((len(arrays[0]), first + len(arrays[0])))
+                self._enter(first, list(zip(*(array.tolist() for array in arrays), strict=True)))
+                while waiting and len(self._rows.flags) >= waiting[0][0]:
+                    yield self._rows.take(*waiting.popleft())
+            self._collect(0)
+        except LinkClosed as error:
+            place = f"after sample {self._answered - 1}" if self._answered > 0 else "before the first sample"
+            raise LinkClosed(f"{error} {place}") from error
+        except TimeLimitReached:
+            yield from self._take_rest(waiting)
+            raise
+        yield from self._take_rest(waiting)
+
+    def _take_rest(self, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
+        """Answers to the waiting stretches (samples, end); the last may be answered in part."""
+        for n, end in waiting:
+            answered = min(n, len(self._rows.flags))
+            yield self._rows.take(answered, end - n + answered)
+
+    # ---- to the device
+
+    def _enter(self, first: int, samples: Sequence[Codes]) -> None:
+        if first < self._next_index:
+            raise ValueError(f"sample {first} comes again: the next one is {self._next_index}")
         per_message = self._packing.per_message
         for start in range(0, len(samples), per_message):
             self._send(first + start, samples[start : start + per_message])
-        self.next_index = first + len(samples)
-
-    def finish(self) -> None:
-        """Wait for all answers; errors as ``enter``."""
-        self._collect(0)
-
-    @property
-    def ready(self) -> int:
-        """Number of samples that can be taken."""
-        return len(self._rows.flags)
-
-    def take(self, n: int, before: int) -> Replies:
-        """Remove and return the oldest n samples, with the alarms and diagnoses before the sample ``before``."""
-        return self._rows.take(n, before)
-
-    # ---- to the device
+        self._next_index = first + len(samples)
 
     def _send(self, first: int, samples: Sequence[Codes]) -> None:
         if self._pace is not None:
@@ -240,10 +249,7 @@ class Exchange:
             is_full = len(self._pending) >= window
             self._pace.sending(first + len(samples), window * self._packing.per_message, is_full=is_full)
         self._collect(self._packing.window - 1)
-        try:
-            deadline_s = self._talk.send(self._message(first, samples))
-        except LinkClosed as error:
-            raise self._with_place(error) from error
+        deadline_s = self._talk.send(self._message(first, samples))
         if not self._pending:
             self._deadline_s = deadline_s
             self._await(first)
@@ -264,30 +270,24 @@ class Exchange:
 
     def _wait_for(self, due_s: float) -> None:
         """Accept messages until this time on the clock."""
-        try:
-            while self._talk.clock() < due_s:
-                message = self._talk.receive(due_s)
-                if message is not None:
-                    self._accept(message)
-        except LinkClosed as error:
-            raise self._with_place(error) from error
+        while self._talk.clock() < due_s:
+            message = self._talk.receive(due_s)
+            if message is not None:
+                self._accept(message)
 
     def _collect(self, most: int) -> None:
         """Accept messages until at most ``most`` are not completely answered."""
-        try:
-            while len(self._pending) > most:
-                message = self._talk.receive(self._deadline_s)
-                if message is None:
-                    self._handle_timeout()
-                else:
-                    self._accept(message)
-        except LinkClosed as error:
-            raise self._with_place(error) from error
+        while len(self._pending) > most:
+            message = self._talk.receive(self._deadline_s)
+            if message is None:
+                self._handle_timeout()
+            else:
+                self._accept(message)
 
     def _accept(self, message: Message) -> None:
         """Accept an answer about the oldest sample, or about one whose predecessors were lost."""
         if not is_finite(message):
-            raise self._non_finite(message)
+            raise self._non_finite_error(message)
         if (
             isinstance(message, Estimate)
             and message.sample_index == self._wire_index
@@ -305,7 +305,7 @@ class Exchange:
             self._lose(lost)
             self._accept(message)
         else:
-            raise self._unexpected(message)
+            raise self._unexpected_error(message)
 
     def _ends(self, message: Stepped) -> bool:
         """True if the message completes a sample of this run."""
@@ -380,7 +380,7 @@ class Exchange:
             )
         self._lose(len(self._pending))
 
-    def _non_finite(self, message: Message) -> DeviceError:
+    def _non_finite_error(self, message: Message) -> DeviceError:
         """Error for an answer with a value that is NaN or infinite."""
         wire_index = getattr(message, "sample_index", self._answered % INDICES)
         index = index_up_to(sum(self._pending[-1]) - 1 if self._pending else self._answered, wire_index)
@@ -391,13 +391,9 @@ class Exchange:
             " which is not finite"
         )
 
-    def _unexpected(self, message: Message) -> DeviceError:
+    def _unexpected_error(self, message: Message) -> DeviceError:
         due = self._elements[self._next_element]
         wanted = "Stepped" if due == _NO_ELEMENT else f"Estimate of {Element(due).name}"
         return DeviceError(
             f"device {self._talk.name}: expected {wanted} for sample {self._answered}, received {message}"
         )
-
-    def _with_place(self, error: LinkError) -> LinkClosed:
-        place = f"after sample {self._answered - 1}" if self._answered > 0 else "before the first sample"
-        return LinkClosed(f"{error} {place}")

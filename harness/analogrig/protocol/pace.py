@@ -6,7 +6,7 @@ import math
 
 from analogrig.catalogue import BLOCK_SAMPLES, Estimate, Sample, SampleBlock, Stepped
 from analogrig.errors import ConfigurationError
-from analogrig.links.line import LineSpeed
+from analogrig.links.line import Line
 from analogrig.links.wire import Clock
 
 
@@ -43,25 +43,31 @@ class Pace:
         self.overruns += is_full or late_s > window * self._period_s
 
 
-def check_line(
-    line: LineSpeed, period_s: float, *, device: str, parameters: int, report_interval_n: int, in_blocks: bool
-) -> None:
-    """Check that ``line`` carries a sample every ``period_s``, without alarms and diagnoses.
+def sample_times(line: Line, *, parameters: int, report_interval_n: int, in_blocks: bool) -> tuple[float, float]:
+    """Time on the line of one sample and of its answers, without alarms and diagnoses [s].
 
-    :param device: its name, for the error.
     :param parameters: elements of theta.
-    :raises ConfigurationError: the line is too slow; shows the calculation.
     """
     to_s = line.message_s(SampleBlock) / BLOCK_SAMPLES if in_blocks else line.message_s(Sample)
-    elements = parameters + 1
-    stepped_s = line.message_s(Stepped)
-    from_s = stepped_s + elements * line.message_s(Estimate) / report_interval_n
+    return to_s, line.message_s(Stepped) + (parameters + 1) * line.message_s(Estimate) / report_interval_n
+
+
+def check_line(
+    line: Line, period_s: float, *, device: str, parameters: int, report_interval_n: int, in_blocks: bool
+) -> None:
+    """Check that ``line`` carries a sample every ``period_s``; parameters as of ``sample_times``.
+
+    :param device: its name, for the error.
+    :raises ConfigurationError: the line is too slow; shows the calculation.
+    """
+    to_s, from_s = sample_times(line, parameters=parameters, report_interval_n=report_interval_n, in_blocks=in_blocks)
     load = line.together_s(to_s, from_s) / period_s
     if load > 1.0:
-        thinner = ", or more samples for each report" if line.together_s(to_s, stepped_s) < period_s else ""
+        would_fit = line.together_s(to_s, line.message_s(Stepped)) < period_s
+        thinner = ", or more samples for each report" if would_fit else ""
         raise ConfigurationError(
             f"device {device}: real time does not fit its line: {1.0 / period_s:g} samples/s, each of"
-            f" {to_s * 1e6:.4g} us to the device and {from_s * 1e6:.4g} us back ({elements} estimates every"
+            f" {to_s * 1e6:.4g} us to the device and {from_s * 1e6:.4g} us back ({parameters + 1} estimates every"
             f" {report_interval_n} samples), need {load:.4g} times the capacity of {line.speed};"
             f" {math.ceil(10.0 * load) / 10.0:g} times slower would fit{thinner}"
         )

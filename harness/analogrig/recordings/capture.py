@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from analogrig import catalogue
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
-from analogrig.recordings.decoder import CaptureDecoder, CapturedRun, FrameDecoder
+from analogrig.recordings.decoder import CaptureDecoder, CapturedRun, FrameDictionary
 from analogrig.recordings.files import CapturedFrames
 from analogrig.run import CHANNELS, LOST, UNREPORTED, Conditions, Run
 from analogrig.scenario import Scenario
@@ -49,7 +48,7 @@ def import_run(
     """
     frames = CapturedFrames(path)
     try:
-        decoder = CaptureDecoder(FrameDecoder(dbc), frames)
+        decoder = CaptureDecoder(FrameDictionary(dbc), frames)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     captured = _select_run(decoder, frames, number)
@@ -162,8 +161,8 @@ def _run(
         innovation=rows.values[:, -1],
         statistic=rows.statistic,
         flags=rows.flags,
-        **_event_arrays(alarms, ("alarm_index", "alarm_kind", "alarm_statistic")),
-        **_event_arrays(diagnoses, ("diagnosis_index", "diagnosis_change", "diagnosis_onset", "diagnosis_extent")),
+        **_event_arrays(alarms, _ALARM),
+        **_event_arrays(diagnoses, _DIAGNOSIS),
     )
 
 
@@ -177,13 +176,18 @@ def _capture_faults(path: Path, captured: CapturedRun) -> Iterator[str]:
         yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"
 
 
-_TYPES = {"index": np.int64, "onset": np.int64, "kind": np.uint8, "change": np.uint8}
+_ALARM = (("alarm_index", np.int64), ("alarm_kind", np.uint8), ("alarm_statistic", np.float32))
+_DIAGNOSIS = (
+    ("diagnosis_index", np.int64),
+    ("diagnosis_change", np.uint8),
+    ("diagnosis_onset", np.int64),
+    ("diagnosis_extent", np.float32),
+)
+"""Fields of ``Run``, in the order of the rows of ``CapturedRun``."""
 
 
-def _event_arrays(rows: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    columns: Iterable[Sequence[float]] = zip(*rows, strict=True) if rows else itertools.repeat(())
-    types = [_TYPES.get(name.rpartition("_")[2], np.float32) for name in names]
-    return {name: np.array(column, kind) for name, kind, column in zip(names, types, columns, strict=False)}
+def _event_arrays(rows: Sequence[Sequence[float]], fields: Sequence[tuple[str, type]]) -> dict[str, Any]:
+    return {name: np.array([row[i] for row in rows], kind) for i, (name, kind) in enumerate(fields)}
 
 
 class _RunArrays:

@@ -4,26 +4,14 @@ from __future__ import annotations
 
 import struct
 from collections import Counter as Tally
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig import catalogue, config
-from analogrig.catalogue import (
-    CATALOGUE_HASH,
-    INDICES,
-    LAYOUTS,
-    RUN_SHIFT,
-    RUNS,
-    SEQS,
-    STEPPED_FLAGS,
-    Message,
-    brief,
-    index_up_to,
-    pack,
-    unpack,
-)
+from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.recordings.files import silence_logger
 
@@ -31,38 +19,34 @@ if TYPE_CHECKING:
     import can
 
 
-class FrameDecoder:
-    """Decoder of frames, by the catalogue of this build or by a DBC with other identifiers and layouts."""
+class FrameDictionary:
+    """Meaning of frames, by the catalogue of this build or by a DBC with other identifiers and layouts."""
 
     def __init__(self, dbc: Path | None = None) -> None:
         """Decode by ``dbc``; None: by the catalogue of this build.
 
         :raises ConfigurationError: ``dbc`` is not a DBC, or one of its messages lacks a signal or is multiplexed.
         """
-        self.dbc = dbc
-        self._messages = {} if dbc is None else _messages(dbc)
+        self.is_own = dbc is None
+        self._decoders: Mapping[tuple[int, bool], Callable[[bytes], Message | None]]
+        if dbc is None:
+            self._decoders = {(layout.id, False): partial(_decode_own, layout.id) for layout in LAYOUTS.values()}
+        else:
+            self._decoders = {key: partial(_decode_by_dbc, known) for key, known in _messages(dbc).items()}
 
     def message(self, frame: can.Message) -> Message | None:
         """Message in a frame; None if the frame holds none of the catalogue."""
-        if frame.is_error_frame or frame.is_remote_frame:
+        if frame.is_remote_frame or not self.is_known(frame):
             return None
-        if self.dbc is not None:
-            known = self._messages.get((frame.arbitration_id, frame.is_extended_id))
-            return None if known is None else _decode_by_dbc(known, bytes(frame.data))
-        if frame.is_extended_id or frame.arbitration_id > 0xFF:
-            return None
-        return unpack(bytes((frame.arbitration_id,)) + bytes(frame.data))
+        return self._decoders[frame.arbitration_id, frame.is_extended_id](bytes(frame.data))
 
-    def is_ours(self, frame: can.Message) -> bool:
+    def is_known(self, frame: can.Message) -> bool:
         """True if the identifier of the frame belongs to the catalogue."""
-        if frame.is_error_frame:
-            return False
-        if self.dbc is not None:
-            return (frame.arbitration_id, frame.is_extended_id) in self._messages
-        return not frame.is_extended_id and frame.arbitration_id in _IDENTIFIERS
+        return not frame.is_error_frame and (frame.arbitration_id, frame.is_extended_id) in self._decoders
 
 
-_IDENTIFIERS = {layout.id for layout in LAYOUTS.values()}
+def _decode_own(identifier: int, data: bytes) -> Message | None:
+    return unpack(bytes((identifier,)) + data)
 
 
 MAX_DBC_BYTES = 16_000_000
@@ -80,8 +64,7 @@ def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
     except ConfigurationError as error:
         raise ConfigurationError(f"--dbc {error}") from error
     except Exception as error:
-        cause = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigurationError(f"--dbc {dbc}: not a DBC: {cause}") from error
+        raise ConfigurationError(f"--dbc {dbc}: not a DBC: {str(error) or type(error).__name__}") from error
     known = [message for message in database.messages if message.name in LAYOUTS]
     if not known:
         raise ConfigurationError(f"--dbc {dbc}: has none of the messages {', '.join(LAYOUTS)}")
@@ -156,7 +139,7 @@ class CapturedRun:
 class CaptureDecoder:
     """Decoder of a capture: assembles the runs of a device from the messages in both directions."""
 
-    def __init__(self, dictionary: FrameDecoder, frames: Iterable[can.Message]) -> None:
+    def __init__(self, dictionary: FrameDictionary, frames: Iterable[can.Message]) -> None:
         """Decode all ``frames``.
 
         :raises RecordingError: the device uses another catalogue, and no DBC was given.
@@ -185,7 +168,7 @@ class CaptureDecoder:
     def _decode(self, frame: can.Message) -> None:
         message = self._dictionary.message(frame)
         if message is None:
-            kind = "frames_dropped" if self._dictionary.is_ours(frame) else "frames_foreign"
+            kind = "frames_dropped" if self._dictionary.is_known(frame) else "frames_foreign"
             self.line["error_frames" if frame.is_error_frame else kind] += 1
         elif self._is_next(message):
             handle = getattr(self, f"_{type(message).__name__.lower()}", None)
@@ -199,7 +182,7 @@ class CaptureDecoder:
         self._last[from_harness] = message
         if last is None or isinstance(message, catalogue.Identify | catalogue.Hello):
             return True
-        step = (message.seq - last.seq) % SEQS
+        step = (message.seq - last.seq) % catalogue.SEQS
         if step == 0:
             if type(message) is not type(last) or message != last:
                 sender = "harness" if from_harness else "device"
@@ -241,7 +224,7 @@ class CaptureDecoder:
 
     def _belongs_to_run(self, flags: int) -> bool:
         """True if the run id in ``flags`` is that of the current run, which adopts the first id if it has none."""
-        run, current = flags >> RUN_SHIFT & (RUNS - 1), self._current_run()
+        run, current = flags >> catalogue.RUN_SHIFT & (RUNS - 1), self._current_run()
         if current.run is None:
             current.run = run
         self.line["messages_of_other_runs"] += current.run != run
@@ -276,10 +259,10 @@ class CaptureDecoder:
 
         :raises RecordingError: the device uses another catalogue, and no DBC was given.
         """
-        if self._dictionary.dbc is None and message.catalogue_hash != CATALOGUE_HASH:
+        if self._dictionary.is_own and message.catalogue_hash != catalogue.CATALOGUE_HASH:
             raise RecordingError(
-                f"the device uses catalogue {message.catalogue_hash:#010x}, this harness {CATALOGUE_HASH:#010x}:"
-                " pass the DBC of the device with --dbc"
+                f"the device uses catalogue {message.catalogue_hash:#010x}, this harness"
+                f" {catalogue.CATALOGUE_HASH:#010x}: pass the DBC of the device with --dbc"
             )
         hello = {"catalogue_hash": message.catalogue_hash, "theta_max": message.theta_max}
         self._identity = {**self._identity, **hello}
@@ -335,6 +318,6 @@ class CaptureDecoder:
             run.incomplete.add(index)
             self._has_gap = False
         self._date_diagnosis(index)
-        step = (message.flags & STEPPED_FLAGS, message.statistic)
+        step = (message.flags & catalogue.STEPPED_FLAGS, message.statistic)
         if run.steps.setdefault(index, step) != step:
             self._add_fault(f"the step of sample {index} was sent twice with different values")

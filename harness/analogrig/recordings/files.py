@@ -7,11 +7,10 @@ import gc
 import io
 import logging
 import sys
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any
 
 from analogrig.errors import RecordingError
 from analogrig.wording import number_of
@@ -21,12 +20,6 @@ if TYPE_CHECKING:
 
 WRITTEN = ("log", "blf", "asc", "mf4")
 """Formats that can be written, as file suffixes."""
-
-
-class _FrameWriter(Protocol):
-    def __call__(self, frame: can.Message) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 class CanLog:
@@ -40,7 +33,7 @@ class CanLog:
         self.path = path
         self._held: list[can.Message] | None = []
         """Frames before ``begin``; None afterwards."""
-        self._writer: _FrameWriter | None = None
+        self._writer: can.io.generic.MessageWriter | None = None
         self._failure: Exception | None = None
 
     @property
@@ -62,7 +55,9 @@ class CanLog:
             return
         try:
             if self._writer is None:
-                self._writer = _open_writer(self.path)
+                from analogrig.links.python_can import can
+
+                self._writer = can.Logger(self.path)
             self._writer(frame)
         except Exception as error:  # noqa: BLE001 - the writers' exceptions are undocumented; the run must continue
             self._failure = error
@@ -80,21 +75,8 @@ class CanLog:
             self._failure = self._failure or error
         failure, self._failure = self._failure, None
         if failure is not None:
-            cause = getattr(failure, "strerror", None) or " ".join(str(failure).split())
+            cause = getattr(failure, "strerror", None) or failure
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from failure
-
-
-def _open_writer(path: Path) -> _FrameWriter:
-    from analogrig.links.python_can import can
-
-    writers: Mapping[str, Any] = {
-        "log": can.CanutilsLogWriter,
-        "blf": can.BLFWriter,
-        "asc": can.ASCWriter,
-        "mf4": can.MF4Writer,
-    }
-    writer: _FrameWriter = writers[path.suffix[1:]](path)
-    return writer
 
 
 READ = (*WRITTEN, "trc")
@@ -103,19 +85,6 @@ READ = (*WRITTEN, "trc")
 
 LONGEST_LINE = 4096
 """Characters of a line of a candump log that are read at once; a frame has at most 200."""
-
-
-class _CountedLines(io.TextIOBase):
-    """Text file that counts the lines read, and cuts those that are longer than ``LONGEST_LINE``."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-        self.number = 0
-
-    def readline(self, _size: int | None = -1, /) -> str:  # type: ignore[override]
-        line = self._file.readline(LONGEST_LINE)
-        self.number += line != ""
-        return line
 
 
 @dataclass
@@ -151,35 +120,26 @@ class CapturedFrames:
         from analogrig.links.python_can import can
 
         with self.path.open(encoding="ascii", errors="replace") as file:
-            lines = _CountedLines(file)
-            while True:
-                before = lines.number
+            lines = iter(lambda: file.readline(LONGEST_LINE), "")
+            for number, line in enumerate(lines, 1):
                 try:
-                    yield from can.CanutilsLogReader(typing.cast(TextIO, lines))
+                    yield from can.CanutilsLogReader(io.StringIO(line))
                 except Exception:  # noqa: BLE001 - python-can's exceptions for damaged lines are undocumented
-                    self.damaged.append(lines.number)
-                    if lines.number > before:
-                        continue
-                return
+                    self.damaged.append(number)
 
     def _read_binary(self) -> Iterator[can.Message]:
         """Read any other format, in which reading ends at the first fault."""
         from analogrig.links.python_can import can
 
-        readers: Mapping[str, Any] = {
-            "blf": can.BLFReader,
-            "asc": can.ASCReader,
-            "mf4": can.MF4Reader,
-            "trc": can.TRCReader,
-        }
-        suffix = self.path.suffix[1:].lower()
+        suffix = self.path.suffix.lower()
+        reader: Any = can.io.player.MESSAGE_READERS[suffix]
         n = 0
         # The file is opened here because readers that fail leave it open.
         with self.path.open("rb") as raw:
-            file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {"asc", "trc"} else raw
+            file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {".asc", ".trc"} else raw
             with silence_logger("asammdf"), silence_logger("can"), _silence_asammdf():
                 try:
-                    for frame in readers[suffix](file):
+                    for frame in reader(file):
                         yield frame
                         n += 1
                 except Exception as error:  # noqa: BLE001 - the readers' exceptions are undocumented

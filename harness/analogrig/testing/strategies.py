@@ -273,7 +273,7 @@ def seeds() -> st.SearchStrategy[int]:
 
 def link_faults(kinds: Sequence[str] | None = None, most: int = 3) -> st.SearchStrategy[str]:
     """Link faults in the syntax of ``--wire-faults``; shrinks to a line without faults."""
-    from analogrig.links.faulty_wire import FaultyWire
+    from analogrig.links.wire_faults import FaultyWire
 
     where = st.one_of(
         st.builds("{}:{}".format, st.sampled_from(["to", "from"]), st.integers(0, 400)),

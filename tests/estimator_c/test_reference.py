@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.devices.estimator import Estimator, StepStatus
-from analogrig.devices.reference import ReferenceEstimator
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
+from tests.estimator_c.reference import ReferenceEstimator
 from tests.estimator_c.test_est_trigger import FRONT, suspension
 
 N = 900
@@ -75,7 +75,7 @@ def followed(
 @pytest.mark.parametrize("missing", [[], [100, 314, 315, 700]], ids=["whole", "gaps"])
 @pytest.mark.parametrize("drift", [0.0, 2e-5, -2e-5], ids=["still", "late", "early"])
 @pytest.mark.parametrize("case", CASES)
-def test_estimator_and_twin_agree(case: str, drift: float, missing: list[int]) -> None:
+def test_estimator_and_reference_agree(case: str, drift: float, missing: list[int]) -> None:
     u, y = record(drift)
     valid = np.ones(N, bool)
     valid[missing] = False

@@ -1,4 +1,4 @@
-"""Reference implementation of the estimator in plain Python and float64, as an oracle for the C and for exploration.
+"""Reference implementation of the estimator in plain Python and float64, as an oracle for the C.
 
 It follows harness/docs/background/estimator.md, not the C; both agree to the precision of float32. It is not
 optimised. Guards of the device (stuck or absurd readings, counters) are left out.
