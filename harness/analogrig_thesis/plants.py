@@ -5,14 +5,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import freqz, lfilter, lfiltic
 
 from analogrig.plant import AT_REST, Plant, SampledPlant
 from analogrig.run import Segment
-from analogrig_thesis.document import Signal
+from analogrig_thesis.texts import Signal
 
 PERIOD_S = 0.01
 """Section 4.2: "The system sample rate was 100Hz"."""
@@ -34,8 +35,11 @@ PROFILE_N = 800
 CHANGE_LABELS = ("K↓", "B↑", "B↓, K↑", "M↓")
 
 
-@dataclass(frozen=True)
-class Arx:
+REST = np.zeros(2)
+"""Two samples at rest."""
+
+
+class Arx(NamedTuple):
     """y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) + b1 u(k-2) (thesis Equ 3.10 with na = nb = 2)."""
 
     a1: float
@@ -64,11 +68,6 @@ class Arx:
         return cls(a1, a2, b0 * b_scale, b1 * b_scale)
 
     @property
-    def values(self) -> tuple[float, float, float, float]:
-        """a1, a2, b0, b1."""
-        return (self.a1, self.a2, self.b0, self.b1)
-
-    @property
     def poles(self) -> list[float]:
         """Real parts of both poles, the larger pole first."""
         return [x.real for x in sorted(np.roots([1.0, self.a1, self.a2]).tolist(), key=abs, reverse=True)]
@@ -78,21 +77,15 @@ class Arx:
         """Static gain, metres per newton."""
         return (self.b0 + self.b1) / (1.0 + self.a1 + self.a2)
 
-    def response(self, u: Signal, before: tuple[Signal, Signal] | None = None) -> Signal:
-        """Simulated output (n,).
-
-        :param before: the two inputs and the two outputs before the first sample; zeros if omitted.
-        """
-        past_u, past_y = before or (np.zeros(2), np.zeros(2))
-        inputs, y = [*past_u.tolist(), *u.tolist()], past_y.tolist()
-        for k in range(len(u)):
-            y.append(-self.a1 * y[k + 1] - self.a2 * y[k] + self.b0 * inputs[k + 1] + self.b1 * inputs[k])
-        return np.array(y[2:])
+    def response(self, u: Signal, past_u: Signal = REST, past_y: Signal = REST) -> Signal:
+        """Simulated output (n,) after two inputs and two outputs."""
+        b, a = [0.0, self.b0, self.b1], [1.0, self.a1, self.a2]
+        return np.asarray(lfilter(b, a, u, zi=lfiltic(b, a, past_y[::-1], past_u[::-1]))[0])
 
     def frequency_response(self, frequency_hz: Signal) -> NDArray[np.complex128]:
         """G(exp(j w T)) (n,)."""
-        z = np.exp(2j * math.pi * frequency_hz * PERIOD_S)
-        return np.asarray((self.b0 * z + self.b1) / (z * z + self.a1 * z + self.a2))
+        b, a = [0.0, self.b0, self.b1], [1.0, self.a1, self.a2]
+        return np.asarray(freqz(b, a, 2.0 * math.pi * frequency_hz * PERIOD_S)[1])
 
 
 def damping_ratio(plant: Plant) -> float:
@@ -105,16 +98,17 @@ def square(n: int, amplitude: float, period_n: int = 100) -> Signal:
     return np.where(np.arange(n) % period_n < period_n // 2, amplitude, -amplitude)
 
 
-def stretches(segments: Sequence[Segment], n: int) -> list[tuple[int, int]]:
-    """First sample of each segment, and of the next one or ``n``."""
-    return list(itertools.pairwise([*(segment.start for segment in segments), n]))
+def stretches(segments: Sequence[Segment], n: int) -> list[tuple[int, int, Plant]]:
+    """First sample of each segment, that of the next one or ``n``, and the plant."""
+    ends = itertools.pairwise([*(segment.start for segment in segments), n])
+    return [(start, end, segment.plant) for (start, end), segment in zip(ends, segments, strict=True)]
 
 
 def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: float = PERIOD_S) -> Signal:
     """Displacement (n,) of a plant whose parameters jump; position and velocity are continuous."""
     y, state = np.empty(len(u)), AT_REST
-    for segment, (start, end) in zip(segments, stretches(segments, len(u)), strict=True):
-        sampled = SampledPlant.from_plant(segment.plant, period_s)
+    for start, end, plant in stretches(segments, len(u)):
+        sampled = SampledPlant.from_plant(plant, period_s)
         for k in range(start, end):
             y[k] = state[0]
             state = sampled.next(state, float(u[k]))
@@ -123,16 +117,12 @@ def time_varying(u: Signal, segments: Sequence[Segment] = PROFILE, period_s: flo
 
 def jumps_in_the_coefficients(u: Signal) -> Signal:
     """Displacement (n,) over the profile if the coefficients of the difference equation jump instead of the plant."""
-    y, before = np.empty(0), (np.zeros(2), np.zeros(2))
-    for segment, (start, end) in zip(PROFILE, stretches(PROFILE, len(u)), strict=True):
-        y = np.append(y, Arx.of(segment.plant).response(u[start:end], before))
-        before = (u[end - 2 : end], y[-2:])
-    return y
+    inputs, y = np.append(REST, u), REST
+    for start, end, plant in stretches(PROFILE, PROFILE_N):
+        y = np.append(y, Arx.of(plant).response(u[start:end], inputs[start : start + 2], y[-2:]))
+    return y[2:]
 
 
 def coefficients(segments: Sequence[Segment], n: int) -> Signal:
     """True a1, a2, b0, b1 (n, 4) of each sample, in metres and newtons."""
-    out = np.empty((n, 4))
-    for segment in segments:
-        out[segment.start :] = Arx.of(segment.plant).values
-    return out
+    return np.concatenate([np.tile(Arx.of(plant), (end - start, 1)) for start, end, plant in stretches(segments, n)])

@@ -14,10 +14,9 @@ import numpy as np
 
 from analogrig.storage import replacing
 from analogrig_thesis import chapter3, chapter4, chapter5
-from analogrig_thesis.circuit_runs import RECORDED, CircuitRuns, play_circuit
-from analogrig_thesis.document import ReproducedChapter, Signal
+from analogrig_thesis.circuit import RECORDED, CircuitRuns, SchemeComparison, compare, play_circuit
 from analogrig_thesis.rendering import render
-from analogrig_thesis.scheme_comparison import SchemeComparison, compare
+from analogrig_thesis.texts import Chapter, Signal
 
 FORMAT, VERSION = "analogrig-thesis", 1
 
@@ -25,6 +24,9 @@ PAGE, CLAIMS, RECORDINGS = "thesis.html", "claims.json", "recordings"
 
 FILES = (CLAIMS, *(f"{RECORDINGS}/{name}.npz" for name in (*RECORDED, "simulated")))
 """Files beside the page."""
+
+TABLES = ("numbers", "errata", "claims")
+"""Tables of every chapter in claims.json."""
 
 DIGITS = 6
 """Significant digits of every value in claims.json; the rest is rounding."""
@@ -34,7 +36,7 @@ DIGITS = 6
 class Reproduction:
     """Results of ``analogrig thesis``."""
 
-    chapters: tuple[ReproducedChapter, ...]
+    chapters: tuple[Chapter, ...]
     comparison: SchemeComparison
     circuit: CircuitRuns
     simulated: Mapping[str, Signal]
@@ -62,18 +64,8 @@ class Reproduction:
         table = {
             "format": FORMAT,
             "version": VERSION,
-            "figures": [figure.number for chapter in self.chapters for figure in chapter.text.figures],
-            "numbers": [
-                {**vars(number), "ours": ours, "deviation": ours / number.printed - 1.0}
-                for chapter in self.chapters
-                for number, ours in zip(chapter.text.numbers, chapter.numbers, strict=True)
-            ],
-            "errata": [vars(erratum) for chapter in self.chapters for erratum in chapter.text.errata],
-            "claims": [
-                {**vars(claim), "measured": chapter.measured[claim.ident]}
-                for chapter in self.chapters
-                for claim in chapter.text.claims
-            ],
+            "figures": [number for chapter in self.chapters for number in chapter.figures],
+            **{name: [row for chapter in self.chapters for row in getattr(chapter, name)] for name in TABLES},
             "comparison": vars(self.comparison),
         }
         return json.dumps(_plain(table), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
@@ -82,19 +74,14 @@ class Reproduction:
 def reproduce() -> Reproduction:
     """Simulate, play, estimate and judge; deterministic, some ten seconds.
 
-    :raises ConfigurationError: a file of texts is not valid.
     :raises DeviceError, LinkError, RigError: the circuit could not be played.
     """
-    example, simulation, circuit = chapter3.play_example(), chapter4.simulate(), play_circuit()
+    simulation, circuit = chapter4.simulate(), play_circuit()
     return Reproduction(
-        (
-            chapter3.reproduce_chapter(example),
-            chapter4.reproduce_chapter(simulation),
-            chapter5.reproduce_chapter(circuit),
-        ),
+        (chapter3.reproduce_chapter(), chapter4.reproduce_chapter(simulation), chapter5.reproduce_chapter(circuit)),
         compare(simulation, circuit),
         circuit,
-        {**chapter3.simulated_data(example), **chapter4.simulated_data(simulation)},
+        {**chapter3.simulate_example(), **chapter4.simulated_data(simulation)},
     )
 
 

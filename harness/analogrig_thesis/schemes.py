@@ -1,12 +1,22 @@
-"""Estimators that the thesis compares, and ours: settings of the same C."""
+"""Estimators that the thesis compares, and ours: settings of the same C, their estimates, and the quality of these."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.judging.verdict import trajectory
+from analogrig.plant import Plant, physical_parameters
+from analogrig.run import Run, Segment
+from analogrig_thesis.plants import CHANGE_LABELS, PERIOD_S, stretches
+from analogrig_thesis.texts import Mark, Signal
 
 HOLD_N = 4
 """Section 4.4.3: "After four samples, calculate the mean as normal". The C counts four innovations: it restarts its
@@ -44,18 +54,29 @@ PLAIN = EstimatorConfig(
 )
 """Plain recursive least squares (Equ 3.19, 3.20): no whitening, no forgetting, no trigger."""
 
-OURS = "cusum"
-"""Key of the shipped default: whitened equations, cumulative sum of the normalised innovation."""
+ERROR, MEAN, OURS = "prediction-error", "mean-between-faults", "cusum"
+"""Keys of the thesis's two triggers, and of the shipped default: whitened equations, cumulative sum of the normalised
+innovation."""
 
 NAMES: Mapping[str, str] = {
     "rls": "recursive least squares",
     "forgetting": f"forgetting factor {FORGETTING:g}",
     "random-walk": "random walk, R = I",
-    "prediction-error": "prediction error",
-    "mean-between-faults": "mean between faults",
+    ERROR: "prediction error",
+    MEAN: "mean between faults",
     OURS: "our default trigger",
 }
 """Names of all schemes by key, in the order of the tables."""
+
+CONVERGED = 0.05
+"""M, B and K have converged once each is, and stays, this close to the truth, relative to it."""
+
+SPIKE = 0.5
+"""An excursion of M, B or K farther than this from the truth, relative to it, is a spike."""
+
+LARGEST_INPUT = 2.0**19
+"""The device rejects readings above 1e6: larger data are divided by a power of two and P0 is multiplied by its square,
+which gives the same estimator to the bit."""
 
 
 def schemes(plain: EstimatorConfig, prediction_error: float, mean: float, warm_up_n: int) -> dict[str, EstimatorConfig]:
@@ -70,7 +91,127 @@ def schemes(plain: EstimatorConfig, prediction_error: float, mean: float, warm_u
         "rls": {},
         "forgetting": {"forgetting": FORGETTING},
         "random-walk": {"random_walk": 1.0},
-        "prediction-error": {"trigger": "prediction-error", "ceiling": prediction_error, "reset": "all", **held},
-        "mean-between-faults": {"trigger": "mean-between-faults", "ceiling": mean, **held},
+        ERROR: {"trigger": ERROR, "ceiling": prediction_error, "reset": "all", **held},
+        MEAN: {"trigger": MEAN, "ceiling": mean, **held},
     }
     return {key: dataclasses.replace(plain, **fields) for key, fields in variants.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Output of an estimator over n samples."""
+
+    theta: Signal
+    """(n, p) in the units of the data."""
+    innovation: Signal
+    """(n,)"""
+    statistic: Signal
+    """(n,) of the trigger."""
+    alarms: NDArray[np.int64]
+    """Sample indices."""
+    parameters: Signal
+    """(n, 3) M, B, K in kg, N s/m, N/m; NaN where theta describes no suspension."""
+
+    @classmethod
+    def of_run(cls, run: Run) -> Track:
+        """Return the device's estimates of a run; theta in codes."""
+        theta, innovation, statistic = (each.astype(np.float64) for each in (run.theta, run.innovation, run.statistic))
+        return cls(theta, innovation, statistic, run.alarm_index, trajectory(run))
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Force ``u`` and displacement ``y`` (n,), in codes of the card or in any other units."""
+
+    u: Signal
+    y: Signal
+    m_per_unit: float = 1.0
+    n_per_unit: float = 1.0
+
+    @property
+    def b_scale(self) -> float:
+        """Factor from b's in these units to b's in metres per newton."""
+        return self.m_per_unit / self.n_per_unit
+
+    def track(self, config: EstimatorConfig) -> Track:
+        """Run the C estimator in this process; its ceiling is in units of y."""
+        largest = max(np.abs(self.u).max(), np.abs(self.y).max())
+        shrunk = 2.0 ** -max(0.0, np.ceil(np.log2(largest / LARGEST_INPUT)))
+        unit = 1.0 if config.trigger == OURS else shrunk
+        ceiling = None if config.ceiling is None else config.ceiling * unit
+        fitted = dataclasses.replace(config, p0=config.p0 / shrunk**2, ceiling=ceiling)
+        steps = Estimator(fitted).run(self.u * shrunk, self.y * shrunk)
+        theta, settings = steps.theta.astype(np.float64), dataclasses.asdict(config)
+        parameters = physical_parameters(theta, settings, self.n_per_unit, self.m_per_unit, PERIOD_S)
+        return Track(theta, steps.innovation / shrunk, steps.statistic / unit, steps.alarms, parameters)
+
+
+@dataclass(frozen=True)
+class TrackQuality:
+    """Detection and convergence of a track, judged by the true plants."""
+
+    latency_n: tuple[int | None, ...]
+    """Samples from each change to the first alarm before the next change."""
+    missed: int
+    extra_alarms: int
+    """Alarms that are not the first after a change."""
+    reconverged_n: tuple[int | None, ...]
+    """Samples from each change until M, B and K stay within 5 % up to the next change; None: never."""
+    spread: tuple[float | None, ...]
+    """Standard deviation of M, B, K over the truth, in the second halves of the stretches; None if one is undefined."""
+    undefined: float
+    """Fraction of those samples at which theta describes no suspension."""
+    spikes: int
+    """Number of times that M, B or K leave the bound SPIKE, or become undefined, after a change."""
+
+
+def assess(track: Track, segments: Sequence[Segment]) -> TrackQuality:
+    """Judge a track by the true plants."""
+    ranges = stretches(segments, len(track.theta))
+    error = np.concatenate([relative_errors(track, plant, start, end) for start, end, plant in ranges])
+    late = [error[(start + end) // 2 : end] for start, end, _ in ranges]
+    spread = np.sqrt(np.mean([each.var(axis=0) for each in late], axis=0))
+    latency = [_first_alarm(track.alarms, start, end) for start, end, _ in ranges[1:]]
+    beyond = [~(np.abs(error[start + 1 : end]) <= SPIKE).all(axis=1) for start, end, _ in ranges[1:]]
+    return TrackQuality(
+        latency_n=tuple(latency),
+        missed=latency.count(None),
+        extra_alarms=len(track.alarms) - len(latency) + latency.count(None),
+        reconverged_n=tuple(reconverged(error, segments)),
+        spread=tuple(None if np.isnan(each) else float(each) for each in spread),
+        undefined=float(np.concatenate([np.isnan(each).any(axis=1) for each in late]).mean()),
+        spikes=sum(int((each[1:] & ~each[:-1]).sum()) for each in beyond),
+    )
+
+
+def relative_errors(track: Track, plant: Plant, start: int = 0, end: int | None = None) -> Signal:
+    """Errors (n, 3) of M, B, K in samples ``start`` to ``end``, relative to the plant."""
+    return np.asarray(track.parameters[start:end] / list(plant.parameters().values()) - 1.0)
+
+
+def settling_n(error: Signal, within: float = CONVERGED) -> int | None:
+    """Samples until all rows of (n, p) errors stay within a bound, counted from 1; None if the last row does not."""
+    beyond = np.flatnonzero(~(np.abs(error) <= within).all(axis=1))
+    if not len(beyond):
+        return 1
+    return None if beyond[-1] == len(error) - 1 else int(beyond[-1]) + 2
+
+
+def reconverged(error: Signal, segments: Sequence[Segment]) -> list[int | None]:
+    """Samples from each change until all columns of (n, p) errors stay within 5 % up to the next change."""
+    return [settling_n(error[start + 1 : end]) for start, end, _ in stretches(segments, len(error))[1:]]
+
+
+def marks(track: Track, segments: Sequence[Segment], *, with_alarms: bool = True) -> tuple[Mark, ...]:
+    """Changes of the plant and, on request, alarms: the first after each change, and the others."""
+    ranges = stretches(segments, len(track.theta))[1:]
+    changes = [Mark(float(start), "change", label) for (start, *_), label in zip(ranges, CHANGE_LABELS, strict=True)]
+    found = {start + n for start, end, _ in ranges if (n := _first_alarm(track.alarms, start, end)) is not None}
+    alarms = [Mark(float(k), "alarm" if int(k) in found else "false") for k in track.alarms]
+    return (*changes, *(alarms if with_alarms else ()))
+
+
+def _first_alarm(alarms: NDArray[np.int64], start: int, end: int) -> int | None:
+    """Latency of a change at ``start``, which acts on sample ``start + 1`` for the first time."""
+    after = alarms[(alarms > start) & (alarms <= end)]
+    return int(after[0]) - start if len(after) else None

@@ -7,28 +7,14 @@
   const ROBUST_SPREAD = 0.6; // relative distance from the truth beyond which an estimate does not widen the plot
   const CEILINGS_SHOWN = 2;
   const BUCKET_PX = 3;
-  const { alarms, begin, cursor, curve, inks, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf } = plotting;
+  const { begin, curve, drawn, lettered, padded, position, trouble, verticals } = plotting;
 
   const run = JSON.parse(document.getElementById("run").textContent);
   const last = run.samples - 1;
   const showEvery = document.getElementById("every");
   const view = { min: 0, max: last };
   const places = placed();
-  let plots = [];
-
-  function decoded(buffer) {
-    const types = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
-    const signals = {};
-    let at = 0;
-    for (const column of run.columns) {
-      const size = types[column.type].BYTES_PER_ELEMENT * run.points;
-      const raw = new types[column.type](buffer.slice(at, at + size)); // a copy is aligned
-      at += size;
-      const values = Array.from(raw, (v) => (Number.isFinite(v) ? column.offset + column.scale * v : null));
-      signals[column.name] = { raw, values, unit: column.unit };
-    }
-    return signals;
-  }
+  let plots = () => [];
 
   // Sample of each point. A bucket of several samples has two points: the minimum and the maximum.
   function placed() {
@@ -205,10 +191,6 @@
     return plotting.axis(scale, label, side, ink, { size, labelSize: 22, stroke: ink(colour), grid });
   }
 
-  function sampleAxis(ink) {
-    return plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 });
-  }
-
   function pair(signals, ink, caption, left, right) {
     const [a, b] = [left, right].map((name) => signals[name]);
     const words = (name) => name.replace("_", " ");
@@ -254,47 +236,18 @@
     };
   }
 
-  function options(plot, width, ink, stretches) {
-    const rightAxis = plot.axes.length > 1;
-    return {
-      width,
-      height: HEIGHT_PX,
-      padding: [20, rightAxis ? 0 : RIGHT_PX, 0, 0],
-      cursor: cursor("run"),
-      scales: {
-        x: {
-          time: false,
-          range: (u, min, max) => {
-            view.min = Math.max(0, min ?? 0);
-            view.max = Math.min(last, max ?? last);
-            return [view.min, view.max];
-          },
-        },
-        ...plot.scales,
-      },
-      axes: [sampleAxis(ink), ...plot.axes],
-      series: [{ label: "sample" }, ...plot.series],
-      hooks: {
-        drawClear: [(u) => buckets(u, ink).shade()],
-        drawAxes: [(u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }), (u) => alarms(u, marks, ink).lines()],
-        draw: [(u) => missingBand(u, stretches, ink), (u) => alarms(u, marks, ink).flags(), (u) => lamps(u, ink), (u) => buckets(u, ink).words()],
-      },
-    };
-  }
+  const samples = {
+    time: false,
+    range: (u, min, max) => {
+      view.min = Math.max(0, min ?? 0);
+      view.max = Math.min(last, max ?? last);
+      return [view.min, view.max];
+    },
+  };
 
-  function show(first, final) {
-    for (const plot of plots) plot.setScale("x", { min: Math.max(0, first), max: Math.min(last, final) });
-  }
-
-  function draw(signals) {
-    const ink = inks();
-    const place = document.getElementById("plots");
-    const width = widthOf(place);
+  function described(signals, ink) {
     const stretches = missingStretches(signals.missing.raw);
-    const kept = { ...view };
-    plots.forEach((plot) => plot.destroy());
-    place.replaceChildren();
-    plots = [
+    return [
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
       ...(signals.velocity && signals.net_force
         ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
@@ -302,16 +255,28 @@
       estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
       estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
       statistic(signals, ink),
-    ].map((plot) => {
-      const figure = document.createElement("figure");
-      const caption = document.createElement("figcaption");
-      caption.textContent = plot.caption;
-      figure.append(caption);
-      place.append(figure);
-      const name = `${plot.caption}, samples 0 to ${last}`;
-      return plotted(options(plot, width, ink, stretches), [places, ...plot.data], figure, name);
-    });
-    show(kept.min, kept.max);
+    ].map((plot) => ({
+      ...plot,
+      place: document.getElementById("plots"),
+      frame: ["figure", "figcaption"],
+      name: `${plot.caption}, samples 0 to ${last}`,
+      key: "run",
+      right_px: plot.axes.length > 1 ? 0 : RIGHT_PX,
+      data: [places, ...plot.data],
+      scales: { x: samples, ...plot.scales },
+      axes: [plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 }), ...plot.axes],
+      series: [{ label: "sample" }, ...plot.series],
+      marks,
+      under: [
+        (u) => buckets(u, ink).shade(),
+        (u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }),
+      ],
+      over: [(u) => missingBand(u, stretches, ink), (u) => lamps(u, ink), (u) => buckets(u, ink).words()],
+    }));
+  }
+
+  function show(first, final) {
+    for (const plot of plots()) plot.setScale("x", { min: Math.max(0, first), max: Math.min(last, final) });
   }
 
   function controlled() {
@@ -328,14 +293,15 @@
     }
   }
 
-  function shown(buffer) {
-    const signals = decoded(buffer);
-    draw(signals);
-    redrawn(() => draw(signals), document.getElementById("plots"), () => plots, HEIGHT_PX);
+  function shown(columns) {
+    const signals = Object.fromEntries(columns.map((column) => [column.name, column]));
+    plots = drawn((ink) => described(signals, ink), [HEIGHT_PX, HEIGHT_PX]);
+    show(0, last);
     controlled();
-    return plots.length;
+    return plots().length;
   }
 
-  if (run.samples) begin(run.deflated, shown);
+  const columns = run.columns.map((column) => ({ ...column, points: run.points }));
+  if (run.samples) begin(columns, run.deflated, shown);
   else trouble("The run ended before its first sample: there is nothing to plot.");
 })();
