@@ -10,8 +10,7 @@ import numpy as np
 
 from analogrig.devices.reference import ReferenceEstimator
 from analogrig.estimator_config import EstimatorConfig
-from analogrig_thesis.plants import square
-from analogrig_thesis.schemes import ERROR, MEAN, PLAIN, Samples, Track, schemes, settling_n
+from analogrig_thesis.models import ERROR, MEAN, PLAIN, Samples, Track, schemes, settling_n, square
 from analogrig_thesis.texts import Chapter, Drawing, Facts, Mark, Signal, load_chapter
 
 N = 800

@@ -14,38 +14,36 @@ from analogrig.devices.reference import ReferenceEstimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import Plant
 from analogrig.run import Segment
-from analogrig_thesis.plants import (
-    FRONT,
-    PERIOD_S,
-    PROFILE,
-    PROFILE_N,
-    SHOCK,
-    Arx,
-    coefficients,
-    damping_ratio,
-    jumps_in_the_coefficients,
-    square,
-    stretches,
-    time_varying,
-)
-from analogrig_thesis.schemes import (
+from analogrig_thesis.models import (
     ERROR,
     ERROR_CEILING,
+    FRONT,
     HOLD_N,
     MEAN,
     P0,
+    PERIOD_S,
     PLAIN,
+    PROFILE,
+    PROFILE_N,
+    SHOCK,
     UNITS_PER_M,
     WARM_UP_N,
+    Arx,
     Samples,
     Track,
     TrackQuality,
     assess,
+    coefficients,
+    damping_ratio,
+    jumps_in_the_coefficients,
     marks,
     reconverged,
     relative_errors,
     schemes,
     settling_n,
+    square,
+    stretches,
+    time_varying,
 )
 from analogrig_thesis.texts import Chapter, Drawing, Facts, Signal, load_chapter
 
@@ -73,7 +71,7 @@ OUTLIER_AT = (60, 100, 150)
 NOISE_UNITS = (0.0, 100.0, 300.0)
 NOISE_SEEDS = range(5)
 
-SCHEMES = schemes(PLAIN, ERROR_CEILING, MEAN_CEILING, WARM_UP_N)
+SCHEMES = schemes(PLAIN, ERROR_CEILING, MEAN_CEILING)
 
 ENDS = [end - 1 for _, end, _ in stretches(PROFILE, PROFILE_N)]
 """Last samples of the stretches."""
@@ -177,7 +175,7 @@ def _track(config: EstimatorConfig, u: Signal, y_m: Signal, scale: float = UNITS
 
 
 def _scheme(key: str, ceiling: float, **changes: Any) -> EstimatorConfig:
-    return dataclasses.replace(schemes(PLAIN, ceiling, ceiling, WARM_UP_N)[key], **changes)
+    return dataclasses.replace(schemes(PLAIN, ceiling, ceiling)[key], **changes)
 
 
 def _largest(values: Any) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from analogrig.reporting.markup import cell, heading, row, table, text
 from analogrig.reporting.page import SCRIPTS, STYLES, assemble_page
 from analogrig.reporting.payload import as_script, deflate
-from analogrig_thesis.circuit import ComparedData, SchemeComparison, SeedSummary
-from analogrig_thesis.schemes import NAMES, TrackQuality
+from analogrig_thesis.models import NAMES, TrackQuality
 from analogrig_thesis.texts import Chapter, Drawing, Table
 
 _FOLDER = Path(__file__).parent
@@ -33,7 +32,7 @@ _QUALITY = ("Scheme", "Latency", "Missed", "Extra alarms", "Converged after", "S
 _SEEDS = ("Scheme", "Missed", "Extra alarms", "Mean latency", "Median convergence")
 
 
-def render(chapters: Sequence[Chapter], comparison: SchemeComparison) -> str:
+def render(chapters: Sequence[Chapter], comparison: Table) -> str:
     """Return the page; the same input gives the same text.
 
     :raises RecordingError: the build has not put uPlot in its place.
@@ -51,7 +50,8 @@ def render(chapters: Sequence[Chapter], comparison: SchemeComparison) -> str:
         ),
         contents="".join(map(_links, chapters)),
         chapters="\n".join(map(_chapter, chapters)),
-        comparison="".join(_data(each, comparison) for each in comparison.data) + _seeds(comparison),
+        comparison="".join(_data(each, comparison["instructions"]) for each in comparison["data"])
+        + _seeds(comparison["seeds"]),
         data=as_script(_payload(chapters)),
     )
 
@@ -131,11 +131,11 @@ def _claim(claim: Table) -> str:
     )
 
 
-def _data(data: ComparedData, comparison: SchemeComparison) -> str:
-    rows = [_texts((NAMES[key], *_quality(each), comparison.instructions[key])) for key, each in data.schemes.items()]
-    if data.bound_n:
-        rows.append(_texts(("bound of any detector", _list(data.bound_n), *[""] * 6)))
-    return f"<h3>{text(data.name[0].upper() + data.name[1:])}</h3>{table('', heading(_QUALITY), rows)}"
+def _data(data: Table, instructions: Table) -> str:
+    rows = [_texts((NAMES[key], *_quality(each), instructions[key])) for key, each in data["schemes"].items()]
+    if data["bound_n"]:
+        rows.append(_texts(("bound of any detector", _list(data["bound_n"]), *[""] * 6)))
+    return f"<h3>{text(data['name'][0].upper() + data['name'][1:])}</h3>{table('', heading(_QUALITY), rows)}"
 
 
 def _quality(each: TrackQuality) -> list[object]:
@@ -145,20 +145,22 @@ def _quality(each: TrackQuality) -> list[object]:
     return [*trigger, _list(each.reconverged_n), scatter, each.spikes]
 
 
-def _seeds(comparison: SchemeComparison) -> str:
-    some = next(iter(comparison.seeds.values()))
-    rows = (_texts((NAMES[key], *_summary(each))) for key, each in comparison.seeds.items())
+def _seeds(seeds: Mapping[str, Table]) -> str:
+    some = next(iter(seeds.values()))
+    rows = (_texts((NAMES[key], *_summary(each))) for key, each in seeds.items())
     return (
-        f"<h3>Circuit, 12 bits, 1 LSB of noise: {some.changes // 4} seeds, {some.changes} changes, {some.samples:,}"
-        f" samples</h3>{table('', heading(_SEEDS), rows)}"
+        f"<h3>Circuit, 12 bits, 1 LSB of noise: {some['changes'] // 4} seeds, {some['changes']} changes,"
+        f" {some['samples']:,} samples</h3>{table('', heading(_SEEDS), rows)}"
     )
 
 
-def _summary(each: SeedSummary) -> list[object]:
-    latency, converged = ("never" if n is None else f"{n:.3g}" for n in (each.latency_n, each.reconverged_n))
-    if each.latency_n is None and not each.extra_alarms:
+def _summary(each: Table) -> list[object]:
+    latency, converged = (
+        "never" if each[key] is None else f"{each[key]:.3g}" for key in ("latency_n", "reconverged_n")
+    )
+    if each["latency_n"] is None and not each["extra_alarms"]:
         return ["", "", "no trigger", converged]
-    return [each.missed, each.extra_alarms, latency, converged]
+    return [each["missed"], each["extra_alarms"], latency, converged]
 
 
 def _texts(values: Iterable[object]) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from analogrig.devices.estimator import Estimator
-from analogrig_thesis.circuit import NOISY, SEED, TRACKING, circuit_schemes, play_alone
+from analogrig_thesis.chapter5 import NOISY, SEED, TRACKING, circuit_schemes, play_alone
 
 RESULT = Path("harness/analogrig_thesis/cost.json")
 REPEATS = 100

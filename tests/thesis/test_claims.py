@@ -119,60 +119,6 @@ def test_damping_ratios_are_the_closed_form(claims: Claims) -> None:
     assert ours == pytest.approx([damping_ratio(*plant) for plant in PROFILE.values()], rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("ident", "kind", "ceiling"),
-    [("4.6-immediately", "prediction-error", 1500.0), ("4.9-false-alarms", "mean-between-faults", 300.0)],
-)
-def test_latencies_in_the_simulation_are_those_of_the_printed_algorithm(
-    claims: Claims, ident: str, kind: str, ceiling: float
-) -> None:
-    u = square(800, 2940.0, -2940.0)
-    _, alarms = Rls(kind, ceiling).run(u, 1e7 * suspension(u))
-    measured = claim(claims, ident)["measured"]
-    assert measured["latency_n"] == latencies(alarms, 800)
-    assert measured["extra_alarms"] == len(alarms) - len(CHANGES)
-
-
-def test_bias_of_plain_recursive_least_squares_is_that_of_the_printed_algorithm(claims: Claims) -> None:
-    u = square(800, 2940.0, -2940.0)
-    theta, _ = Rls().run(u, 1e7 * suspension(u))
-    rows = []
-    for end, plant in zip((199, 399, 499, 599, 799), PROFILE.values(), strict=True):
-        a1, a2, b0, b1 = theta[end]
-        stiffness = 1e7 * (1.0 + a1 + a2) / (b0 + b1)
-        rates = -np.log(np.roots([1.0, a1, a2]).astype(complex)) / PERIOD_S
-        mass = stiffness / (rates[0] * rates[1]).real
-        rows.append(np.array([mass, mass * rates.sum().real, stiffness]) / plant - 1.0)
-    ours = claim(claims, "4.5-biased")["measured"]["relative_errors_of_M_B_K_at_the_ends"]
-    assert np.allclose(ours, rows, rtol=0.02, atol=1e-4)
-
-
-def test_bandwidth_of_the_shock_absorber_is_the_closed_form(claims: Claims) -> None:
-    """Solve |K - M w^2 + j B w|^2 = 2 K^2, a quadratic in w^2."""
-    mass, damping, stiffness = 2.0, 900.0, 12250.0
-    half = (damping**2 - 2.0 * stiffness * mass) / 2.0
-    w2 = (-half + math.sqrt(half**2 + mass**2 * stiffness**2)) / mass**2
-    hertz = math.sqrt(w2) / (2.0 * math.pi)
-    assert claim(claims, "4.3-excitation")["measured"]["bandwidth_hz"] == pytest.approx(hertz, rel=1e-3)
-
-
-def test_example_of_chapter_3_converges_as_the_printed_recursion_does(claims: Claims) -> None:
-    u = square(800, 10.0, -10.0)
-    y = np.zeros(len(u))
-    for k in range(len(u)):
-        y[k] = -0.5 * y[k - 1] * (k > 0) - 0.8 * y[k - 2] * (k > 1) - 0.9 * (u[k - 1] if k else 0.0)
-    theta, p = np.zeros(3), 10.0 * np.eye(3)
-    beyond = 0
-    for k in range(2, len(u)):
-        phi = np.array([-y[k - 1], -y[k - 2], u[k - 1]])
-        gain = p @ phi / (1.0 + phi @ p @ phi)
-        theta = theta + gain * (y[k] - phi @ theta)
-        p = p - np.outer(gain, phi @ p)
-        if (np.abs(theta / [0.5, 0.8, -0.9] - 1.0) > 0.01).any():
-            beyond = k
-    assert claim(claims, "3.5-converges")["measured"]["within_1_percent_after_n"] == beyond + 2
-
-
 def test_skewed_card_gives_equ_5_4_and_the_page_marks_it_as_an_inference(claims: Claims, reproduced: Path) -> None:
     """Compute least squares with numpy over the recorded codes, in newtons and metres."""
     run = Run.load(reproduced / RECORDINGS / "fig-5.5.npz")
@@ -295,6 +241,12 @@ class Oracle:
     def converged(self, key: str) -> list[int | None]:
         return reconverged(self.simulated[key][0], CHANGES)
 
+    def finds(self, measured: Claims, key: str) -> bool:
+        """True if latencies and extra alarms are those of the printed algorithm, which misses no change."""
+        alarms = self.simulated[key][1]
+        found = {"latency_n": latencies(alarms, 800), "extra_alarms": len(alarms) - len(CHANGES)}
+        return found.items() <= measured.items()
+
     def theta_converged(self, key: str) -> list[int | None]:
         return reconverged(self.simulated[key][3], CHANGES)
 
@@ -386,19 +338,24 @@ def _bode_apart_db(estimated: list[float]) -> float:
     return float(np.abs(gains[0] - gains[1]).max())
 
 
-def _settled_in_front(y_per_m: float) -> int | None:
-    u = square(400, 2940.0, -2940.0)
-    theta = Rls().run(u, y_per_m * arx(u, discrete(115.0, 3021.0, 24500.0)))[0]
-    error = physical(theta, y_per_m) / [115.0, 3021.0, 24500.0] - 1.0
-    (found,) = reconverged(np.vstack([error[:1], error]), (0,))
-    return found
+def _settled_in_front(y_per_m: float) -> list[int | None]:
+    """Samples until M, B, K, and until a1, a2, b0, b1, stay within 5 %."""
+    u, front = square(400, 2940.0, -2940.0), (115.0, 3021.0, 24500.0)
+    theta = Rls().run(u, y_per_m * arx(u, discrete(*front)))[0]
+    errors = physical(theta, y_per_m) / front - 1.0, theta / [1.0, 1.0, y_per_m, y_per_m] / discrete(*front) - 1.0
+    return [n for error in errors for n in reconverged(np.vstack([error[:1], error]), (0,))]
 
 
-def _theta_settled_in_front(y_per_m: float) -> int | None:
-    u, plant = square(400, 2940.0, -2940.0), np.array(discrete(115.0, 3021.0, 24500.0))
-    error = Rls().run(u, y_per_m * arx(u, plant.tolist()))[0] / [1.0, 1.0, y_per_m, y_per_m] / plant - 1.0
-    (found,) = reconverged(np.vstack([error[:1], error]), (0,))
-    return found
+def _bandwidth_hz() -> float:
+    """Solve |K - M w^2 + j B w|^2 = 2 K^2, a quadratic in w^2."""
+    mass, damping, stiffness = 2.0, 900.0, 12250.0
+    half = (damping**2 - 2.0 * stiffness * mass) / 2.0
+    return math.sqrt((-half + math.sqrt(half**2 + mass**2 * stiffness**2)) / mass**2) / (2.0 * math.pi)
+
+
+def _first_within(error: Signal, within: float) -> int:
+    """Samples until all rows stay within a bound, counted from 1."""
+    return int(np.flatnonzero((np.abs(error) > within).any(axis=1))[-1]) + 2
 
 
 def _wind_up(m: Claims, o: Oracle) -> bool:
@@ -525,7 +482,10 @@ def _equ_5_4(o: Oracle) -> Signal:
 VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "3.5-converges": (
         "holds",
-        lambda m, o: m["within_1_percent_after_n"] == 5 and near(m["spread"], o.scatter(changing=False), 0.1),
+        lambda m, o: (
+            m["within_1_percent_after_n"] == _first_within(o.example(changing=False)[0], 0.01)
+            and near(m["spread"], o.scatter(changing=False), 0.1)
+        ),
     ),
     "3.5-slow": ("holds", _slow),
     "3.6-sluggish": (
@@ -555,7 +515,12 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         lambda m, o: near(m["spread_with_noise"], o.scatter(noise=0.1, random_walk=1.0)),
     ),
     "3.8-better": ("holds with a reading", _simple_detection),
-    "4.3-excitation": ("holds with a reading", lambda m, _: near(m["criterion_hz"], 0.16 * m["bandwidth_hz"], 1e-5)),
+    "4.3-excitation": (
+        "holds with a reading",
+        lambda m, _: (
+            near(m["criterion_hz"], 0.16 * m["bandwidth_hz"], 1e-5) and near(m["bandwidth_hz"], _bandwidth_hz(), 1e-3)
+        ),
+    ),
     "4.3-batch": (
         "holds with a reading",
         lambda m, _: (
@@ -565,19 +530,30 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "4.4-30-samples": (
         "holds with a reading",
         lambda m, _: (
-            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3)
-            and m["theta_within_5_percent_after_n"]["mm"] == _theta_settled_in_front(1e3)
-            and m["theta_within_5_percent_after_n"]["m × 5"] == _theta_settled_in_front(5.0)
+            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3)[0]
+            and m["theta_within_5_percent_after_n"]["mm"] == _settled_in_front(1e3)[1]
+            and m["theta_within_5_percent_after_n"]["m × 5"] == _settled_in_front(5.0)[1]
             and m["largest_error"] < 1e-4
         ),
     ),
-    "4.5-biased": ("holds", lambda m, o: m["reconverged_n"] == o.converged("rls") == [None] * 4),
+    "4.5-biased": (
+        "holds",
+        lambda m, o: (
+            m["reconverged_n"] == o.converged("rls") == [None] * 4
+            and np.allclose(
+                m["relative_errors_of_M_B_K_at_the_ends"],
+                o.simulated["rls"][0][[199, 399, 499, 599, 799]],
+                rtol=0.02,
+                atol=1e-4,
+            )
+        ),
+    ),
     "4.6-immediately": (
         "holds with a reading",
         lambda m, o: (
             m["reconverged_n"] == o.converged("prediction-error")
             and nearly(m["theta_reconverged_n"], o.theta_converged("prediction-error"))
-            and m["latency_n"] == latencies(o.simulated["prediction-error"][1], 800)
+            and o.finds(m, "prediction-error")
         ),
     ),
     "4.6-theory": ("holds with a reading", lambda m, o: m["samples_from_the_alarm"] == _from_the_alarm(o)),
@@ -603,7 +579,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     ),
     "4.9-false-alarms": (
         "holds with a reading",
-        lambda m, o: m["latency_n"] == latencies(o.simulated["mean-between-faults"][1], 800),
+        lambda m, o: o.finds(m, "mean-between-faults"),
     ),
     "4.9-ceiling": (
         "holds with a reading",

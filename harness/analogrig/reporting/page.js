@@ -99,11 +99,10 @@
   // Marks
 
   const marked = (all) => all.map((mark) => ({ ...mark, at: mark.sample }));
-  const changes = marked(run.tweaks);
   const lit = marked(run.overloads);
   const noticed = marked(run.alarms.filter((alarm) => !alarm.false));
   const wrong = marked(run.alarms.filter((alarm) => alarm.false));
-  const marks = { changes, noticed, wrong };
+  const marks = { changes: marked(run.tweaks), noticed, wrong };
 
   // Lit lamps with the names of their amplifiers, inside the plot. Those of one sample are stacked.
   function lamps(u, ink) {
@@ -140,36 +139,24 @@
   function buckets(u, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
-    const wide = run.pieces.filter(([, , size]) => size > 1 && (size * bbox.width) / (view.max - view.min) > BUCKET_PX * px);
-    const spans = wide.map(([start, end, size]) => {
+    for (const [start, end, size] of run.pieces) {
+      if (size === 1 || (size * bbox.width) / (view.max - view.min) <= BUCKET_PX * px) continue;
       const from = Math.max(bbox.left, u.valToPos(start, "x", true));
-      return { from, width: Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true)) - from, size };
-    }).filter(({ width }) => width > 0);
-    return {
-      shade() {
-        ctx.save();
-        ctx.fillStyle = ink("line");
-        ctx.globalAlpha = 0.35;
-        for (const { from, width } of spans) ctx.fillRect(from, bbox.top, width, bbox.height);
-        ctx.restore();
-      },
-      words() {
-        lettered(u, ink("muted"), "left", "bottom");
-        for (const { from, width, size } of spans) {
-          const words = `minimum and maximum of every ${size} samples`;
-          if (ctx.measureText(words).width < width) ctx.fillText(words, from, bbox.top - 2 * px);
-        }
-        ctx.restore();
-      },
-    };
+      const width = Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true)) - from;
+      if (width <= 0) continue;
+      ctx.save();
+      ctx.fillStyle = ink("line");
+      ctx.globalAlpha = 0.35;
+      ctx.fillRect(from, bbox.top, width, bbox.height);
+      ctx.restore();
+      lettered(u, ink("muted"), "left", "bottom");
+      const words = `minimum and maximum of every ${size} samples`;
+      if (ctx.measureText(words).width < width) ctx.fillText(words, from, bbox.top - 2 * px);
+      ctx.restore();
+    }
   }
 
   // Plots
-
-  function line(label, ink, colour, unit, more) {
-    const value = (u, v) => (v === null || v === undefined ? "–" : `${v.toPrecision(5)}${unit ? " " + unit : ""}`);
-    return curve(label, ink(colour), { value, ...more });
-  }
 
   // Circles around the values at which the channel's bit of `clipped` is set.
   function circled(clipped, channel, ink, colour) {
@@ -191,49 +178,45 @@
     return plotting.axis(scale, label, side, ink, { size, labelSize: 22, stroke: ink(colour), grid });
   }
 
-  function pair(signals, ink, caption, left, right) {
-    const [a, b] = [left, right].map((name) => signals[name]);
-    const words = (name) => name.replace("_", " ");
-    const points = (name, colour) => circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
+  // Plot of some curves, each with its values `of` every point.
+  function plotOf(ink, caption, curves, range, axes) {
     return {
       caption,
-      data: [a.values, b.values],
-      series: [
-        line(words(left), ink, "first", a.unit, { scale: "left", points: points(left, "first") }),
-        line(words(right), ink, "second", b.unit, { scale: "right", points: points(right, "second") }),
-      ],
-      scales: { left: { range: plainRange }, right: { range: plainRange } },
-      axes: [
-        axis("left", `${words(left)} [${a.unit}]`, 3, ink, "first"),
-        axis("right", `${words(right)} [${b.unit}]`, 1, ink, "second"),
-      ],
+      data: curves.map(({ of }) => of),
+      series: curves.map(({ label, colour, ...more }) => curve(label, ink(colour), { scale: "left", ...more })),
+      scales: { left: { range }, right: { range } },
+      axes,
     };
+  }
+
+  function pair(signals, ink, caption, left, right) {
+    const words = (name) => name.replace("_", " ");
+    const label = (name) => `${words(name)} [${signals[name].unit}]`;
+    const curveOf = (name, scale, colour) => {
+      const points = circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
+      return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points };
+    };
+    const curves = [curveOf(left, "left", "first"), curveOf(right, "right", "second")];
+    const axes = [axis("left", label(left), 3, ink, "first"), axis("right", label(right), 1, ink, "second")];
+    return plotOf(ink, caption, curves, plainRange, axes);
   }
 
   function estimate(signals, ink, name, caption, unit) {
     const known = truth(name);
-    const estimates = signals[name].values;
-    const drawn = line("estimate", ink, "first", unit, { scale: "left" });
-    const steps = uPlot.paths.stepped({ align: 1 });
-    return {
-      caption,
-      data: known ? [known, estimates] : [estimates],
-      series: known ? [line("truth", ink, "truth", unit, { scale: "left", width: 4, paths: steps }), drawn] : [drawn],
-      scales: { left: { range: estimateRange(estimates, known) } },
-      axes: [axis("left", `${name} [${unit}]`, 3, ink)],
-    };
+    const found = { of: signals[name].values, label: "estimate", colour: "first", unit };
+    const paths = uPlot.paths.stepped({ align: 1 });
+    const curves = known ? [{ of: known, label: "truth", colour: "truth", unit, width: 4, paths }, found] : [found];
+    return plotOf(ink, caption, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
   }
 
   function statistic(signals, ink) {
-    const values = signals.statistic.values;
-    const ceiling = run.ceiling === null ? [] : [line("ceiling", ink, "truth", "", { scale: "left", width: 2, dash: [10, 6] })];
-    return {
-      caption: "Trigger: its statistic, and the ceiling above which it raises an alarm",
-      data: ceiling.length ? [values, new Array(run.points).fill(run.ceiling)] : [values],
-      series: [line("statistic", ink, "first", "", { scale: "left" }), ...ceiling],
-      scales: { left: { range: statisticRange } },
-      axes: [axis("left", "statistic", 3, ink)],
-    };
+    const caption = "Trigger: its statistic, and the ceiling above which it raises an alarm";
+    const curves = [{ of: signals.statistic.values, label: "statistic", colour: "first" }];
+    if (run.ceiling !== null) {
+      const ceiling = new Array(run.points).fill(run.ceiling);
+      curves.push({ of: ceiling, label: "ceiling", colour: "truth", width: 2, dash: [10, 6] });
+    }
+    return plotOf(ink, caption, curves, statisticRange, [axis("left", "statistic", 3, ink)]);
   }
 
   const samples = {
@@ -268,10 +251,10 @@
       series: [{ label: "sample" }, ...plot.series],
       marks,
       under: [
-        (u) => buckets(u, ink).shade(),
+        (u) => buckets(u, ink),
         (u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }),
       ],
-      over: [(u) => missingBand(u, stretches, ink), (u) => lamps(u, ink), (u) => buckets(u, ink).words()],
+      over: [(u) => missingBand(u, stretches, ink), (u) => lamps(u, ink)],
     }));
   }
 

@@ -111,8 +111,8 @@ const plotting = (() => {
 
   // Curves, axes and layout
 
-  function curve(label, stroke, more) {
-    const value = (u, v) => (v === null || v === undefined ? "–" : v.toPrecision(5));
+  function curve(label, stroke, { unit, ...more }) {
+    const value = (u, v) => (v === null || v === undefined ? "–" : `${v.toPrecision(5)}${unit ? " " + unit : ""}`);
     return { label, stroke, width: 1.5, points: { show: false }, value, ...more };
   }
 

@@ -56,7 +56,7 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Scenario", f"{context.scenario['name']}{f': {description}' if description else ''}"),
         ("Rig", context.rig["name"]),
         ("Device", context.dut["name"]),
-        ("Firmware", _pairs(context.dut.get("identity", {})) or "unknown"),
+        ("Firmware", _firmware(context.dut.get("identity", {})) or "unknown"),
         ("Link", context.link),
         ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
         ("Seed", context.seed),
@@ -202,20 +202,17 @@ def _change_row(tweak: ChangeVerdict) -> str:
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
-    cells = [instant, cell(change, "text"), cell(_latency(tweak), "number"), number(tweak.bound_n)]
+    latency = "–" if tweak.latencies_n is None else latency_text(tweak).replace("-", "–")
+    cells = [instant, cell(change), cell(latency, "number"), number(tweak.bound_n)]
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
 def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
     word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
-    cells = [f'<th scope="row">{tweak.sample}</th>', cell(tweak.what, "text"), cell(diagnosis.named, "text")]
+    cells = [f'<th scope="row">{tweak.sample}</th>', cell(tweak.what), cell(diagnosis.named)]
     cells += [number(diagnosis.extent, ".3f"), number(diagnosis.extent_error, "+.1%")]
     cells += [number(diagnosis.delay_n), number(diagnosis.bound_n), number(diagnosis.onset_error_n, "+d")]
     return row([*cells, cell(word, f"text {kind}")])
-
-
-def _latency(tweak: ChangeVerdict) -> str:
-    return "–" if tweak.latencies_n is None else latency_text(tweak).replace("-", "–")
 
 
 def _result(tweak: ChangeVerdict) -> tuple[str, str]:
@@ -234,14 +231,9 @@ def _segment_row(segment: SegmentEstimate) -> str:
     cells = [_zoom(segment.start, segment.end - 1)]
     for name in PARAMETERS:
         estimate = None if segment.estimate is None else segment.estimate[name]
-        cells += [number(estimate, ".5g"), number(segment.truth[name], ".6g"), number(_error(segment, name), "+.2%")]
+        error = None if estimate is None else round(segment.error[name], 4) + 0.0  # never a negative zero
+        cells += [number(estimate, ".5g"), number(segment.truth[name], ".6g"), number(error, "+.2%")]
     return row(cells)
-
-
-def _error(segment: SegmentEstimate, name: str) -> float | None:
-    """Relative error, rounded to 0.01 %; never a negative zero."""
-    error = segment.error.get(name)
-    return None if error is None else round(error, 4) + 0.0
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -255,18 +247,15 @@ def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value
 
 
-def _pairs(table: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key.replace('_', ' ')} {_format_value(key, value)}" for key, value in table.items())
-
-
-def _format_value(key: str, value: object) -> str:
-    """Value as text; hashes and nonces in hexadecimal."""
-    return f"{value:#010x}" if isinstance(value, int) and key.endswith(("hash", "nonce")) else str(value)
+def _firmware(identity: Mapping[str, Any]) -> str:
+    """Identity of the firmware in words; hashes and nonces in hexadecimal."""
+    hexadecimal = {key for key, value in identity.items() if isinstance(value, int) and key.endswith(("hash", "nonce"))}
+    values = {key: f"{value:#010x}" if key in hexadecimal else value for key, value in identity.items()}
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in values.items())
 
 
 def _zoom(first: int, last: int | None = None) -> str:
     """Row heading that zooms the plots to these samples."""
-    shown = str(first) if last is None else f"{first}–{last}"
-    until = "" if last is None else f' data-last="{last}"'
-    goal = f'data-first="{first}"{until}'
-    return f'<th scope="row"><button type="button" {goal} title="Show in the plots">{shown}</button></th>'
+    shown, until = (str(first), "") if last is None else (f"{first}–{last}", f' data-last="{last}"')
+    goal = f'data-first="{first}"{until} title="Show in the plots"'
+    return f'<th scope="row"><button type="button" {goal}>{shown}</button></th>'
