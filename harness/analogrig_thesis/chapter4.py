@@ -272,7 +272,7 @@ def _measure_error(simulation: Simulation) -> dict[str, Facts]:
             "theta_reconverged_n": _theta_reconverged(simulation, ERROR),
             "alarms_without_hold_off": len(simulation.track(_scheme(ERROR, ERROR_CEILING, hold_off_n=0)).alarms),
             "by_unit_of_y": {
-                name: _detection(simulation.track(SCHEMES[ERROR], SCALES[name])) for name in SCALES_OF_CEILING
+                name: _detection(simulation, ERROR, ERROR_CEILING, SCALES[name]) for name in SCALES_OF_CEILING
             },
             "ceilings_without_a_miss": _suitable_ceilings(simulation, ERROR, 8),
             "alarms_if_the_coefficients_jump": _alarms_if_the_coefficients_jump(simulation, ERROR),
@@ -304,8 +304,8 @@ def _measure_mean(simulation: Simulation) -> dict[str, Facts]:
         "4.9-false-alarms": {
             "latency_n": quality[MEAN].latency_n,
             "extra_alarms": quality[MEAN].extra_alarms,
-            "hold_off_from_the_alarm": _detection(simulation.track(_scheme(MEAN, MEAN_CEILING, hold_off_n=HOLD_N - 2))),
-            "with_magnitudes": _detection(simulation.track(_scheme(MEAN, MEAN_CEILING, absolute=True))),
+            "hold_off_from_the_alarm": _detection(simulation, MEAN, MEAN_CEILING, hold_off_n=HOLD_N - 2),
+            "with_magnitudes": _detection(simulation, MEAN, MEAN_CEILING, absolute=True),
             "alarms_if_the_coefficients_jump": _alarms_if_the_coefficients_jump(simulation, MEAN),
         },
         "4.10-spikes": {"spikes": {each: quality[each].spikes for each in (MEAN, ERROR)}},
@@ -329,9 +329,11 @@ def _theta_reconverged(simulation: Simulation, key: str) -> list[int | None]:
     return reconverged(_errors_of_theta(simulation.tracks[key], UNITS_PER_M, PROFILE), PROFILE)
 
 
-def _detection(each: Track) -> dict[str, Any]:
-    """Latencies, missed changes and extra alarms of a track over the profile."""
-    quality = assess(each, PROFILE)
+def _detection(
+    simulation: Simulation, key: str, ceiling: float, scale: float = UNITS_PER_M, **changes: Any
+) -> dict[str, Any]:
+    """Latencies, missed changes and extra alarms of a scheme with another ceiling, unit of y or setting."""
+    quality = assess(simulation.track(_scheme(key, ceiling, **changes), scale), PROFILE)
     return {"latency_n": quality.latency_n, "missed": quality.missed, "extra_alarms": quality.extra_alarms}
 
 
@@ -360,19 +362,18 @@ def _least_outlier(simulation: Simulation, key: str, at: int) -> float:
 
 def _extra_alarms_by_noise(simulation: Simulation, key: str) -> dict[str, dict[str, float]]:
     """Mean extra alarms of NOISE_SEEDS in single and in double precision, by the rms noise of y [0.1 um]."""
-    config, u = SCHEMES[key], simulation.u
-    out: dict[str, dict[str, float]] = {"single precision": {}, "double precision": {}}
+    config, u, extra = SCHEMES[key], simulation.u, {}
     for rms in NOISE_UNITS:
-        extra = []
+        found = []
         for seed in NOISE_SEEDS if rms else (0,):
             y = simulation.y * UNITS_PER_M + np.random.default_rng(seed).normal(0.0, rms, PROFILE_N)
             single = Samples(u, y, 1.0 / UNITS_PER_M).track(config)
             steps = ReferenceEstimator(config).run(u.tolist(), y.tolist())
             double = dataclasses.replace(single, alarms=np.flatnonzero([step.alarm for step in steps]))
-            extra.append([assess(each, PROFILE).extra_alarms for each in (single, double)])
-        for row, mean in zip(out.values(), np.mean(extra, axis=0).tolist(), strict=True):
-            row[f"{rms:g}"] = mean
-    return out
+            found.append([assess(each, PROFILE).extra_alarms for each in (single, double)])
+        extra[f"{rms:g}"] = np.mean(found, axis=0).tolist()
+    names = ("single precision", "double precision")
+    return {name: {rms: means[i] for rms, means in extra.items()} for i, name in enumerate(names)}
 
 
 def _second_alarms(rate: int, ceiling: float) -> dict[str, int | None]:
@@ -400,11 +401,9 @@ def _measure_ceilings(simulation: Simulation) -> dict[str, Facts]:
     return {
         "4.9-ceiling": {
             "largest_innovation": innovation,
-            "with_that_ceiling": _detection(simulation.track(_scheme(MEAN, innovation))),
+            "with_that_ceiling": _detection(simulation, MEAN, innovation),
             "largest_innovation_stationary": calm,
-            "with_that_of_the_stationary": {
-                each: _detection(simulation.track(_scheme(each, calm))) for each in (MEAN, ERROR)
-            },
+            "with_that_of_the_stationary": {each: _detection(simulation, each, calm) for each in (MEAN, ERROR)},
             "serving_ceilings_signed": _suitable_ceilings(simulation, MEAN, 1, absolute=False),
             "serving_ceilings_of_magnitudes": _suitable_ceilings(simulation, MEAN, 1, absolute=True),
         }
@@ -416,9 +415,7 @@ def _suitable_ceilings(simulation: Simulation, key: str, most_extra: int, **chan
 
     41 ceilings from 1 % to 100 times the printed one are tried.
     """
-    found = []
-    for ceiling in (CEILINGS[key] * np.geomspace(0.01, 100.0, 41)).tolist():
-        quality = assess(simulation.track(_scheme(key, ceiling, **changes)), PROFILE)
-        if not quality.missed and quality.extra_alarms <= most_extra:
-            found.append(float(ceiling))
+    ceilings = (CEILINGS[key] * np.geomspace(0.01, 100.0, 41)).tolist()
+    seen = {ceiling: _detection(simulation, key, ceiling, **changes) for ceiling in ceilings}
+    found = [at for at, each in seen.items() if not each["missed"] and each["extra_alarms"] <= most_extra]
     return [min(found), max(found)] if found else []

@@ -46,17 +46,6 @@
     return values;
   }
 
-  function missingStretches(missing) {
-    const stretches = [];
-    for (let k = 0; k < missing.length; k++) {
-      if (!missing[k]) continue;
-      const first = k;
-      while (k + 1 < missing.length && missing[k + 1]) k++;
-      stretches.push([places[first], places[k]]);
-    }
-    return stretches;
-  }
-
   // Ranges of the vertical scales
 
   function inView(values) {
@@ -121,15 +110,15 @@
     ctx.restore();
   }
 
-  function missingBand(u, stretches, ink) {
+  function missingBand(u, missing, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
     ctx.save();
     ctx.fillStyle = ink("missing");
-    for (const [first, final] of stretches) {
-      if (final < view.min || first > view.max) continue;
-      const from = Math.max(bbox.left, u.valToPos(first - 0.5, "x", true));
-      const to = Math.min(bbox.left + bbox.width, u.valToPos(final + 0.5, "x", true));
+    for (let k = pointAt(view.min); k < places.length && places[k] <= view.max; k++) {
+      if (!missing[k]) continue;
+      const from = Math.max(bbox.left, u.valToPos(places[k] - 0.5, "x", true));
+      const to = Math.min(bbox.left + bbox.width, u.valToPos((places[k + 1] ?? last + 1) - 0.5, "x", true));
       ctx.fillRect(from, bbox.top + bbox.height - 6 * px, Math.max(to - from, px), 6 * px);
     }
     ctx.restore();
@@ -229,7 +218,6 @@
   };
 
   function described(signals, ink) {
-    const stretches = missingStretches(signals.missing.raw);
     return [
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
       ...(signals.velocity && signals.net_force
@@ -254,7 +242,7 @@
         (u) => buckets(u, ink),
         (u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }),
       ],
-      over: [(u) => missingBand(u, stretches, ink), (u) => lamps(u, ink)],
+      over: [(u) => missingBand(u, signals.missing.raw, ink), (u) => lamps(u, ink)],
     }));
   }
 
