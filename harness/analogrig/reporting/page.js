@@ -117,8 +117,8 @@
     ctx.fillStyle = ink("missing");
     for (let k = pointAt(view.min); k < places.length && places[k] <= view.max; k++) {
       if (!missing[k]) continue;
-      const from = Math.max(bbox.left, u.valToPos(places[k] - 0.5, "x", true));
-      const to = Math.min(bbox.left + bbox.width, u.valToPos((places[k + 1] ?? last + 1) - 0.5, "x", true));
+      const from = Math.max(bbox.left, Math.floor(u.valToPos(places[k] - 0.5, "x", true))); // whole pixels leave no seams
+      const to = Math.min(bbox.left + bbox.width, Math.ceil(u.valToPos((places[k + 1] ?? last + 1) - 0.5, "x", true)));
       ctx.fillRect(from, bbox.top + bbox.height - 6 * px, Math.max(to - from, px), 6 * px);
     }
     ctx.restore();
