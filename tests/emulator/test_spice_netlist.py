@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.cli import main
-from analogrig.reporting.netlist import netlist
+from analogrig.reporting.export import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 

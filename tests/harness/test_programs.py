@@ -18,7 +18,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.judging import information
 from analogrig.judging.verdict import as_json, judge
 from analogrig.plant import Plant, SampledPlant
-from analogrig.reporting.netlist import netlist
+from analogrig.reporting.export import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig

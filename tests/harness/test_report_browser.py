@@ -20,6 +20,9 @@ from tests.harness.runs import with_fault
 PLOTS = 6
 FORCE, MASS, STIFFNESS, STATISTIC = 0, 2, 4, 5
 
+LONG = 600_000
+"""Samples of a run whose plots show minima and maxima of 24 samples."""
+
 ALARM, FALSE_ALARM, MISSING = (0, 158, 115), (213, 94, 0), (86, 180, 233)
 """Bluish green, vermilion and sky blue of Okabe and Ito."""
 
@@ -29,11 +32,18 @@ def run() -> Run:
     return reported_run()
 
 
+@pytest.fixture(scope="module")
+def report(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(run, reported_verdict(run), path)
+    return path
+
+
 @pytest.fixture
-def opened(browser: Browser, run: Run, tmp_path: Path) -> Iterator[Watched]:
-    with_page = _open(browser, run, reported_verdict(run), tmp_path)
-    yield with_page
-    with_page.page.close()
+def opened(browser: Browser, report: Path) -> Iterator[Watched]:
+    watched = Watched(browser, report)
+    yield watched
+    watched.page.close()
 
 
 def test_every_plot_is_drawn_without_a_complaint_or_a_request(opened: Watched) -> None:
@@ -145,10 +155,9 @@ def test_run_without_a_sample_says_so_where_the_plots_would_be(browser: Browser,
 
 @pytest.mark.parametrize("samples", [1, 2, NOTICED])
 def test_run_that_broke_off_is_drawn(browser: Browser, run: Run, tmp_path: Path, samples: int) -> None:
-    arrays = {
-        name: getattr(run, name)[:samples] for name in ("codes", "clipped", "theta", "innovation", "statistic", "flags")
-    }
-    watched = _open(browser, short := with_fault(replace(run, **arrays), "cut"), judge(short), tmp_path)
+    arrays = ("codes", "clipped", "theta", "innovation", "statistic", "flags")
+    short = with_fault(replace(run, **{name: getattr(run, name)[:samples] for name in arrays}), "cut")
+    watched = _open(browser, short, judge(short), tmp_path)
     assert len(watched.plots()) == PLOTS
     assert watched.complaints == []
 
@@ -161,32 +170,32 @@ def test_run_without_truth_and_trigger_is_drawn(browser: Browser, run: Run, tmp_
     assert watched.complaints == []
 
 
-def test_page_of_two_million_samples_is_drawn_with_its_alarms_and_zooms(browser: Browser, tmp_path: Path) -> None:
-    long = long_run(2_000_000, false_alarms=5, changes=2)
+def test_page_of_a_long_run_is_drawn_with_its_alarms_and_zooms(browser: Browser, tmp_path: Path) -> None:
+    long = long_run(LONG, false_alarms=5, changes=2)
     watched = _open(browser, long, judge(long), tmp_path)
     assert len(watched.plots()) == PLOTS
     assert watched.complaints == []
     whole = watched.images()
     assert min(watched.pixels(ALARM)) > 20
     assert min(watched.pixels(FALSE_ALARM)) > 20
-    watched.page.get_by_role("button", name="666666", exact=True).click()
+    watched.page.get_by_role("button", name="200000", exact=True).click()
     near = watched.images()
     assert all(before != after for before, after in zip(whole, near, strict=True))
     watched.point_at(FORCE, 40 / 120)
-    assert watched.values(FORCE)[0] == "666,666"  # full resolution: a point for every sample
+    assert watched.values(FORCE)[0] == "200,000"  # full resolution: a point for every sample
     force, displacement = watched.values(FORCE)[1:]
-    assert _number(force, "N") == pytest.approx(long.codes[666_666, 0] * 2940.0 / 4096, rel=1e-4)
-    assert _number(displacement, "mm") == pytest.approx(long.codes[666_666, 1] * 199.6 / 4096, rel=1e-4)
+    assert _number(force, "N") == pytest.approx(long.codes[200_000, 0] * 2940.0 / 4096, rel=1e-4)
+    assert _number(displacement, "mm") == pytest.approx(long.codes[200_000, 1] * 199.6 / 4096, rel=1e-4)
     watched.page.get_by_role("button", name="Whole run").click()
     watched.page.mouse.move(0, 0)
     assert watched.images() == whole
 
 
-def test_spike_of_one_sample_among_two_million_is_drawn(browser: Browser, tmp_path: Path) -> None:
-    flat = long_run(2_000_000, false_alarms=0, changes=0)
+def test_spike_of_one_sample_in_a_long_run_is_drawn(browser: Browser, tmp_path: Path) -> None:
+    flat = long_run(LONG, false_alarms=0, changes=0)
     flat.statistic[:] = 0.0
     spiked = replace(flat, statistic=flat.statistic.copy())
-    spiked.statistic[1_234_567] = 11.0  # below the ceiling, which makes the scale
+    spiked.statistic[345_678] = 11.0  # below the ceiling, which makes the scale
     (tmp_path / "spiked").mkdir()
     without, with_it = (
         _open(browser, run, judge(run), folder).images()[STATISTIC]

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from analogrig.devices.estimator import Estimator
-from analogrig_thesis.circuit_runs import NOISY, SEED, TRACKING, ScaledSamples, circuit_schemes
+from analogrig_thesis.chapter5 import NOISY, SEED, TRACKING, circuit_schemes, play_alone
 
 RESULT = Path("harness/analogrig_thesis/cost.json")
 REPEATS = 100
@@ -41,7 +41,7 @@ def executed(key: str, repeats: int) -> int:
 
 def run(key: str, repeats: int) -> None:
     """Run one scheme over the repeated samples of Fig. 5.7: the counted process."""
-    samples = ScaledSamples.play(NOISY, TRACKING, SEED)
+    samples = play_alone(NOISY, TRACKING, SEED)
     config = circuit_schemes(samples.m_per_unit)[key]
     Estimator(config).run(np.tile(samples.u, repeats), np.tile(samples.y, repeats))
 

@@ -193,12 +193,18 @@ def late_scatter(values: NDArray[np.floating], starts: Sequence[int]) -> Signal:
     return np.asarray(np.sqrt(np.mean([values[(a + b) // 2 : b].var(axis=0) for a, b in stretches], axis=0)))
 
 
-def latencies(alarms: Sequence[int], n: int) -> list[int | None]:
+def latencies(alarms: Sequence[int], n: int, starts: Sequence[int] = CHANGES) -> list[int | None]:
     """Samples from each change to the first alarm before the next."""
-    ends = [*CHANGES[1:], n]
+    ends = [*starts[1:], n]
     return [
-        next((k - start for k in alarms if start < k <= end), None) for start, end in zip(CHANGES, ends, strict=True)
+        next((k - start for k in alarms if start < k <= end), None) for start, end in zip(starts, ends, strict=True)
     ]
+
+
+def missed_and_extra(alarms: Sequence[int], n: int, starts: Sequence[int] = CHANGES) -> tuple[int, int]:
+    """Changes without an alarm before the next, and alarms that are not the first after a change."""
+    missed = latencies(alarms, n, starts).count(None)
+    return missed, len(alarms) - len(starts) + missed
 
 
 def damping_ratio(mass_kg: float, damping_n_s_per_m: float, stiffness_n_per_m: float) -> float:

@@ -37,6 +37,7 @@ from tests.thesis.oracle import (
     latencies,
     least_squares,
     lighter_for_a_while,
+    missed_and_extra,
     physical,
     reconverged,
     square,
@@ -53,6 +54,8 @@ FIGURES = (
 )
 
 RECORDED = ("fig-5.4", "fig-5.5", "fig-5.7", "fig-5.7-quantised")
+
+ERROR, MEAN = "prediction-error", "mean-between-faults"
 
 
 def numbers(claims: Claims, where: str) -> list[float]:
@@ -119,60 +122,6 @@ def test_damping_ratios_are_the_closed_form(claims: Claims) -> None:
     assert ours == pytest.approx([damping_ratio(*plant) for plant in PROFILE.values()], rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("ident", "kind", "ceiling"),
-    [("4.6-immediately", "prediction-error", 1500.0), ("4.9-false-alarms", "mean-between-faults", 300.0)],
-)
-def test_latencies_in_the_simulation_are_those_of_the_printed_algorithm(
-    claims: Claims, ident: str, kind: str, ceiling: float
-) -> None:
-    u = square(800, 2940.0, -2940.0)
-    _, alarms = Rls(kind, ceiling).run(u, 1e7 * suspension(u))
-    measured = claim(claims, ident)["measured"]
-    assert measured["latency_n"] == latencies(alarms, 800)
-    assert measured["extra_alarms"] == len(alarms) - len(CHANGES)
-
-
-def test_bias_of_plain_recursive_least_squares_is_that_of_the_printed_algorithm(claims: Claims) -> None:
-    u = square(800, 2940.0, -2940.0)
-    theta, _ = Rls().run(u, 1e7 * suspension(u))
-    rows = []
-    for end, plant in zip((199, 399, 499, 599, 799), PROFILE.values(), strict=True):
-        a1, a2, b0, b1 = theta[end]
-        stiffness = 1e7 * (1.0 + a1 + a2) / (b0 + b1)
-        rates = -np.log(np.roots([1.0, a1, a2]).astype(complex)) / PERIOD_S
-        mass = stiffness / (rates[0] * rates[1]).real
-        rows.append(np.array([mass, mass * rates.sum().real, stiffness]) / plant - 1.0)
-    ours = claim(claims, "4.5-biased")["measured"]["relative_errors_of_M_B_K_at_the_ends"]
-    assert np.allclose(ours, rows, rtol=0.02, atol=1e-4)
-
-
-def test_bandwidth_of_the_shock_absorber_is_the_closed_form(claims: Claims) -> None:
-    """Solve |K - M w^2 + j B w|^2 = 2 K^2, a quadratic in w^2."""
-    mass, damping, stiffness = 2.0, 900.0, 12250.0
-    half = (damping**2 - 2.0 * stiffness * mass) / 2.0
-    w2 = (-half + math.sqrt(half**2 + mass**2 * stiffness**2)) / mass**2
-    hertz = math.sqrt(w2) / (2.0 * math.pi)
-    assert claim(claims, "4.3-excitation")["measured"]["bandwidth_hz"] == pytest.approx(hertz, rel=1e-3)
-
-
-def test_example_of_chapter_3_converges_as_the_printed_recursion_does(claims: Claims) -> None:
-    u = square(800, 10.0, -10.0)
-    y = np.zeros(len(u))
-    for k in range(len(u)):
-        y[k] = -0.5 * y[k - 1] * (k > 0) - 0.8 * y[k - 2] * (k > 1) - 0.9 * (u[k - 1] if k else 0.0)
-    theta, p = np.zeros(3), 10.0 * np.eye(3)
-    beyond = 0
-    for k in range(2, len(u)):
-        phi = np.array([-y[k - 1], -y[k - 2], u[k - 1]])
-        gain = p @ phi / (1.0 + phi @ p @ phi)
-        theta = theta + gain * (y[k] - phi @ theta)
-        p = p - np.outer(gain, phi @ p)
-        if (np.abs(theta / [0.5, 0.8, -0.9] - 1.0) > 0.01).any():
-            beyond = k
-    assert claim(claims, "3.5-converges")["measured"]["within_1_percent_after_n"] == beyond + 2
-
-
 def test_skewed_card_gives_equ_5_4_and_the_page_marks_it_as_an_inference(claims: Claims, reproduced: Path) -> None:
     """Compute least squares with numpy over the recorded codes, in newtons and metres."""
     run = Run.load(reproduced / RECORDINGS / "fig-5.5.npz")
@@ -185,58 +134,6 @@ def test_skewed_card_gives_equ_5_4_and_the_page_marks_it_as_an_inference(claims:
     assert "This is an inference" in (reproduced / PAGE).read_text(encoding="utf-8")
 
 
-def test_simulation_over_the_second_thousand_samples_is_as_near_as_claimed(claims: Claims, reproduced: Path) -> None:
-    run = Run.load(reproduced / RECORDINGS / "fig-5.5.npz")
-    u, y = run.channel("force"), run.channel("displacement")
-    a1, a2, b0, b1, d = least_squares(u[:1000], y[:1000])
-    out = [*y[998:1000]]
-    for k in range(1000, 2000):
-        out.append(-a1 * out[-1] - a2 * out[-2] + b0 * u[k - 1] + b1 * u[k - 2] + d)
-    rms_mm = 1e3 * math.sqrt(float(np.mean((y[1000:] - out[2:]) ** 2)))
-    assert claim(claims, "5.6-agreement")["measured"]["rms_mm"] == pytest.approx(rms_mm, rel=0.01)
-
-
-def test_analogue_and_scipy_differ_by_noise_and_offsets_alone(claims: Claims, reproduced: Path) -> None:
-    run = Run.load(reproduced / RECORDINGS / "fig-5.4.npz")
-    x = arx(square(400, 1470.0, 0.0), discrete(2.0, 900.0, 12250.0))
-    rms_mm = 1e3 * math.sqrt(float(np.mean((run.channel("displacement") - x) ** 2)))
-    assert claim(claims, "5.3-parity")["measured"]["difference_rms_mm"] == pytest.approx(rms_mm, rel=1e-3)
-    assert rms_mm < 2.0 * run.conditions.channels["displacement"].lsb * 1e3
-
-
-def test_tracking_claim_counts_what_the_recording_holds(claims: Claims, reproduced: Path) -> None:
-    run = Run.load(reproduced / RECORDINGS / "fig-5.7.npz")
-    alarms = run.alarm_index.tolist()
-    starts, ends = (200, 400, 600, 800), (400, 600, 800, 1000)
-    first = [next((k for k in alarms if a < k <= b), None) for a, b in zip(starts, ends, strict=True)]
-    measured = claim(claims, "5.5-tracking")["measured"]["mean_between_faults"]
-    assert measured["missed"] == first.count(None)
-    assert measured["extra_alarms"] == len(alarms) - 4 + first.count(None)
-    assert [segment.start for segment in run.conditions.segments] == [0, *starts]
-
-
-def test_filtered_data_raise_the_alarms_of_the_printed_algorithm(claims: Claims, reproduced: Path) -> None:
-    """Filter, detrend and scale with scipy (section 4.3), then run the recursion in double precision."""
-    run = Run.load(reproduced / RECORDINGS / "fig-5.7.npz")
-    filtered = [
-        lfilter(*butter(2, 5.0 / 50.0), each - each.mean())
-        for each in (run.channel("force"), 1e7 * run.channel("displacement"))
-    ]
-    _, alarms = Rls("mean-between-faults", 500.0).run(*filtered)
-    first = [next((k - a for k in alarms if a < k <= a + 200), None) for a in (200, 400, 600, 800)]
-    measured = claim(claims, "5.5-tracking")["measured"]
-    rows = measured["filtered_and_detrended_off_line"]["5 Hz"]
-    assert rows["mean-between-faults"]["latency_n"] == first
-    assert rows["mean-between-faults"]["extra_alarms"] == len(alarms) - 4 + first.count(None)
-    best = measured["best_ceilings"]["conditioned prediction-error e"]
-    _, alarms = Rls("prediction-error", best["ceiling_lsb"] * 1e7 * run.conditions.channels["displacement"].lsb).run(
-        *filtered
-    )
-    found = [any(a < k <= a + 200 for k in alarms) for a in (200, 400, 600, 800)]
-    assert best["missed"] == found.count(False) == 0
-    assert abs(best["extra_alarms"] - (len(alarms) - found.count(True))) <= 1
-
-
 class Oracle:
     """Independent values for the claims: the recursion as printed, on data of scipy or the recorded codes."""
 
@@ -247,7 +144,7 @@ class Oracle:
     def __init__(self, folder: Path) -> None:
         self.runs = {
             name: Run.load(folder / RECORDINGS / f"{file}.npz")
-            for name, file in (("noisy", "fig-5.7"), ("quantised", "fig-5.7-quantised"), ("skewed", "fig-5.5"))
+            for name, file in zip(("parity", "skewed", "noisy", "quantised"), RECORDED, strict=True)
         }
 
     def example(self, *, noise: float = 0.0, changing: bool = True, **variant: Any) -> tuple[Signal, Signal]:
@@ -284,8 +181,8 @@ class Oracle:
         for key, rls in {
             "rls": Rls(),
             "forgetting": Rls(forgetting=0.97),
-            "prediction-error": Rls("prediction-error", 1500.0),
-            "mean-between-faults": Rls("mean-between-faults", 300.0),
+            ERROR: Rls(ERROR, 1500.0),
+            MEAN: Rls(MEAN, 300.0),
         }.items():
             theta, alarms = rls.run(u, y)
             of_theta = theta / [1.0, 1.0, 1e7, 1e7] / theta_truth - 1.0
@@ -295,12 +192,18 @@ class Oracle:
     def converged(self, key: str) -> list[int | None]:
         return reconverged(self.simulated[key][0], CHANGES)
 
+    def finds(self, measured: Claims, key: str) -> bool:
+        """True if latencies and extra alarms are those of the printed algorithm, which misses no change."""
+        alarms = self.simulated[key][1]
+        found = {"latency_n": latencies(alarms, 800), "extra_alarms": missed_and_extra(alarms, 800)[1]}
+        return found.items() <= measured.items()
+
     def theta_converged(self, key: str) -> list[int | None]:
         return reconverged(self.simulated[key][3], CHANGES)
 
     def disturbed(self, kind: str, disturbance: Signal) -> list[int]:
         """Alarms of chapter 4 with a disturbance of y [0.1 um]."""
-        u, ceiling = square(800, 2940.0, -2940.0), {"prediction-error": 1500.0, "mean-between-faults": 300.0}[kind]
+        u, ceiling = square(800, 2940.0, -2940.0), {ERROR: 1500.0, MEAN: 300.0}[kind]
         n = len(disturbance)
         return Rls(kind, ceiling).run(u[:n], 1e7 * suspension(u[:n]) + disturbance)[1]
 
@@ -367,7 +270,7 @@ def near(ours: Any, expected: Any, rel: float = 0.02) -> bool:
     return bool(ours == pytest.approx(expected, rel=rel))
 
 
-_ROUNDED = {"mean-between-faults": 1, "forgetting": 0, "prediction-error": 0}
+_ROUNDED = {MEAN: 1, "forgetting": 0, ERROR: 0}
 """Number of first changes, by scheme, after which rounding decides the convergence of M, B and K."""
 
 
@@ -386,19 +289,24 @@ def _bode_apart_db(estimated: list[float]) -> float:
     return float(np.abs(gains[0] - gains[1]).max())
 
 
-def _settled_in_front(y_per_m: float) -> int | None:
-    u = square(400, 2940.0, -2940.0)
-    theta = Rls().run(u, y_per_m * arx(u, discrete(115.0, 3021.0, 24500.0)))[0]
-    error = physical(theta, y_per_m) / [115.0, 3021.0, 24500.0] - 1.0
-    (found,) = reconverged(np.vstack([error[:1], error]), (0,))
-    return found
+def _settled_in_front(y_per_m: float) -> list[int | None]:
+    """Samples until M, B, K, and until a1, a2, b0, b1, stay within 5 %."""
+    u, front = square(400, 2940.0, -2940.0), (115.0, 3021.0, 24500.0)
+    theta = Rls().run(u, y_per_m * arx(u, discrete(*front)))[0]
+    errors = physical(theta, y_per_m) / front - 1.0, theta / [1.0, 1.0, y_per_m, y_per_m] / discrete(*front) - 1.0
+    return [n for error in errors for n in reconverged(np.vstack([error[:1], error]), (0,))]
 
 
-def _theta_settled_in_front(y_per_m: float) -> int | None:
-    u, plant = square(400, 2940.0, -2940.0), np.array(discrete(115.0, 3021.0, 24500.0))
-    error = Rls().run(u, y_per_m * arx(u, plant.tolist()))[0] / [1.0, 1.0, y_per_m, y_per_m] / plant - 1.0
-    (found,) = reconverged(np.vstack([error[:1], error]), (0,))
-    return found
+def _bandwidth_hz() -> float:
+    """Solve |K - M w^2 + j B w|^2 = 2 K^2, a quadratic in w^2."""
+    mass, damping, stiffness = 2.0, 900.0, 12250.0
+    half = (damping**2 - 2.0 * stiffness * mass) / 2.0
+    return math.sqrt((-half + math.sqrt(half**2 + mass**2 * stiffness**2)) / mass**2) / (2.0 * math.pi)
+
+
+def _first_within(error: Signal, within: float) -> int:
+    """Samples until all rows stay within a bound, counted from 1."""
+    return int(np.flatnonzero((np.abs(error) > within).any(axis=1))[-1]) + 2
 
 
 def _wind_up(m: Claims, o: Oracle) -> bool:
@@ -439,7 +347,7 @@ def _noise_alarms(m: Claims, o: Oracle, kind: str) -> bool:
     extra = []
     for seed in range(5):
         alarms = o.disturbed(kind, np.random.default_rng(seed).normal(0.0, 100.0, 800))
-        extra.append(len(alarms) - 4 + latencies(alarms, 800).count(None))
+        extra.append(missed_and_extra(alarms, 800)[1])
     single, double = m["extra_alarms_by_noise"].values()
     assert single["0"] == double["0"] and all(single[rms] >= double[rms] for rms in single)
     return bool(abs(double["100"] - float(np.mean(extra))) <= 0.5)
@@ -452,7 +360,7 @@ def _second_alarms(rate: int, ceiling: float) -> list[int | None]:
     out: list[int | None] = []
     for apart in range(1, 13):
         y = 1e7 * lighter_for_a_while(u, at, apart, PERIOD_S / rate)
-        _, alarms = Rls("mean-between-faults", ceiling, warm_up_n=50 * rate).run(u, y)
+        _, alarms = Rls(MEAN, ceiling, warm_up_n=50 * rate).run(u, y)
         found = [k for k in alarms if at < k < at + 50 * rate]
         out.append(found[1] - found[0] if len(found) > 1 else None)
     return out
@@ -463,6 +371,44 @@ def _sample_rate(m: Claims, _: Oracle) -> bool:
         nearly(list(m["second_alarm_after_n"].values()), _second_alarms(1, 300.0))
         and list(m["at_200_hz"].values()) == _second_alarms(2, 300.0) == [None] * 12
         and nearly(list(m["at_200_hz_with_a_quarter_of_the_ceiling"].values()), _second_alarms(2, 75.0))
+    )
+
+
+def _parity(m: Claims, o: Oracle) -> bool:
+    """Check the difference from scipy, of noise and offsets alone."""
+    x = arx(square(400, 1470.0, 0.0), discrete(2.0, 900.0, 12250.0))
+    rms_mm = 1e3 * _rms(o.runs["parity"].channel("displacement") - x)
+    return near(m["difference_rms_mm"], rms_mm, 1e-3) and m["difference_rms_lsb"] < 2.0
+
+
+def _second_half(m: Claims, o: Oracle) -> bool:
+    u, y = (o.runs["skewed"].channel(name) for name in ("force", "displacement"))
+    a1, a2, b0, b1, d = least_squares(u[:1000], y[:1000])
+    out = [*y[998:1000]]
+    for k in range(1000, 2000):
+        out.append(-a1 * out[-1] - a2 * out[-2] + b0 * u[k - 1] + b1 * u[k - 2] + d)
+    same = near(m["rms_mm"], 1e3 * _rms(y[1000:] - out[2:]), 0.01)
+    return same and m["of_span"] < 0.001 and m["as_printed_1_m_after_n"] < 15
+
+
+def _tracking(m: Claims, o: Oracle) -> bool:
+    """Count the recorded alarms, and those of the printed algorithm on data that scipy filters (section 4.3)."""
+    run, n, starts = o.runs["noisy"], 1000, o.CIRCUIT
+    assert [segment.start for segment in run.conditions.segments] == [0, *starts]
+    recorded = m["mean_between_faults"]
+    assert (recorded["missed"], recorded["extra_alarms"]) == missed_and_extra(run.alarm_index.tolist(), n, starts)
+    channels = (run.channel("force"), 1e7 * run.channel("displacement"))
+    filtered = [lfilter(*butter(2, 5.0 / 50.0), each - each.mean()) for each in channels]
+    _, alarms = Rls(MEAN, 500.0).run(*filtered)
+    row, best = m["filtered_and_detrended_off_line"]["5 Hz"][MEAN], m["best_ceilings"]["conditioned prediction-error e"]
+    assert row["latency_n"] == latencies(alarms, n, starts)
+    assert row["extra_alarms"] == missed_and_extra(alarms, n, starts)[1]
+    _, alarms = Rls(ERROR, best["ceiling_lsb"] * 1e7 * run.conditions.channels["displacement"].lsb).run(*filtered)
+    missed, extra = missed_and_extra(alarms, n, starts)
+    assert best["missed"] == missed == 0
+    assert abs(best["extra_alarms"] - extra) <= 1
+    return bool(m["forgetting"]["reconverged_n"] == o.circuit_converged("forgetting")) and nearly(
+        m["theta_reconverged_n"]["forgetting"], o.circuit_theta_converged("forgetting")
     )
 
 
@@ -481,14 +427,14 @@ def _slow(m: Claims, o: Oracle) -> bool:
 
 
 def _simple_detection(m: Claims, o: Oracle) -> bool:
-    error, _ = o.example(kind="prediction-error", ceiling=3.0, warm_up_n=10)
+    error, _ = o.example(kind=ERROR, ceiling=3.0, warm_up_n=10)
     same: bool = m["reconverged_n"] == reconverged(error, o.EXAMPLE)
     return same and m["alarms"] == len(o.alarms)
 
 
 def _from_the_alarm(o: Oracle) -> list[int | None]:
-    late = latencies(o.simulated["prediction-error"][1], 800)
-    pairs = zip(o.converged("prediction-error"), late, strict=True)
+    late = latencies(o.simulated[ERROR][1], 800)
+    pairs = zip(o.converged(ERROR), late, strict=True)
     return [None if n is None or late is None else n - late for n, late in pairs]
 
 
@@ -525,7 +471,10 @@ def _equ_5_4(o: Oracle) -> Signal:
 VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "3.5-converges": (
         "holds",
-        lambda m, o: m["within_1_percent_after_n"] == 5 and near(m["spread"], o.scatter(changing=False), 0.1),
+        lambda m, o: (
+            m["within_1_percent_after_n"] == _first_within(o.example(changing=False)[0], 0.01)
+            and near(m["spread"], o.scatter(changing=False), 0.1)
+        ),
     ),
     "3.5-slow": ("holds", _slow),
     "3.6-sluggish": (
@@ -555,7 +504,12 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
         lambda m, o: near(m["spread_with_noise"], o.scatter(noise=0.1, random_walk=1.0)),
     ),
     "3.8-better": ("holds with a reading", _simple_detection),
-    "4.3-excitation": ("holds with a reading", lambda m, _: near(m["criterion_hz"], 0.16 * m["bandwidth_hz"], 1e-5)),
+    "4.3-excitation": (
+        "holds with a reading",
+        lambda m, _: (
+            near(m["criterion_hz"], 0.16 * m["bandwidth_hz"], 1e-5) and near(m["bandwidth_hz"], _bandwidth_hz(), 1e-3)
+        ),
+    ),
     "4.3-batch": (
         "holds with a reading",
         lambda m, _: (
@@ -565,29 +519,40 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "4.4-30-samples": (
         "holds with a reading",
         lambda m, _: (
-            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3)
-            and m["theta_within_5_percent_after_n"]["mm"] == _theta_settled_in_front(1e3)
-            and m["theta_within_5_percent_after_n"]["m × 5"] == _theta_settled_in_front(5.0)
+            30 >= m["within_5_percent_after_n"]["mm × 5"] == _settled_in_front(5e3)[0]
+            and m["theta_within_5_percent_after_n"]["mm"] == _settled_in_front(1e3)[1]
+            and m["theta_within_5_percent_after_n"]["m × 5"] == _settled_in_front(5.0)[1]
             and m["largest_error"] < 1e-4
         ),
     ),
-    "4.5-biased": ("holds", lambda m, o: m["reconverged_n"] == o.converged("rls") == [None] * 4),
+    "4.5-biased": (
+        "holds",
+        lambda m, o: (
+            m["reconverged_n"] == o.converged("rls") == [None] * 4
+            and np.allclose(
+                m["relative_errors_of_M_B_K_at_the_ends"],
+                o.simulated["rls"][0][[199, 399, 499, 599, 799]],
+                rtol=0.02,
+                atol=1e-4,
+            )
+        ),
+    ),
     "4.6-immediately": (
         "holds with a reading",
         lambda m, o: (
-            m["reconverged_n"] == o.converged("prediction-error")
-            and nearly(m["theta_reconverged_n"], o.theta_converged("prediction-error"))
-            and m["latency_n"] == latencies(o.simulated["prediction-error"][1], 800)
+            m["reconverged_n"] == o.converged(ERROR)
+            and nearly(m["theta_reconverged_n"], o.theta_converged(ERROR))
+            and o.finds(m, ERROR)
         ),
     ),
     "4.6-theory": ("holds with a reading", lambda m, o: m["samples_from_the_alarm"] == _from_the_alarm(o)),
     "4.4-outliers": (
         "holds",
-        lambda m, o: _least_outliers(m, o, "prediction-error") and _noise_alarms(m, o, "prediction-error"),
+        lambda m, o: _least_outliers(m, o, ERROR) and _noise_alarms(m, o, ERROR),
     ),
     "4.5-robust": (
         "holds with a reading",
-        lambda m, o: _least_outliers(m, o, "mean-between-faults") and _noise_alarms(m, o, "mean-between-faults"),
+        lambda m, o: _least_outliers(m, o, MEAN) and _noise_alarms(m, o, MEAN),
     ),
     "4.9-sample-rate": ("holds with a reading", _sample_rate),
     "4.8-never-zero": (
@@ -603,7 +568,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     ),
     "4.9-false-alarms": (
         "holds with a reading",
-        lambda m, o: m["latency_n"] == latencies(o.simulated["mean-between-faults"][1], 800),
+        lambda m, o: o.finds(m, MEAN),
     ),
     "4.9-ceiling": (
         "holds with a reading",
@@ -614,37 +579,28 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     ),
     "4.10-spikes": (
         "holds",
-        lambda m, o: (
-            m["spikes"]
-            == {key: excursions(o.simulated[key][0], CHANGES) for key in ("mean-between-faults", "prediction-error")}
-        ),
+        lambda m, o: m["spikes"] == {key: excursions(o.simulated[key][0], CHANGES) for key in (MEAN, ERROR)},
     ),
     "4.10-variance": (
         "holds with a reading",
         lambda m, o: (
             # From the alarm at 236 to the edge at 250 single precision decides; see the test in double precision below.
             all(nearly(m["reconverged_n"][key][late:], o.converged(key)[late:]) for key, late in _ROUNDED.items())
-            and o.converged("mean-between-faults")[0] <= m["reconverged_n"]["mean-between-faults"][0] <= 50
+            and o.converged(MEAN)[0] <= m["reconverged_n"][MEAN][0] <= 50
             and all(nearly(m["theta_reconverged_n"][key], o.theta_converged(key)) for key in m["reconverged_n"])
             and near(m["spread_of_M_B_K"]["forgetting"], _spread_of_simulation(o))
-            and max(m["spread_of_M_B_K"]["mean-between-faults"]) < 5e-4
+            and max(m["spread_of_M_B_K"][MEAN]) < 5e-4
         ),
     ),
     "4.9-level": ("not reproduced", lambda m, _: m["alarms"] == 0),
-    "5.3-parity": ("holds", lambda m, _: m["difference_rms_lsb"] < 2.0),
+    "5.3-parity": ("holds", _parity),
     "5.4-skew": ("holds with a reading", _skewed),
     "5.4-variance": (
         "holds with a reading",
         lambda m, o: near(m["variances"], _variances(o.runs["skewed"]).tolist()),
     ),
-    "5.6-agreement": ("holds with a reading", lambda m, _: m["of_span"] < 0.001 and m["as_printed_1_m_after_n"] < 15),
-    "5.5-tracking": (
-        "does not hold",
-        lambda m, o: (
-            m["forgetting"]["reconverged_n"] == o.circuit_converged("forgetting")
-            and nearly(m["theta_reconverged_n"]["forgetting"], o.circuit_theta_converged("forgetting"))
-        ),
-    ),
+    "5.6-agreement": ("holds with a reading", _second_half),
+    "5.5-tracking": ("does not hold", _tracking),
     "5.9-forgetting": (
         "does not hold",
         lambda m, o: (
@@ -653,7 +609,7 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
                 for key in ("rls", "forgetting", "random-walk")
             )
             and all(
-                near(m["spread_of_b_1e-6_m_per_N"][name]["mean-between-faults"], o.b_scatter(o.runs[name].theta, name))
+                near(m["spread_of_b_1e-6_m_per_N"][name][MEAN], o.b_scatter(o.runs[name].theta, name))
                 for name in ("noisy", "quantised")
             )
         ),
@@ -668,15 +624,15 @@ VERDICTS: dict[str, tuple[str, Callable[[Claims, Oracle], bool]]] = {
     "5.10-prediction": (
         "does not hold",
         lambda m, o: (
-            near(m["rms_lsb"]["mean-between-faults"], _rms(o.runs["noisy"].innovation[100:]))
+            near(m["rms_lsb"][MEAN], _rms(o.runs["noisy"].innovation[100:]))
             and all(near(m["rms_lsb"][key], _rms(errors[100:]), 0.1) for key, (_, errors) in o.on_circuit.items())
         ),
     ),
     "5.10-spiking": (
         "holds with a reading",
         lambda m, o: (
-            m["spikes"]["mean-between-faults"] == o.recorded_spikes("noisy")
-            and m["spikes_quantised"]["mean-between-faults"] == o.recorded_spikes("quantised")
+            m["spikes"][MEAN] == o.recorded_spikes("noisy")
+            and m["spikes_quantised"][MEAN] == o.recorded_spikes("quantised")
         ),
     ),
 }
@@ -713,8 +669,8 @@ def test_verdict_and_the_figures_behind_it(claims: Claims, oracle: Oracle, ident
 @pytest.mark.parametrize(
     ("row", "name", "order", "kind", "ceiling"),
     [
-        ("filtered_live_order_2_quantised_mean_0.2_lsb", "quantised", 2, "mean-between-faults", 0.2),
-        ("filtered_live_order_4_noisy_prediction_error_2_lsb", "noisy", 4, "prediction-error", 2.0),
+        ("filtered_live_order_2_quantised_mean_0.2_lsb", "quantised", 2, MEAN, 0.2),
+        ("filtered_live_order_4_noisy_prediction_error_2_lsb", "noisy", 4, ERROR, 2.0),
     ],
 )
 def test_verdict_names_the_filter_that_makes_a_ceiling_suitable(
@@ -725,16 +681,16 @@ def test_verdict_names_the_filter_that_makes_a_ceiling_suitable(
     codes = oracle.runs[name].codes[:, :2].astype(float).T
     filtered = (lfilter(b, a, each - each[0]) + each[0] for each in codes)
     _, alarms = Rls(kind, ceiling, offset=True).run(*filtered)
-    found = [any(start < k <= start + 200 for k in alarms) for start in Oracle.CIRCUIT]
+    missed, extra = missed_and_extra(alarms, 1000, Oracle.CIRCUIT)
     measured = claim(claims, "5.5-tracking")["measured"][row]
-    assert measured["missed"] == found.count(False) == 0
-    assert abs(measured["extra_alarms"] - (len(alarms) - found.count(True))) <= 1
+    assert measured["missed"] == missed == 0
+    assert abs(measured["extra_alarms"] - extra) <= 1
     assert measured["extra_alarms"] <= 3
 
 
 def test_scheme_of_the_thesis_in_double_precision_converges_as_the_printed_recursion_does(oracle: Oracle) -> None:
     """Run the algorithm without rounding: in the C M, B and K converge later after the first alarm."""
-    key, per_m, scale = "mean-between-faults", 1e7, 2.0**-20
+    key, per_m, scale = MEAN, 1e7, 2.0**-20
     config = SCHEMES[key]
     assert config.ceiling is not None
     estimator = ReferenceEstimator(dataclasses.replace(config, p0=config.p0 / scale**2, ceiling=config.ceiling * scale))
@@ -751,12 +707,12 @@ def test_default_trigger_misses_nothing_where_the_thesis_s_fail(claims: Claims) 
     seeds = claims["comparison"]["seeds"]
     assert seeds["cusum"]["missed"] == 0
     assert seeds["cusum"]["extra_alarms"] <= 1
-    assert seeds["mean-between-faults"]["extra_alarms"] > 1000
-    assert seeds["prediction-error"]["extra_alarms"] > 1000
+    assert seeds[MEAN]["extra_alarms"] > 1000
+    assert seeds[ERROR]["extra_alarms"] > 1000
 
 
 def test_comparison_has_every_scheme_and_its_cost_on_every_data(claims: Claims) -> None:
-    keys = {"rls", "forgetting", "random-walk", "prediction-error", "mean-between-faults", "cusum"}
+    keys = {"rls", "forgetting", "random-walk", ERROR, MEAN, "cusum"}
     *raw, filtered = claims["comparison"]["data"]
     assert len(raw) == 3
     assert all(set(data["schemes"]) == keys for data in raw)

@@ -35,7 +35,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.out.suffix in (".csv", ".npz"):
         move_aside(arguments.out, files_read(arguments))
-    from analogrig.reporting.emulate import write_signals
+    from analogrig.reporting.export import write_signals
     from analogrig.reporting.summary import lamps_text
 
     with opened(arguments) as (rig, scenario, seed):

@@ -29,7 +29,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None:
         move_aside(arguments.out, files_read(arguments))
-    from analogrig.reporting.netlist import netlist
+    from analogrig.reporting.export import netlist
     from analogrig.storage import replacing
 
     with opened(arguments) as (rig, scenario, seed):

@@ -44,7 +44,7 @@ def _run(arguments: argparse.Namespace) -> int:
         show_plain(reproduction.claims().rstrip())
         return PASSED
     for chapter in reproduction.chapters:
-        for claim in chapter.text.claims:
-            show(f"{claim.ident:18} {claim.verdict}")
+        for claim in chapter.claims:
+            show(f"{claim['ident']:18} {claim['verdict']}")
     show(f"{arguments.out / PAGE}")
     return PASSED

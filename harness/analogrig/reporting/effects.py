@@ -11,11 +11,10 @@ from xml.sax.saxutils import escape
 from analogrig.storage import replacing
 from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 
-__all__ = ["as_json", "measure", "text", "write_picture"]
-
 EffectsBySet = Mapping[str, Sequence[Effect]]
 """Effects by parameter set; each set has the same effects in the same order."""
 
+_FIGURES = ("median_lsb", "largest_lsb", "draws")
 _COLOURS = ("#2b6cb0", "#c05621")
 _LEAST_LSB, _MOST_LSB = 1e-3, 1e3
 
@@ -30,22 +29,11 @@ def measure(sets: Sequence[str]) -> EffectsBySet:
 
 def as_json(table: EffectsBySet) -> dict[str, Any]:
     """Effects in plain JSON types."""
-    return {
-        "samples": SAMPLES,
-        "unit": "LSB (10 V / 4096)",
-        "sets": {
-            name: [
-                {
-                    "effect": row.name,
-                    "median_lsb": row.median_lsb,
-                    "largest_lsb": row.largest_lsb,
-                    "draws": row.draws,
-                }
-                for row in rows
-            ]
-            for name, rows in table.items()
-        },
+    sets = {
+        name: [{"effect": row.name, **{field: getattr(row, field) for field in _FIGURES}} for row in rows]
+        for name, rows in table.items()
     }
+    return {"samples": SAMPLES, "unit": "LSB (10 V / 4096)", "sets": sets}
 
 
 def text(table: EffectsBySet) -> str:
@@ -71,15 +59,9 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
 
     :raises RecordingError: the file cannot be written.
     """
-    with replacing(path) as file:
-        file.write(_svg(table).encode("utf-8"))
-
-
-def _svg(table: EffectsBySet) -> str:
     row_px, top_px = 10 * len(table) + 8, 56
     names = [row.name for row in next(iter(table.values()))]
     height = top_px + row_px * len(names) + 30
-    bottom = height - 24
     font = 'font-family="sans-serif" font-size="12"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="760" height="{height}" {font}>',
@@ -90,14 +72,15 @@ def _svg(table: EffectsBySet) -> str:
         parts.append(f'<rect x="{250 + 90 * i}" y="32" width="10" height="10" fill="{_COLOURS[i]}"/>')
         parts.append(f'<text x="{265 + 90 * i}" y="41">{escape(name)}</text>')
     for decade in range(round(math.log10(_LEAST_LSB)), round(math.log10(_MOST_LSB)) + 1):
-        x, bold = _x_px(10.0**decade), decade == 0
-        parts.append(f'<path d="M{x:.1f} {top_px - 6}V{bottom - 8}" stroke="{"#888" if bold else "#ddd"}"/>')
-        parts.append(f'<text x="{x:.1f}" y="{bottom + 8}" text-anchor="middle">{10.0**decade:g}</text>')
+        x, colour = _x_px(10.0**decade), "#ddd" if decade else "#888"
+        parts.append(f'<path d="M{x:.1f} {top_px - 6}V{height - 32}" stroke="{colour}"/>')
+        parts.append(f'<text x="{x:.1f}" y="{height - 16}" text-anchor="middle">{10.0**decade:g}</text>')
     for k, name in enumerate(names):
         y = top_px + row_px * k
         parts.append(f'<text x="240" y="{y + row_px / 2:.1f}" text-anchor="end">{escape(name)}</text>')
         parts += [_bar(rows[k], y + 10 * i, _COLOURS[i]) for i, rows in enumerate(table.values())]
-    return "\n".join([*parts, "</svg>"]) + "\n"
+    with replacing(path) as file:
+        file.write("\n".join([*parts, "</svg>", ""]).encode())
 
 
 def _bar(effect: Effect, y: float, colour: str) -> str:

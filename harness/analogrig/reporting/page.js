@@ -7,28 +7,14 @@
   const ROBUST_SPREAD = 0.6; // relative distance from the truth beyond which an estimate does not widen the plot
   const CEILINGS_SHOWN = 2;
   const BUCKET_PX = 3;
-  const { alarms, begin, cursor, curve, inks, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf } = plotting;
+  const { begin, curve, drawn, lettered, padded, position, trouble, verticals } = plotting;
 
   const run = JSON.parse(document.getElementById("run").textContent);
   const last = run.samples - 1;
   const showEvery = document.getElementById("every");
   const view = { min: 0, max: last };
   const places = placed();
-  let plots = [];
-
-  function decoded(buffer) {
-    const types = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
-    const signals = {};
-    let at = 0;
-    for (const column of run.columns) {
-      const size = types[column.type].BYTES_PER_ELEMENT * run.points;
-      const raw = new types[column.type](buffer.slice(at, at + size)); // a copy is aligned
-      at += size;
-      const values = Array.from(raw, (v) => (Number.isFinite(v) ? column.offset + column.scale * v : null));
-      signals[column.name] = { raw, values, unit: column.unit };
-    }
-    return signals;
-  }
+  let plots = () => [];
 
   // Sample of each point. A bucket of several samples has two points: the minimum and the maximum.
   function placed() {
@@ -58,17 +44,6 @@
     const values = new Array(run.points).fill(null);
     for (const segment of run.segments) values.fill(segment[name], pointAt(segment.start), pointAt(segment.end));
     return values;
-  }
-
-  function missingStretches(missing) {
-    const stretches = [];
-    for (let k = 0; k < missing.length; k++) {
-      if (!missing[k]) continue;
-      const first = k;
-      while (k + 1 < missing.length && missing[k + 1]) k++;
-      stretches.push([places[first], places[k]]);
-    }
-    return stretches;
   }
 
   // Ranges of the vertical scales
@@ -113,11 +88,10 @@
   // Marks
 
   const marked = (all) => all.map((mark) => ({ ...mark, at: mark.sample }));
-  const changes = marked(run.tweaks);
   const lit = marked(run.overloads);
   const noticed = marked(run.alarms.filter((alarm) => !alarm.false));
   const wrong = marked(run.alarms.filter((alarm) => alarm.false));
-  const marks = { changes, noticed, wrong };
+  const marks = { changes: marked(run.tweaks), noticed, wrong };
 
   // Lit lamps with the names of their amplifiers, inside the plot. Those of one sample are stacked.
   function lamps(u, ink) {
@@ -136,15 +110,15 @@
     ctx.restore();
   }
 
-  function missingBand(u, stretches, ink) {
+  function missingBand(u, missing, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
     ctx.save();
     ctx.fillStyle = ink("missing");
-    for (const [first, final] of stretches) {
-      if (final < view.min || first > view.max) continue;
-      const from = Math.max(bbox.left, u.valToPos(first - 0.5, "x", true));
-      const to = Math.min(bbox.left + bbox.width, u.valToPos(final + 0.5, "x", true));
+    for (let k = pointAt(view.min); k < places.length && places[k] <= view.max; k++) {
+      if (!missing[k]) continue;
+      const from = Math.max(bbox.left, Math.floor(u.valToPos(places[k] - 0.5, "x", true))); // whole pixels leave no seams
+      const to = Math.min(bbox.left + bbox.width, Math.ceil(u.valToPos((places[k + 1] ?? last + 1) - 0.5, "x", true)));
       ctx.fillRect(from, bbox.top + bbox.height - 6 * px, Math.max(to - from, px), 6 * px);
     }
     ctx.restore();
@@ -154,36 +128,24 @@
   function buckets(u, ink) {
     const { ctx, bbox } = u;
     const px = devicePixelRatio;
-    const wide = run.pieces.filter(([, , size]) => size > 1 && (size * bbox.width) / (view.max - view.min) > BUCKET_PX * px);
-    const spans = wide.map(([start, end, size]) => {
+    for (const [start, end, size] of run.pieces) {
+      if (size === 1 || (size * bbox.width) / (view.max - view.min) <= BUCKET_PX * px) continue;
       const from = Math.max(bbox.left, u.valToPos(start, "x", true));
-      return { from, width: Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true)) - from, size };
-    }).filter(({ width }) => width > 0);
-    return {
-      shade() {
-        ctx.save();
-        ctx.fillStyle = ink("line");
-        ctx.globalAlpha = 0.35;
-        for (const { from, width } of spans) ctx.fillRect(from, bbox.top, width, bbox.height);
-        ctx.restore();
-      },
-      words() {
-        lettered(u, ink("muted"), "left", "bottom");
-        for (const { from, width, size } of spans) {
-          const words = `minimum and maximum of every ${size} samples`;
-          if (ctx.measureText(words).width < width) ctx.fillText(words, from, bbox.top - 2 * px);
-        }
-        ctx.restore();
-      },
-    };
+      const width = Math.min(bbox.left + bbox.width, u.valToPos(end, "x", true)) - from;
+      if (width <= 0) continue;
+      ctx.save();
+      ctx.fillStyle = ink("line");
+      ctx.globalAlpha = 0.35;
+      ctx.fillRect(from, bbox.top, width, bbox.height);
+      ctx.restore();
+      lettered(u, ink("muted"), "left", "bottom");
+      const words = `minimum and maximum of every ${size} samples`;
+      if (ctx.measureText(words).width < width) ctx.fillText(words, from, bbox.top - 2 * px);
+      ctx.restore();
+    }
   }
 
   // Plots
-
-  function line(label, ink, colour, unit, more) {
-    const value = (u, v) => (v === null || v === undefined ? "–" : `${v.toPrecision(5)}${unit ? " " + unit : ""}`);
-    return curve(label, ink(colour), { value, ...more });
-  }
 
   // Circles around the values at which the channel's bit of `clipped` is set.
   function circled(clipped, channel, ink, colour) {
@@ -205,96 +167,58 @@
     return plotting.axis(scale, label, side, ink, { size, labelSize: 22, stroke: ink(colour), grid });
   }
 
-  function sampleAxis(ink) {
-    return plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 });
+  // Plot of some curves, each with its values `of` every point.
+  function plotOf(ink, caption, curves, range, axes) {
+    return {
+      caption,
+      data: curves.map(({ of }) => of),
+      series: curves.map(({ label, colour, ...more }) => curve(label, ink(colour), { scale: "left", ...more })),
+      scales: { left: { range }, right: { range } },
+      axes,
+    };
   }
 
   function pair(signals, ink, caption, left, right) {
-    const [a, b] = [left, right].map((name) => signals[name]);
     const words = (name) => name.replace("_", " ");
-    const points = (name, colour) => circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
-    return {
-      caption,
-      data: [a.values, b.values],
-      series: [
-        line(words(left), ink, "first", a.unit, { scale: "left", points: points(left, "first") }),
-        line(words(right), ink, "second", b.unit, { scale: "right", points: points(right, "second") }),
-      ],
-      scales: { left: { range: plainRange }, right: { range: plainRange } },
-      axes: [
-        axis("left", `${words(left)} [${a.unit}]`, 3, ink, "first"),
-        axis("right", `${words(right)} [${b.unit}]`, 1, ink, "second"),
-      ],
+    const label = (name) => `${words(name)} [${signals[name].unit}]`;
+    const curveOf = (name, scale, colour) => {
+      const points = circled(signals.clipped.raw, run.columns.findIndex((c) => c.name === name), ink, colour);
+      return { of: signals[name].values, label: words(name), colour, unit: signals[name].unit, scale, points };
     };
+    const curves = [curveOf(left, "left", "first"), curveOf(right, "right", "second")];
+    const axes = [axis("left", label(left), 3, ink, "first"), axis("right", label(right), 1, ink, "second")];
+    return plotOf(ink, caption, curves, plainRange, axes);
   }
 
   function estimate(signals, ink, name, caption, unit) {
     const known = truth(name);
-    const estimates = signals[name].values;
-    const drawn = line("estimate", ink, "first", unit, { scale: "left" });
-    const steps = uPlot.paths.stepped({ align: 1 });
-    return {
-      caption,
-      data: known ? [known, estimates] : [estimates],
-      series: known ? [line("truth", ink, "truth", unit, { scale: "left", width: 4, paths: steps }), drawn] : [drawn],
-      scales: { left: { range: estimateRange(estimates, known) } },
-      axes: [axis("left", `${name} [${unit}]`, 3, ink)],
-    };
+    const found = { of: signals[name].values, label: "estimate", colour: "first", unit };
+    const paths = uPlot.paths.stepped({ align: 1 });
+    const curves = known ? [{ of: known, label: "truth", colour: "truth", unit, width: 4, paths }, found] : [found];
+    return plotOf(ink, caption, curves, estimateRange(found.of, known), [axis("left", `${name} [${unit}]`, 3, ink)]);
   }
 
   function statistic(signals, ink) {
-    const values = signals.statistic.values;
-    const ceiling = run.ceiling === null ? [] : [line("ceiling", ink, "truth", "", { scale: "left", width: 2, dash: [10, 6] })];
-    return {
-      caption: "Trigger: its statistic, and the ceiling above which it raises an alarm",
-      data: ceiling.length ? [values, new Array(run.points).fill(run.ceiling)] : [values],
-      series: [line("statistic", ink, "first", "", { scale: "left" }), ...ceiling],
-      scales: { left: { range: statisticRange } },
-      axes: [axis("left", "statistic", 3, ink)],
-    };
+    const caption = "Trigger: its statistic, and the ceiling above which it raises an alarm";
+    const curves = [{ of: signals.statistic.values, label: "statistic", colour: "first" }];
+    if (run.ceiling !== null) {
+      const ceiling = new Array(run.points).fill(run.ceiling);
+      curves.push({ of: ceiling, label: "ceiling", colour: "truth", width: 2, dash: [10, 6] });
+    }
+    return plotOf(ink, caption, curves, statisticRange, [axis("left", "statistic", 3, ink)]);
   }
 
-  function options(plot, width, ink, stretches) {
-    const rightAxis = plot.axes.length > 1;
-    return {
-      width,
-      height: HEIGHT_PX,
-      padding: [20, rightAxis ? 0 : RIGHT_PX, 0, 0],
-      cursor: cursor("run"),
-      scales: {
-        x: {
-          time: false,
-          range: (u, min, max) => {
-            view.min = Math.max(0, min ?? 0);
-            view.max = Math.min(last, max ?? last);
-            return [view.min, view.max];
-          },
-        },
-        ...plot.scales,
-      },
-      axes: [sampleAxis(ink), ...plot.axes],
-      series: [{ label: "sample" }, ...plot.series],
-      hooks: {
-        drawClear: [(u) => buckets(u, ink).shade()],
-        drawAxes: [(u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }), (u) => alarms(u, marks, ink).lines()],
-        draw: [(u) => missingBand(u, stretches, ink), (u) => alarms(u, marks, ink).flags(), (u) => lamps(u, ink), (u) => buckets(u, ink).words()],
-      },
-    };
-  }
+  const samples = {
+    time: false,
+    range: (u, min, max) => {
+      view.min = Math.max(0, min ?? 0);
+      view.max = Math.min(last, max ?? last);
+      return [view.min, view.max];
+    },
+  };
 
-  function show(first, final) {
-    for (const plot of plots) plot.setScale("x", { min: Math.max(0, first), max: Math.min(last, final) });
-  }
-
-  function draw(signals) {
-    const ink = inks();
-    const place = document.getElementById("plots");
-    const width = widthOf(place);
-    const stretches = missingStretches(signals.missing.raw);
-    const kept = { ...view };
-    plots.forEach((plot) => plot.destroy());
-    place.replaceChildren();
-    plots = [
+  function described(signals, ink) {
+    return [
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
       ...(signals.velocity && signals.net_force
         ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
@@ -302,16 +226,28 @@
       estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
       estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
       statistic(signals, ink),
-    ].map((plot) => {
-      const figure = document.createElement("figure");
-      const caption = document.createElement("figcaption");
-      caption.textContent = plot.caption;
-      figure.append(caption);
-      place.append(figure);
-      const name = `${plot.caption}, samples 0 to ${last}`;
-      return plotted(options(plot, width, ink, stretches), [places, ...plot.data], figure, name);
-    });
-    show(kept.min, kept.max);
+    ].map((plot) => ({
+      ...plot,
+      place: document.getElementById("plots"),
+      frame: ["figure", "figcaption"],
+      name: `${plot.caption}, samples 0 to ${last}`,
+      key: "run",
+      right_px: plot.axes.length > 1 ? 0 : RIGHT_PX,
+      data: [places, ...plot.data],
+      scales: { x: samples, ...plot.scales },
+      axes: [plotting.axis("x", "sample", 2, ink, { size: 26, labelSize: 18 }), ...plot.axes],
+      series: [{ label: "sample" }, ...plot.series],
+      marks,
+      under: [
+        (u) => buckets(u, ink),
+        (u) => verticals(u, lit, { colour: ink("truth"), width: 2, dash: [1, 3] }),
+      ],
+      over: [(u) => missingBand(u, signals.missing.raw, ink), (u) => lamps(u, ink)],
+    }));
+  }
+
+  function show(first, final) {
+    for (const plot of plots()) plot.setScale("x", { min: Math.max(0, first), max: Math.min(last, final) });
   }
 
   function controlled() {
@@ -328,14 +264,15 @@
     }
   }
 
-  function shown(buffer) {
-    const signals = decoded(buffer);
-    draw(signals);
-    redrawn(() => draw(signals), document.getElementById("plots"), () => plots, HEIGHT_PX);
+  function shown(columns) {
+    const signals = Object.fromEntries(columns.map((column) => [column.name, column]));
+    plots = drawn((ink) => described(signals, ink), [HEIGHT_PX, HEIGHT_PX]);
+    show(0, last);
     controlled();
-    return plots.length;
+    return plots().length;
   }
 
-  if (run.samples) begin(run.deflated, shown);
+  const columns = run.columns.map((column) => ({ ...column, points: run.points }));
+  if (run.samples) begin(columns, run.deflated, shown);
   else trouble("The run ended before its first sample: there is nothing to plot.");
 })();

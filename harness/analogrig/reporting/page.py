@@ -63,20 +63,14 @@ def assemble_page(template: Path, styles: Sequence[Path], scripts: Sequence[Path
     :raises RecordingError: a file is missing, such as uPlot before the build.
     """
     style, script = ([_part(path) for path in paths] for paths in (styles, scripts))
-    head = Template(_part(FOLDER / "head.html")).substitute(
-        title=title, policy=_policy(style, script), styles="\n".join(f"<style>{each}</style>" for each in style)
+    elements = [_part(FOLDER / "licence.html").rstrip("\n")] if scripts else []
+    return Template(_part(FOLDER / "frame.html")).substitute(
+        title=title,
+        policy=f"default-src 'none'; style-src {_hashes(style)}; script-src {_hashes(script)}",
+        styles="\n".join(f"<style>{each}</style>" for each in style),
+        body=Template(_part(template)).substitute(texts).rstrip("\n"),
+        scripts="\n".join([*elements, *(f"<script>{each}</script>" for each in script)]),
     )
-    return Template(_part(template)).substitute(
-        texts,
-        head=head.rstrip("\n"),
-        licence=_part(FOLDER / "licence.html").rstrip("\n"),
-        scripts="\n".join(f"<script>{each}</script>" for each in script),
-    )
-
-
-def _policy(styles: list[str], scripts: list[str]) -> str:
-    """Content security policy that allows only these styles and scripts, and no network access."""
-    return f"default-src 'none'; style-src {_hashes(styles)}; script-src {_hashes(scripts)}"
 
 
 def _hashes(sources: list[str]) -> str:

@@ -15,7 +15,6 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +33,14 @@ _MOST_NEAR_MOMENTS = 50_000
 _MOST_MOMENTS = 100
 _LONGEST_REACH = 1_000
 """Samples on either side of a moment."""
+
+_DISPLAY_UNITS = {"m": ("mm", 1000.0)}
+"""Units that the page displays as others, with the factor."""
+
+_MOST_FALSE_ALARMS = 5_000
+"""Largest number of false alarms marked in the plots."""
+_MOST_STEPS = 4_000
+"""Largest number of steps of the truth on all ramps together."""
 
 
 class Piece(NamedTuple):
@@ -103,13 +110,10 @@ def condense_clipping(codes: NDArray[np.uint16], clipped: NDArray[np.bool_], siz
     """(p, c): the points of ``condense(codes, size)`` that were clipped; a clipped code is an end of its range."""
     if size == 1:
         return clipped
-    starts = range(0, len(codes), size)
-    least, greatest = np.minimum.reduceat(codes, starts, axis=0), np.maximum.reduceat(codes, starts, axis=0)
-    bucket = np.arange(len(codes)) // size
-    out = np.empty((2 * len(starts), codes.shape[1]), np.bool_)
-    out[0::2] = np.logical_or.reduceat(clipped & (codes == least[bucket]), starts, axis=0)
-    out[1::2] = np.logical_or.reduceat(clipped & (codes == greatest[bucket]), starts, axis=0)
-    return out
+    ends, bucket = condense(codes, size), np.arange(len(codes)) // size
+    at_end = (clipped & (codes == ends[half::2][bucket]) for half in range(2))
+    found = [np.logical_or.reduceat(each, range(0, len(codes), size), axis=0) for each in at_end]
+    return np.stack(found, axis=1).reshape(ends.shape)
 
 
 def thin_out(values: Sequence[int], samples: int, most: int) -> list[int]:
@@ -121,52 +125,28 @@ def thin_out(values: Sequence[int], samples: int, most: int) -> list[int]:
     return [int(each) for each in ordered[firsts]]
 
 
-_DISPLAY_UNITS = {"m": ("mm", 1000.0)}
-"""Units that the page displays as others, with the factor."""
-
-_MOST_FALSE_ALARMS = 5_000
-"""Largest number of false alarms marked in the plots."""
-_MOST_STEPS = 4_000
-"""Largest number of steps of the truth on all ramps together."""
-
-
-@dataclass(frozen=True)
-class PlotColumn:
-    """One signal of the plots; the page shows ``offset + scale * values`` in ``unit``."""
-
-    name: str
-    values: NDArray[Any]
-    """(p,) uint8, uint16 or float32, of the points of the plot."""
-    scale: float = 1.0
-    offset: float = 0.0
-    unit: str = ""
-
-
 def payload(run: Run, verdict: Verdict) -> dict[str, Any]:
     """Data of the plots in plain JSON types without NaN."""
     shown = _pieces(run, verdict)
-    columns = _columns(run, shown)
+    values = _signals(run, shown)
     detections, false = _alarms(run, verdict)
     return {
         "samples": run.samples,
         "points": sum(piece.points for piece in shown),
         "pieces": shown,
-        "columns": [
-            {"name": c.name, "type": c.values.dtype.name, "scale": c.scale, "offset": c.offset, "unit": c.unit}
-            for c in columns
-        ],
-        "deflated": deflate(column.values for column in columns),
-        "tweaks": [{"sample": tweak.sample, "label": direction(tweak)} for tweak in verdict.tweaks],
+        "columns": [{"name": name, "type": each.dtype.name, **_units(run, name)} for name, each in values.items()],
+        "deflated": deflate(values.values()),
+        "tweaks": [{"sample": tweak.sample, "label": _direction(tweak)} for tweak in verdict.tweaks],
         "alarms": [
             {"sample": index, "false": is_false}
             for index, is_false in sorted([*((each, False) for each in detections), *((each, True) for each in false)])
         ],
         "overloads": [{"sample": sample, "label": name} for name, sample in sorted(verdict.overloads.items())],
         "segments": [
-            {"start": start, "end": end, **_finite_values(plant.parameters())}
+            {"start": start, "end": end, **{key: _finite(value) for key, value in plant.parameters().items()}}
             for start, end, plant in _true_segments(run)
         ],
-        "ceiling": finite_or_none(verdict.ceiling),
+        "ceiling": _finite(verdict.ceiling),
     }
 
 
@@ -221,22 +201,22 @@ def deflate(columns: Iterable[NDArray[Any]]) -> str:
     return base64.b64encode(zlib.compress(raw, 9)).decode("ascii")
 
 
-def finite_or_none(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     """``value``, or None if it is None or non-finite."""
     return value if value is not None and math.isfinite(value) else None
 
 
-def direction(tweak: ChangeVerdict) -> str:
+def _direction(tweak: ChangeVerdict) -> str:
     """Label of a change in a plot: ``B ↓, K ↑``."""
     return ", ".join(f"{name} {'↑' if tweak.after[name] > old else '↓'}" for name, old in tweak.before.items())
 
 
-def _columns(run: Run, shown: Sequence[Piece]) -> Sequence[PlotColumn]:
+def _signals(run: Run, shown: Sequence[Piece]) -> dict[str, NDArray[Any]]:
+    """Signals by name: (p,) uint8, uint16 or float32, of the points of the plot."""
     measured = [i for i, name in enumerate(CHANNELS) if name in run.conditions.channels]
     none = _points(run, slice(0), 1, measured)
     parts = [none, *(_points(run, part, piece.size, measured) for piece in shown for part in piece.parts())]
-    values = {name: np.concatenate([part[name] for part in parts]) for name in none}
-    return [PlotColumn(name, points, **_units(run, name)) for name, points in values.items()]
+    return {name: np.concatenate([part[name] for part in parts]) for name in none}
 
 
 def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[str, NDArray[Any]]:
@@ -256,14 +236,10 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
 
 
 def _units(run: Run, name: str) -> dict[str, Any]:
-    """Scale, offset and unit of a column, if it is a channel."""
+    """Scale, offset and unit of a signal; the page shows ``offset + scale * values``."""
     if name not in run.conditions.channels:
-        return {}
+        return {"scale": 1.0, "offset": 0.0, "unit": ""}
     channel = run.conditions.channels[name]
     unit, factor = _DISPLAY_UNITS.get(channel.unit, (channel.unit, 1.0))
     per_volt = channel.unit_per_v * factor
     return {"scale": channel.lsb_v * per_volt, "offset": channel.low_v * per_volt, "unit": unit}
-
-
-def _finite_values(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: finite_or_none(value) for name, value in values.items()}

@@ -6,10 +6,20 @@ const plotting = (() => {
   const DENSE_PX = 10; // smallest distance of false alarms that do not fade
   const DENSE_ALPHA = 0.2; // opacity of the most faded alarms
 
-  async function inflated(deflated) {
+  // Columns with their raw values, and with their values in the unit of the plot; null for a non-finite one.
+  async function decoded(columns, deflated) {
     const bytes = Uint8Array.from(atob(deflated), (c) => c.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    return new Response(stream).arrayBuffer();
+    const buffer = await new Response(stream).arrayBuffer();
+    const types = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
+    let at = 0;
+    return columns.map((column) => {
+      const size = types[column.type].BYTES_PER_ELEMENT * column.points;
+      const raw = new types[column.type](buffer.slice(at, at + size)); // a copy is aligned
+      at += size;
+      const values = Array.from(raw, (v) => (Number.isFinite(v) ? column.offset + column.scale * v : null));
+      return { ...column, raw, values };
+    });
   }
 
   function padded(low, high) {
@@ -101,8 +111,8 @@ const plotting = (() => {
 
   // Curves, axes and layout
 
-  function curve(label, stroke, more) {
-    const value = (u, v) => (v === null || v === undefined ? "–" : v.toPrecision(5));
+  function curve(label, stroke, { unit, ...more }) {
+    const value = (u, v) => (v === null || v === undefined ? "–" : `${v.toPrecision(5)}${unit ? " " + unit : ""}`);
     return { label, stroke, width: 1.5, points: { show: false }, value, ...more };
   }
 
@@ -122,19 +132,6 @@ const plotting = (() => {
     };
   }
 
-  // The pointer reads out all plots with the same key. Dragging zooms all of them.
-  function cursor(key) {
-    return { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } };
-  }
-
-  function plotted(options, data, place, name) {
-    const plot = new uPlot(options, data, place);
-    const canvas = plot.root.querySelector("canvas");
-    canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", name);
-    return plot;
-  }
-
   function inks() {
     const style = getComputedStyle(document.documentElement);
     return (name) => style.getPropertyValue(`--${name}`).trim();
@@ -144,24 +141,67 @@ const plotting = (() => {
     return document.documentElement.classList.contains("printing");
   }
 
-  function widthOf(place) {
-    return isPrinting() ? PRINT_WIDTH_PX : place.clientWidth;
+  // The pointer reads out all plots with the same key. Dragging zooms all of them. `under` and `over` draw more below
+  // and above the signals.
+  function options({ key, right_px, scales, axes, series, marks, under = [], over = [] }, width, height, ink) {
+    return {
+      width,
+      height,
+      padding: [20, right_px, 0, 0],
+      cursor: { y: false, sync: { key, scales: ["x", null] }, drag: { x: true, y: false, dist: 4 } },
+      scales,
+      axes,
+      series,
+      hooks: {
+        drawAxes: [...under, (u) => alarms(u, marks, ink).lines()],
+        draw: [...over, (u) => alarms(u, marks, ink).flags()],
+      },
+    };
   }
 
-  // Redraw for print and for another colour scheme; resize the plots with their container.
-  function redrawn(draw, place, plots, height) {
+  function plotted(plot, heights, ink) {
+    const frame = document.createElement(plot.frame[0]);
+    const caption = document.createElement(plot.frame[1]);
+    frame.className = "plot";
+    caption.textContent = plot.caption;
+    frame.append(caption);
+    plot.place.append(frame);
+    const width = isPrinting() ? PRINT_WIDTH_PX : plot.place.clientWidth;
+    const drawn = new uPlot(options(plot, width, heights[isPrinting() ? 1 : 0], ink), plot.data, frame);
+    const canvas = drawn.root.querySelector("canvas");
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", plot.name);
+    return drawn;
+  }
+
+  // Draw what `describe` returns, again for print and for another colour scheme, and fit it to its container.
+  // Return a function that returns the plots.
+  function drawn(describe, heights) {
+    let plots = [];
+    function draw() {
+      const ink = inks();
+      const kept = plots.map(({ scales }) => ({ min: scales.x.min, max: scales.x.max }));
+      plots.forEach((plot) => plot.destroy());
+      const described = describe(ink);
+      for (const { place } of described) place.replaceChildren();
+      plots = described.map((plot) => plotted(plot, heights, ink));
+      kept.forEach((range, i) => plots[i].setScale("x", range));
+      return described[0].place;
+    }
     const printing = (on) => () => {
       document.documentElement.classList.toggle("printing", on);
       draw();
     };
+    const place = draw();
     addEventListener("beforeprint", printing(true));
     addEventListener("afterprint", printing(false));
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
     new ResizeObserver(() => {
       const width = place.clientWidth;
-      if (!width || isPrinting() || plots()[0].width === width) return;
-      for (const plot of plots()) plot.setSize({ width, height });
+      if (!width || isPrinting() || plots[0].width === width) return;
+      for (const plot of plots) plot.setSize({ width, height: heights[0] });
     }).observe(place);
+    return () => plots;
   }
 
   function trouble(text) {
@@ -170,18 +210,18 @@ const plotting = (() => {
     place.hidden = false;
   }
 
-  // `show` draws the decoded data and returns the number of plots.
-  async function begin(deflated, show) {
+  // `show` draws the decoded columns and returns the number of plots.
+  async function begin(columns, deflated, show) {
     if (typeof DecompressionStream === "undefined") {
       return trouble("This browser is too old for the plots: it has no DecompressionStream.");
     }
     try {
-      document.documentElement.dataset.drawn = String(show(await inflated(deflated)));
+      document.documentElement.dataset.drawn = String(show(await decoded(columns, deflated)));
     } catch (error) {
       trouble(`The plots could not be drawn: ${error.message}`);
       throw error;
     }
   }
 
-  return { alarms, axis, begin, cursor, curve, inks, isPrinting, lettered, padded, plotted, position, redrawn, trouble, verticals, widthOf };
+  return { axis, begin, curve, drawn, lettered, padded, position, trouble, verticals };
 })();

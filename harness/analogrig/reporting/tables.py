@@ -1,9 +1,8 @@
-"""Texts and tables of the page. ``_text`` escapes every text that may come from a file."""
+"""Texts and tables of the page of a run. ``markup`` escapes every text that may come from a file."""
 
 from __future__ import annotations
 
-import html
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from analogrig.identity import Identity
@@ -11,6 +10,7 @@ from analogrig.judging.advice import advice
 from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
 from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
+from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
 from analogrig.reporting.summary import lamps_text, latency_text, load_text
 from analogrig.run import Run
@@ -18,9 +18,6 @@ from analogrig.wording import number_of
 
 _MAX_FALSE_ALARMS = 20
 """Rows in the table of false alarms; the plots mark more."""
-
-_MOST_ROWS = 500
-"""Largest number of rows in any table."""
 
 _SIGNS = {"passed": "✓", "failed": "✗", "inconclusive": "?"}
 
@@ -33,17 +30,17 @@ _SENTENCES = {
 
 def title(run: Run, verdict: Verdict) -> str:
     """Title of the page, escaped."""
-    return f"{_text(verdict.outcome.upper())}: {_run_title(run)}"
+    return f"{text(verdict.outcome.upper())}: {_run_title(run)}"
 
 
 def outcome(run: Run, verdict: Verdict) -> str:
     """Banner with the outcome, the reasons, and advice."""
     notes = (f"Note: {sentence}." for sentence in advice(run, verdict))
-    reasons = "".join(f"<li>{_text(sentence)}</li>" for sentence in (*verdict.reasons, *notes))
+    reasons = "".join(f"<li>{text(sentence)}</li>" for sentence in (*verdict.reasons, *notes))
     return (
         f'<section class="outcome {verdict.outcome}" aria-labelledby="outcome">'
         f'<h1 id="outcome"><span class="sign" aria-hidden="true">{_SIGNS[verdict.outcome]}</span>'
-        f" {_text(verdict.outcome.upper())}<small>{_run_title(run)}</small></h1>"
+        f" {text(verdict.outcome.upper())}<small>{_run_title(run)}</small></h1>"
         f"<p>{_SENTENCES[verdict.outcome]}</p>"
         f"{f'<ul>{reasons}</ul>' if reasons else ''}"
         f"{_figures_sentence(run, verdict)}</section>"
@@ -59,7 +56,7 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Scenario", f"{context.scenario['name']}{f': {description}' if description else ''}"),
         ("Rig", context.rig["name"]),
         ("Device", context.dut["name"]),
-        ("Firmware", _pairs(context.dut.get("identity", {})) or "unknown"),
+        ("Firmware", _firmware(context.dut.get("identity", {})) or "unknown"),
         ("Link", context.link),
         ("Bus load", "unknown, or no CAN bus" if load is None else load_text(load)),
         ("Seed", context.seed),
@@ -68,7 +65,7 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Theta hash", verdict.theta_hash),
         *provenance(context.identity),
     ]
-    return _table("Scenario, rig and device", "", (_pair_row(name, value) for name, value in rows), kind="pairs")
+    return pairs("Scenario, rig and device", rows)
 
 
 def provenance(identity: Identity | None) -> list[tuple[str, str]]:
@@ -92,10 +89,8 @@ def tweaks(verdict: Verdict) -> str:
     caption = f"Latency and bound in samples from the change; {assumed}"
     if any(tweak.alternatives for tweak in verdict.tweaks):
         caption += "; a range if the instant was estimated from the samples"
-    head = _row(
-        [_head("Sample"), _head("Change"), *map(_number_head, ("Latency", "Bound", "Latency / bound")), _head("Result")]
-    )
-    return _table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
+    head = heading(("Sample", "Change"), ("Latency", "Bound", "Latency / bound"), ("Result",))
+    return table(caption, head, (_change_row(tweak) for tweak in verdict.tweaks))
 
 
 def diagnoses(verdict: Verdict) -> str:
@@ -105,8 +100,8 @@ def diagnoses(verdict: Verdict) -> str:
         return "<p>The device reported no diagnosis.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
     numbers = ("Extent", "Error", "Delay", "Bound", "Onset error")
-    head = _row([_head("Sample"), _head("Changed"), _head("Named"), *map(_number_head, numbers), _head("Result")])
-    return _table(caption, head, (_diagnosis_row(*each) for each in reported))
+    head = heading(("Sample", "Changed", "Named"), numbers, ("Result",))
+    return table(caption, head, (_diagnosis_row(*each) for each in reported))
 
 
 def false_alarms(run: Run, verdict: Verdict) -> str:
@@ -122,19 +117,19 @@ def false_alarms(run: Run, verdict: Verdict) -> str:
     caption = f"{count:,} in {number_of(run.samples, 'sample', form=',')}" + (
         f"; the first {len(shown)} are listed" if count > len(shown) else ""
     )
-    rows = (_row([_zoom(index), _number(statistics.get(index))]) for index in shown)
-    return _table(caption, _row([_head("Sample"), _number_head("Statistic")]), rows)
+    rows = (row([_zoom(index), number(statistics.get(index))]) for index in shown)
+    return table(caption, heading(("Sample",), ("Statistic",)), rows)
 
 
 def estimates(verdict: Verdict) -> str:
     """Table of M, B and K at the end of each segment, compared with the truth."""
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
-    groups = [f'<th scope="colgroup" colspan="3">{name} [{_text(UNITS[name])}]</th>' for name in PARAMETERS]
-    columns = [_number_head(name) for name in ("estimate", "truth", "error")] * len(PARAMETERS)
-    head = _row(['<th scope="col" rowspan="2">Samples</th>', *groups]) + _row(columns)
+    groups = [f'<th scope="colgroup" colspan="3">{name} [{text(UNITS[name])}]</th>' for name in PARAMETERS]
+    head = row(['<th scope="col" rowspan="2">Samples</th>', *groups])
+    head += heading((), ("estimate", "truth", "error") * len(PARAMETERS))
     rows = (_segment_row(segment) for segment in verdict.estimates)
-    return _table("The estimate after the last sample of each segment", head, rows)
+    return table("The estimate after the last sample of each segment", head, rows)
 
 
 def settings(run: Run) -> str:
@@ -148,15 +143,14 @@ def settings(run: Run) -> str:
         "channel": channels,
         "counter": context.counters,
     }
-    rows = (_pair_row(key, value) for key, value in _flatten(everything))
-    return _table("As recorded", "", rows, kind="pairs")
+    return pairs("As recorded", _flatten(everything))
 
 
 def period(run: Run) -> str:
     """Sample period in problem time and at the machine, escaped."""
     context = run.conditions
     problem_ms, machine_us = context.sample_period_problem_s * 1e3, context.sample_period_s * 1e6
-    return _text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
+    return text(f"{problem_ms:.4g} ms of problem time, {machine_us:.4g} µs at the machine")
 
 
 def resolution(run: Run, verdict: Verdict) -> str:
@@ -175,7 +169,7 @@ def resolution(run: Run, verdict: Verdict) -> str:
 
 def _run_title(run: Run) -> str:
     context = run.conditions
-    return f"{_text(context.scenario['name'])} on {_text(context.rig['name'])}, device {_text(context.dut['name'])}"
+    return f"{text(context.scenario['name'])} on {text(context.rig['name'])}, device {text(context.dut['name'])}"
 
 
 def _figures_sentence(run: Run, verdict: Verdict) -> str:
@@ -208,20 +202,17 @@ def _change_row(tweak: ChangeVerdict) -> str:
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
-    cells = [instant, _cell(change, "text"), f"<td class='number'>{_latency(tweak)}</td>", _number(tweak.bound_n)]
-    return _row([*cells, _number(ratio, ".2f"), _cell(word, f"text {kind}")])
+    latency = "–" if tweak.latencies_n is None else latency_text(tweak).replace("-", "–")
+    cells = [instant, cell(change), cell(latency, "number"), number(tweak.bound_n)]
+    return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
 def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
     word, kind = ("✓ right", "good") if diagnosis.right else ("✗ WRONG", "bad")
-    cells = [f'<th scope="row">{tweak.sample}</th>', _cell(tweak.what, "text"), _cell(diagnosis.named, "text")]
-    cells += [_number(diagnosis.extent, ".3f"), _number(diagnosis.extent_error, "+.1%")]
-    cells += [_number(diagnosis.delay_n), _number(diagnosis.bound_n), _number(diagnosis.onset_error_n, "+d")]
-    return _row([*cells, _cell(word, f"text {kind}")])
-
-
-def _latency(tweak: ChangeVerdict) -> str:
-    return "–" if tweak.latencies_n is None else _text(latency_text(tweak)).replace("-", "–")
+    cells = [f'<th scope="row">{tweak.sample}</th>', cell(tweak.what), cell(diagnosis.named)]
+    cells += [number(diagnosis.extent, ".3f"), number(diagnosis.extent_error, "+.1%")]
+    cells += [number(diagnosis.delay_n), number(diagnosis.bound_n), number(diagnosis.onset_error_n, "+d")]
+    return row([*cells, cell(word, f"text {kind}")])
 
 
 def _result(tweak: ChangeVerdict) -> tuple[str, str]:
@@ -240,14 +231,9 @@ def _segment_row(segment: SegmentEstimate) -> str:
     cells = [_zoom(segment.start, segment.end - 1)]
     for name in PARAMETERS:
         estimate = None if segment.estimate is None else segment.estimate[name]
-        cells += [_number(estimate, ".5g"), _number(segment.truth[name], ".6g"), _number(_error(segment, name), "+.2%")]
-    return _row(cells)
-
-
-def _error(segment: SegmentEstimate, name: str) -> float | None:
-    """Relative error, rounded to 0.01 %; never a negative zero."""
-    error = segment.error.get(name)
-    return None if error is None else round(error, 4) + 0.0
+        error = None if estimate is None else round(segment.error[name], 4) + 0.0  # never a negative zero
+        cells += [number(estimate, ".5g"), number(segment.truth[name], ".6g"), number(error, "+.2%")]
+    return row(cells)
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -261,57 +247,15 @@ def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield f"{prefix}{key}", value
 
 
-def _pairs(table: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key.replace('_', ' ')} {_format_value(key, value)}" for key, value in table.items())
-
-
-def _format_value(key: str, value: object) -> str:
-    """Value as text; hashes and nonces in hexadecimal."""
-    return f"{value:#010x}" if isinstance(value, int) and key.endswith(("hash", "nonce")) else str(value)
-
-
-def _table(caption: str, head: str, rows: Iterable[str], kind: str = "numbers") -> str:
-    """HTML table of finished rows, of which the first are shown; ``kind`` is a style class."""
-    shown = list(rows)
-    if len(shown) > _MOST_ROWS:
-        caption += f"; the first {_MOST_ROWS} of {len(shown):,} rows"
-    return (
-        f'<div class="scroll"><table class="{kind}"><caption>{_text(caption)}</caption>'
-        f"{f'<thead>{head}</thead>' if head else ''}<tbody>{''.join(shown[:_MOST_ROWS])}</tbody></table></div>"
-    )
-
-
-def _row(cells: Iterable[str]) -> str:
-    return f"<tr>{''.join(cells)}</tr>"
-
-
-def _head(name: str) -> str:
-    return f'<th scope="col">{_text(name)}</th>'
-
-
-def _number_head(name: str) -> str:
-    return f'<th scope="col" class="number">{_text(name)}</th>'
-
-
-def _pair_row(name: str, value: object) -> str:
-    return _row([f'<th scope="row">{_text(name)}</th>', _cell(value, "text")])
-
-
-def _cell(value: object, kind: str) -> str:
-    return f'<td class="{kind}">{_text(value)}</td>'
-
-
-def _number(value: float | None, form: str = ".4g") -> str:
-    return f"<td class='number'>{'–' if value is None else _text(format(value, form))}</td>"
+def _firmware(identity: Mapping[str, Any]) -> str:
+    """Identity of the firmware in words; hashes and nonces in hexadecimal."""
+    hexadecimal = {key for key, value in identity.items() if isinstance(value, int) and key.endswith(("hash", "nonce"))}
+    values = {key: f"{value:#010x}" if key in hexadecimal else value for key, value in identity.items()}
+    return ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in values.items())
 
 
 def _zoom(first: int, last: int | None = None) -> str:
     """Row heading that zooms the plots to these samples."""
-    shown = str(first) if last is None else f"{first}–{last}"
-    until = "" if last is None else f' data-last="{last}"'
-    goal = f'data-first="{first}"{until}'
-    return f'<th scope="row"><button type="button" {goal} title="Show in the plots">{shown}</button></th>'
-
-
-def _text(value: object) -> str:
-    return html.escape(str(value))
+    shown, until = (str(first), "") if last is None else (f"{first}–{last}", f' data-last="{last}"')
+    goal = f'data-first="{first}"{until} title="Show in the plots"'
+    return f'<th scope="row"><button type="button" {goal}>{shown}</button></th>'

@@ -1,0 +1,93 @@
+"""Signals and SPICE deck of a rig, without a device."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.bench import Progress
+from analogrig.errors import ConfigurationError
+from analogrig.rigs.emulator import SetUp, is_emulated
+from analogrig.rigs.rig import Block, Rig
+from analogrig.run import CHANNELS
+from analogrig.scenario import Scenario
+from analogrig.storage import replacing
+from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotTurn
+
+
+def write_signals(
+    rig: Rig, scenario: Scenario, seed: int, path: Path, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Play ``scenario`` on ``rig`` and write volts, codes and clipping flags, one row a sample, as .csv or .npz.
+
+    :returns: ``samples``; ``clipped``, the number of samples with any channel clipped; ``overloads``, the first sample
+        with a lit overload lamp by amplifier.
+    :raises ConfigurationError: the suffix of ``path`` is neither .csv nor .npz.
+    :raises RecordingError: the file cannot be written.
+    """
+    if path.suffix not in (".csv", ".npz"):
+        raise ConfigurationError(f"{path}: the file's name must end with .csv or .npz")
+    blocks: list[Block] = []
+    performance = rig.perform(scenario, seed)
+    for block in performance.blocks:
+        blocks.append(block)
+        if progress is not None:
+            progress(block.first + len(block.codes), scenario.samples)
+    volts, codes, clipped = (
+        np.concatenate([getattr(block, name) for block in blocks]) for name in ("volts", "codes", "clipped")
+    )
+    with replacing(path) as file:
+        if path.suffix == ".csv":
+            _write_csv(volts, codes, clipped, file)
+        else:
+            np.savez(file, channels=np.array(CHANNELS), volts=volts, codes=codes, clipped=clipped)
+    overloads = dict(performance.hindsight().lamps)
+    return {"samples": len(codes), "clipped": int(clipped.any(axis=1).sum()), "overloads": overloads}
+
+
+def _write_csv(volts: NDArray[Any], codes: NDArray[Any], clipped: NDArray[Any], file: BinaryIO) -> None:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["sample", *(f"{channel}_{kind}" for kind in ("v", "code", "clipped") for channel in CHANNELS)])
+    for index, row in enumerate(zip(volts.tolist(), codes.tolist(), clipped.astype(int).tolist(), strict=True)):
+        writer.writerow([index, *(f"{v:.6f}" for v in row[0]), *row[1], *row[2]])
+    file.write(out.getvalue().encode("ascii"))
+
+
+def netlist(rig: Rig, scenario: Scenario, seed: int) -> Deck:
+    """SPICE deck of a scenario: circuit with the components drawn from ``seed``, excitation and pot changes.
+
+    :raises ConfigurationError: the scenario cannot be played on this rig, or the rig is not emulated.
+    """
+    if not is_emulated(rig):
+        raise ConfigurationError(f"{rig.description()['name']}: only an emulated rig has a netlist")
+    setup = rig.set_up(scenario, seed)
+    rate_hz = setup.computer.sample_rate_hz
+    return Deck(
+        setup.computer.circuit,
+        samples=scenario.samples,
+        sample_rate_hz=rate_hz,
+        edges={SOURCE: setup.excitation.edges(0, (scenario.samples - 1) * TICKS_PER_SAMPLE + 1, rate_hz)},
+        turns=_dial_changes(setup, scenario.samples),
+        title=f"scenario {scenario.name} on rig {rig.description()['name']}, seed {seed}",
+    )
+
+
+def _dial_changes(setup: SetUp, samples: int) -> list[PotTurn]:
+    """Dials after each sample at which one moves. A ramp becomes one step a sample, to the middle of its period."""
+    dials = setup.computer.dials
+    turns: list[PotTurn] = []
+    for sample, goals, ramp_n in setup.computer.plan(setup.changes, samples):
+        for k in range(min(ramp_n, samples - sample)):
+            part = (k + 0.5) / ramp_n
+            between = {pot: dials[pot] + part * (goal - dials[pot]) for pot, goal in goals.items()}
+            turns.append(PotTurn(sample + k, setup.computer.machine.resting(between)))
+        if sample + ramp_n < samples:
+            turns.append(PotTurn(sample + ramp_n, goals))
+        dials |= goals
+    return turns
