@@ -21,7 +21,7 @@ from analogrig.errors import ConfigurationError, RigError
 from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
 from analogrig.hardware.calibration.model import EmulatorModel, _late_displacement
 from analogrig.hardware.calibration.plan import check_scenario, scenarios
-from analogrig.hardware.calibration.recordings import (
+from analogrig.hardware.calibration.averages import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,

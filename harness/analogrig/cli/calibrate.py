@@ -11,7 +11,7 @@ from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progr
 
 if TYPE_CHECKING:
     from analogrig.hardware.calibration.fit import Calibration, FittedValue
-    from analogrig.hardware.calibration.recordings import SquareWaveRecording
+    from analogrig.hardware.calibration.averages import SquareWaveRecording
     from analogrig.rigs.rig import Rig
 
 MOST_LSB = 1.0
@@ -67,7 +67,7 @@ def add(commands: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError, RigError
     from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate
-    from analogrig.hardware.calibration.recordings import difference_lsb
+    from analogrig.hardware.calibration.averages import difference_lsb
     from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
     from analogrig.storage import replacing
@@ -104,7 +104,7 @@ def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[SquareWaveRecordi
     :raises RigError: the rig failed, or is not well.
     """
     from analogrig.hardware.calibration.plan import check_scenario, scenarios
-    from analogrig.hardware.calibration.recordings import record
+    from analogrig.hardware.calibration.averages import record
 
     asked, out = [*scenarios(arguments.program), check_scenario(arguments.program)], []
     show_progress = progress_line("recordings")

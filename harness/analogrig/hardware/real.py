@@ -21,7 +21,7 @@ from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
 from analogrig.hardware.plan import Planner, PlayPlan, split_records
-from analogrig.hardware.self_test.conduct import self_test
+from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant

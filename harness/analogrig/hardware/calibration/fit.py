@@ -27,7 +27,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from analogrig.errors import RigError
-from analogrig.hardware.calibration.recordings import (
+from analogrig.hardware.calibration.averages import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,
@@ -155,7 +155,7 @@ def calibrate(
 ) -> Calibration:
     """Fit the twin of the rig that made the recordings, of the kind that explains them best.
 
-    :param recordings: those of ``recordings.scenarios`` of one program.
+    :param recordings: those of ``averages.scenarios`` of one program.
     :param op_amp: type of the rig's amplifiers.
     :param stocks: candidate types of its other components; one or more.
     :param pots: candidate quantities that its pots are set by; one or both.
