@@ -18,17 +18,24 @@ from analogrig import config
 from analogrig.cli import main
 from analogrig.cli.calibrate import _said
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
-from analogrig.hardware.calibration.model import EmulatorModel, _late_displacement
-from analogrig.hardware.calibration.plan import check_scenario, scenarios
 from analogrig.hardware.calibration.averages import (
     DISPLACEMENT,
     FORCE,
     SquareWaveRecording,
     average_phases,
+    check_scenario,
     estimate_noise,
     record,
     rounding_variance,
+    scenarios,
+)
+from analogrig.hardware.calibration.fit import (
+    Calibration,
+    EmulatorModel,
+    Pots,
+    Stock,
+    _late_displacement,
+    calibrate,
 )
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig

@@ -310,9 +310,9 @@ def test_gentle_turn_of_a_hand_is_found_from_its_begin_to_its_end() -> None:
 def test_two_pots_that_jump_in_succession_are_both_found() -> None:
     """Machines of real components; the second pot jumps 5 to 120 samples after the first.
 
-    At a coverage of 95 %, more than two misses of twelve have a probability of 1 in 50, each by a few samples.
+    At a coverage of 95 %, more than two misses of eight have a probability of 1 in 170, each by a few samples.
     """
-    orders = [("B", "K", 5), ("K", "M", 40), ("B", "K", 120), ("M", "B", 60), ("M", "K", 90), ("K", "B", 20)]
+    orders = [("B", "K", 5), ("B", "K", 120), ("M", "K", 90), ("K", "B", 20)]
     miss_n = []
     for seed, (first, second, gap) in enumerate(orders):
         middle = FRONT.scaled(first, 0.75)

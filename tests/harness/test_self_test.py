@@ -101,12 +101,12 @@ def test_shipped_rigs_are_well(name: str) -> None:
         assert self_test(rig, 1).reasons == ()
 
 
-def test_twenty_machines_within_tolerance_are_well() -> None:
+def test_machines_within_tolerance_are_well() -> None:
     """Resistors of 1 %, polyester of 5 %, offsets of 3 mV. `make bench ARGS=self-test` tries hundreds."""
     rig = emulate(ComputerDescription(components="polyester"))
     found = {
         (seed, program): self_test(rig, seed, program).reasons
-        for seed in range(20)
+        for seed in range(10)
         for program in (("front",) if seed % 4 else ("front", "shock"))
     }
     assert {key: reasons for key, reasons in found.items() if reasons} == {}
@@ -272,7 +272,7 @@ def test_error_of_the_generator_is_separated_from_one_of_the_input() -> None:
 
 # --------------------------------------------------------------------------------------------- how much, how surely
 
-DRAWN = 32
+DRAWN = 20
 TAIL = 1e-3
 
 

@@ -226,8 +226,8 @@ class _Signal:
     def clipping(self) -> Check:
         share = float(self.clipped.mean())
         at_top = float((self.clipped & (self.codes > self.channel.codes / 2)).mean())
-        end = "upper" if at_top > 0.5 * share else "lower"
-        advice = f"the {self.name} leaves its range at the {end} end: choose a wider range, or check for inversion and offset"
+        end = f"at the {'upper' if at_top > 0.5 * share else 'lower'} end"
+        advice = f"the {self.name} leaves its range {end}: choose a wider range, or check for inversion and offset"
         error = math.sqrt(share * (1.0 - share) / len(self.clipped))
         return Check("clipping", self.name, share, error, 0.0, MOST_CLIPPED, "of the samples", advice)
 
@@ -420,7 +420,9 @@ class _Analysis:
 
     def _shape(self, lsb: Uncertain) -> Check:
         """Check of ``lsb``, the rms of the residual that noise does not explain."""
-        advice = "the displacement is not that of a mass, a damper and a spring: check for overload, stuck bits, program"
+        advice = (
+            "the displacement is not that of a mass, a damper and a spring: check for overload, stuck bits, program"
+        )
         most = max(MOST_SHAPE * self.displacement.swing_codes, LEAST_SHAPE_LSB)
         return Check("shape", "displacement", *lsb, 0.0, most, "LSB", advice)
 
@@ -431,7 +433,9 @@ class _Analysis:
         late_n, error_n = delay.value + lag_n, math.hypot(delay.error, self._response.instant_error_n, lag_error_n)
         late, slow = ("later", "") if late_n > 0.0 else ("earlier", ", and check the type of the amplifiers")
         by = f"{1e6 * abs(late_n) * self.sample_period_s:.2g} us"
-        advice = f"the displacement is taken {late} than the force by {by}: have the card sample both at one instant{slow}"
+        advice = (
+            f"the displacement is taken {late} than the force by {by}: have the card sample both at one instant{slow}"
+        )
         most = max(MOST_SKEW_N, MOST_SKEW_S / self.sample_period_s)
         return Check("skew", "", late_n, error_n, -most, most, "samples", advice)
 
@@ -449,7 +453,13 @@ class _Analysis:
         """Checks of mass and damping."""
         fitted = (self._response.mass_n2, self._response.damping_n)
         for name, found, nominal, most, pot, parts in zip(
-            ("mass", "damping"), fitted, self._nominal, (MOST_MASS, MOST_DAMPING), "MB", ("C1 and C2", "C2"), strict=True
+            ("mass", "damping"),
+            fitted,
+            self._nominal,
+            (MOST_MASS, MOST_DAMPING),
+            "MB",
+            ("C1 and C2", "C2"),
+            strict=True,
         ):
             off = found.value / nominal - 1.0
             advice = f"{pot} is {off:+.0%} relative to K: set the pot of {pot} again, and check {parts}"

@@ -49,7 +49,7 @@ _PLAYS: tuple[tuple[Mapping[Program, tuple[float, float, float]], tuple[float, f
         ((95.0, 2700.0, 22500.0), (1.8, 980.0, 11000.0), (2.0, 8.2, 64)),
     )
 )
-"""M (kg), B (N s/m), K (N/m) of each program, which cover the ranges of the pots; low and high level (V) and half period
+"""M (kg), B (N s/m), K (N/m) of each program, which cover the ranges of the pots; low and high level (V), half period
 (samples). No amplifier is overloaded, and the displacement stays within -1..9 V. The last play is the check."""
 
 

@@ -235,12 +235,11 @@ def _unknowns(computer: ComputerDescription) -> tuple[Unknown, ...]:
     grade = OP_AMP_GRADES.get(computer.op_amp)
     if grade is not None and grade.bandwidth:
         bandwidth, slew = (spread / math.sqrt(3.0) for spread in (grade.bandwidth, grade.slew))
-        for name in ("U1", "U2", "U3", "U4"):
-            weak.append(Unknown(f"{name} bandwidth", "", 0.02, "its bandwidth", "bandwidth", bandwidth))
-        weak.append(Unknown("U1 slew", "", 0.02, "its slew rate", "slew", slew))
+        weak += [Unknown(f"U{i} bandwidth", "", 0.02, "its bandwidth", "bandwidth", bandwidth) for i in range(1, 5)]
+        weak += [Unknown("U1 slew", "", 0.02, "its slew rate", "slew", slew)]
     if computer.pots == "dial":
-        for name in ("M track", "B track", "K track"):
-            weak.append(Unknown(name, "", 1e-3, "its track over its load", "deviation", _TRACKS_KNOWN_TO))
+        about = 1e-3, "its track over its load", "deviation", _TRACKS_KNOWN_TO
+        weak += [Unknown(f"{pot} track", "", *about) for pot in "MBK"]
     return (
         Unknown("RF", "", 1e-4, "RF R5 / (RK R5FB), over the gain of the displacement's channel", "deviation"),
         Unknown("C1", "", 1e-4, "R1 C1 RB R4 / (RFB R4FB)", "deviation"),

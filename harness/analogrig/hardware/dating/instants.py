@@ -158,7 +158,7 @@ def date_jump(
         anywhere = problem.fit(dataclasses.replace(beside.guess, half_width=_ANYWHERE))
         fit = min(fit, anywhere, key=lambda each: float(each.cost.min()))
     divisor = problem.overdispersion(beside.guess, fit.unexplained)
-    if objection := problem.objection(float(fit.cost.min()), fit, beside, divisor):
+    if objection := problem.objection(fit, beside, divisor):
         return objection
     cost = fit.cost / divisor
     best = int(cost.argmin())
@@ -189,15 +189,15 @@ def date_turn(
     problem = _Problem.of(signals, before, after, search, within)
     beside = problem.fit_beside()
     path = _Path.of(problem, beside.guess, middle)
-    every = [path.search(gentle, confidence) for gentle in ((False, True) if middle is None else (False,))]
+    shapes = (False, True) if middle is None else (False,)
+    every = [path.search(gentle=gentle, confidence=confidence) for gentle in shapes]
     every.sort(key=lambda pairs: float(pairs.cost.min()))
     best = every[0]
     at = int(best.cost.argmin())
-    fit = dataclasses.replace(
-        problem.profile(beside.guess), unexplained=float(best.fit[at]) / max(1, int(problem.signals.valid.sum()))
-    )
-    divisor = problem.overdispersion(beside.guess, max(fit.unexplained, float(best.path_misfit[at])))
-    if objection := problem.objection(float(best.cost[at]), fit, beside, divisor):
+    unexplained = float(best.fit[at]) / max(1, int(problem.signals.valid.sum()))
+    fit = dataclasses.replace(problem.profile(beside.guess), cost=best.cost, unexplained=unexplained)
+    divisor = problem.overdispersion(beside.guess, max(unexplained, float(best.path_misfit[at])))
+    if objection := problem.objection(fit, beside, divisor):
         return objection
     first, last = problem.candidates.start, problem.candidates.stop - 1
     if best.begin[at] == first or best.end[at] == last:
@@ -318,7 +318,7 @@ class _Problem:
         return f"{self.search.start} to {self.search.stop - 1}"
 
     def fit_beside(self) -> _Fit:
-        """Fit both plants to the samples beside the search range alone, with the more likely half width of the edges."""
+        """Fit to the samples beside the search range alone; edges anywhere or locked, whichever is more likely."""
         valid = self.signals.valid.copy()
         valid[self.candidates] = False
         signals, last = dataclasses.replace(self.signals, valid=valid), self.candidates.stop - 1
@@ -355,9 +355,7 @@ class _Problem:
         best = int(np.argmin(cost))
         limits = np.array([np.inf, np.inf, *[np.inf, *[_LARGEST_STEP] * len(PARAMETERS)] * 2])
         return _Fit(
-            dataclasses.replace(
-                guess, unknowns=unknowns + np.clip(steps[best], -limits, limits), sample=int(at[best])
-            ),
+            dataclasses.replace(guess, unknowns=unknowns + np.clip(steps[best], -limits, limits), sample=int(at[best])),
             np.array(cost),
             unchanged,
             float(fit[best]) / max(1, int(self.signals.valid.sum())),
@@ -392,14 +390,14 @@ class _Problem:
         ]
         return max(_LEAST_OVERDISPERSION, colour(innovations), unexplained)
 
-    def objection(self, cost: float, fit: _Fit, beside: _Fit, divisor: float) -> NoInstant | None:
-        """Reason to reject the most likely instant, which has ``cost``; None to accept it."""
+    def objection(self, fit: _Fit, beside: _Fit, divisor: float) -> NoInstant | None:
+        """Reason to reject the most likely instant; None to accept it."""
         noise_ratio = max(1.0, beside.unexplained)
         if fit.unexplained > _MOST_UNEXPLAINED * noise_ratio or noise_ratio > _MOST_NOISE_RATIO:
             return NoInstant(
                 f"the residuals of a plant that changes once have {fit.unexplained:.3g} times the noise variance"
             )
-        if fit.unchanged - cost < (_CHANCE + 2.0 * math.log(len(self.search))) * divisor:
+        if fit.unchanged - fit.cost.min() < (_CHANCE + 2.0 * math.log(len(self.search))) * divisor:
             reason = f"nothing in the samples {self.span} shows that the plant has changed"
             return NoInstant(reason, unchanged=True)
         return None
@@ -521,24 +519,24 @@ class _Path:
             problem, *problem.filters(guess), float(guess.unknowns[0]), np.column_stack([np.array(points), offsets])
         )
 
-    def search(self, gentle: bool, confidence: float) -> _Pairs:
+    def search(self, *, gentle: bool, confidence: float) -> _Pairs:
         """Evaluate ever finer grids about the most likely pair until they resolve both intervals."""
         first, last = self.problem.candidates.start, self.problem.candidates.stop - 1
         spans = [(first, last)] * 2
         for _ in range(_ZOOMS):
-            grids = [np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans]
-            pairs = self._evaluate(*grids, gentle)
+            begins, ends = (np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans)
+            pairs = self._evaluate(begins, ends, gentle=gentle)
             if all(_is_fine(each, pairs.cost, confidence) for each in (pairs.begin, pairs.end)):
                 break
             likely = pairs.cost - pairs.cost.min() <= _LIKELY
-            margins = [2 * int(np.diff(grid).max(initial=1)) for grid in grids]
+            margins = [2 * int(np.diff(grid).max(initial=1)) for grid in (begins, ends)]
             spans = [
                 (max(int(each[likely].min()) - margin, first), min(int(each[likely].max()) + margin, last))
                 for each, margin in zip((pairs.begin, pairs.end), margins, strict=True)
             ]
         return pairs
 
-    def _evaluate(self, begins: Indices, ends: Indices, gentle: bool) -> _Pairs:
+    def _evaluate(self, begins: Indices, ends: Indices, *, gentle: bool) -> _Pairs:
         """Evaluate every pair with its end after its begin, the longest first.
 
         A Kalman filter runs along the path of all pairs at once; only the pairs that last so long are updated.

@@ -136,11 +136,11 @@ class Motion:
     """Offsets of displacement and force, in rms of their noise."""
 
     @classmethod
-    def of(
-        cls, plant: Plant, edges: EdgePlace, signals: Signals, offsets: tuple[float, float] = (0.0, 0.0)
-    ) -> Self:
+    def of(cls, plant: Plant, edges: EdgePlace, signals: Signals, offsets: tuple[float, float] = (0.0, 0.0)) -> Self:
         step = _PLACE_STEP if edges.mean < 0.5 else -_PLACE_STEP
-        model, *moved = PlantModel.of([plant, *(plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS)], edges, signals)
+        model, *moved = PlantModel.of(
+            [plant, *(plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS)], edges, signals
+        )
         (later,) = PlantModel.of([plant], edges._replace(mean=edges.mean + step), signals)
         return cls(model, tuple(moved), (later.edge - model.edge) / step, signals, offsets)
 
