@@ -283,8 +283,9 @@ class EmulatorModel:
             step = covariance @ slopes.T @ residuals
             length = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
             if length <= _CONVERGED:
+                chi_square, n = float(residuals @ residuals), len(self.unknowns)
                 freedom = len(residuals) - len(x) - int(np.isinf(self.known_to).sum())
-                return _Fit(self, x, float(residuals @ residuals), freedom, covariance)
+                return _Fit(self, x, chi_square, freedom, covariance[:n, :n] * max(1.0, chi_square / freedom))
             x = x - step
             if length > _FAR:
                 slopes, covariance = self._linearise(x)
@@ -403,21 +404,15 @@ def _late_displacement(computer: SuspensionComputer, wave: Excitation, samples: 
     return np.asarray(volts[1:, CHANNELS.index("displacement")])
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
+class _Fit(NamedTuple):
     """Minimum of the squares."""
 
     model: EmulatorModel
     x: Vector
     chi_square: float
     freedom: int
-    covariance_of_all: Vector
-
-    @property
-    def covariance(self) -> Vector:
-        """Covariance of the unknowns but for the pots' settings, scaled up if noise does not explain the residuals."""
-        n = len(self.model.unknowns)
-        return self.covariance_of_all[:n, :n] * max(1.0, self.chi_square / self.freedom)
+    covariance: Vector
+    """That of the unknowns but for the pots' settings, scaled up if noise does not explain the residuals."""
 
     def estimates(self) -> list[FittedValue]:
         errors = np.sqrt(np.diag(self.covariance)).tolist()

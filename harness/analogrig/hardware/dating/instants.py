@@ -206,7 +206,7 @@ def date_turn(
     wider_n = round(_SHAPE_ERROR * int(best.end[at] - best.begin[at])) if middle is None else 0
     found = []
     for name in ("begin", "end"):
-        each = [_estimate(getattr(pairs, name), pairs.cost / divisor, confidence) for pairs in likely]
+        each = [_estimate(getattr(pairs, name), pairs.cost / divisor, confidence)[0] for pairs in likely]
         low = max(min(instant.low for instant in each) - wider_n, first)
         high = min(max(instant.high for instant in each) + wider_n, last)
         found.append(Instant(*(sample + search.start - first for sample in (each[0].sample, low, high))))
@@ -467,25 +467,17 @@ class _Pairs:
     """Mean square of those between the two instants."""
 
 
-def _marginal(instants: Indices, cost: Array) -> tuple[Indices, Array, int]:
-    """Distinct instants, the marginal cost of each over all its pairs, and the largest distance of neighbours."""
+def _estimate(instants: Indices, cost: Array, confidence: float) -> tuple[Instant, bool]:
+    """Best instant of a grid, by the marginal likelihood over all pairs; True if the grid resolves its interval.
+
+    The interval extends to the next instants of the grid that are rejected.
+    """
     once, at = np.unique(instants, return_inverse=True)
     likelihood = np.bincount(at, np.exp(-0.5 * (cost - cost.min())))
-    return once, -2.0 * np.log(np.maximum(likelihood, np.finfo(np.float64).tiny)), int(np.diff(once).max(initial=1))
-
-
-def _is_fine(instants: Indices, cost: Array, confidence: float) -> bool:
-    """True if the grid of ``instants`` resolves their interval."""
-    once, marginal, step = _marginal(instants, cost)
-    found = interval(marginal, once, confidence)
-    return step == 1 or int(((once >= found.low) & (once <= found.high)).sum()) >= _FINE_N
-
-
-def _estimate(instants: Indices, cost: Array, confidence: float) -> Instant:
-    """Best instant; the interval extends to the next instants of the grid that are rejected."""
-    once, marginal, step = _marginal(instants, cost)
-    found = interval(marginal, once, confidence)
-    return Instant(int(instants[cost.argmin()]), found.low - step + 1, found.high + step - 1)
+    marginal = -2.0 * np.log(np.maximum(likelihood, np.finfo(np.float64).tiny))
+    found, step = interval(marginal, once, confidence), int(np.diff(once).max(initial=1))
+    is_fine = step == 1 or int(((once >= found.low) & (once <= found.high)).sum()) >= _FINE_N
+    return Instant(int(instants[cost.argmin()]), found.low - step + 1, found.high + step - 1), is_fine
 
 
 @dataclass(frozen=True, eq=False)
@@ -526,7 +518,7 @@ class _Path:
         for _ in range(_ZOOMS):
             begins, ends = (np.unique(np.linspace(*span, _GRID_N).round().astype(np.int64)) for span in spans)
             pairs = self._evaluate(begins, ends, gentle=gentle)
-            if all(_is_fine(each, pairs.cost, confidence) for each in (pairs.begin, pairs.end)):
+            if all(_estimate(each, pairs.cost, confidence)[1] for each in (pairs.begin, pairs.end)):
                 break
             likely = pairs.cost - pairs.cost.min() <= _LIKELY
             margins = [2 * int(np.diff(grid).max(initial=1)) for grid in (begins, ends)]
