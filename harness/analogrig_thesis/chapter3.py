@@ -136,6 +136,11 @@ def _measure_convergence(facts: Facts, clean: Mapping[str, Track], first: Track,
         },
     }
 
+def _measure_filters(u: Signal, noise: Signal) -> dict[str, Facts]:
+    """Values behind the claims about the wind-up of P and the Kalman filter, by identifier."""
+    silent, config = u.copy(), SCHEMES["forgetting"]
+    silent[SILENT] = 0.0
+    errors = Samples(silent, respond(silent, STEADY, noise)).track(config).theta / STEADY - 1.0
     p = PlainEstimator(config).run(silent, respond(silent, STEADY))[1][:, 0]
     late = errors[300:600]
     samples = Samples(u, respond(u, STEADY, noise))

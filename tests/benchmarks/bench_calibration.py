@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from scipy.stats import chi2
 
+from analogrig.hardware.calibration.averages import check_scenario
 from analogrig.hardware.calibration.fit import POTS, Calibration
-from analogrig.hardware.calibration.plan import check_scenario
 from tests.harness.calibration_rigs import DrawnRig, calibrate_rig, draw_rig, rms_lsb, thesis_profile, truth
 
 from .figure import Figure

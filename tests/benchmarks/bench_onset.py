@@ -18,8 +18,7 @@ from typing import TypeVar
 import numpy as np
 
 from analogrig.hardware.by_hand import PlannedChange, contradictions
-from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
-from analogrig.hardware.dating.turn import TurnInstants
+from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump
 from analogrig.judging.statistics import lower_rate
 from analogrig.rigs.rig import Rig
 from tests.harness.allowed import open_allowed

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analogrig.hardware.self_test.conduct import self_test
+from analogrig.hardware.self_test import self_test
 from analogrig.judging.statistics import upper_rate
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.run import CHANNELS

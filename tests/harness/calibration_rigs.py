@@ -18,9 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate
-from analogrig.hardware.calibration.plan import Program, scenarios
-from analogrig.hardware.calibration.recordings import DISPLACEMENT, noise_free_lsb, record
+from analogrig.hardware.calibration.averages import DISPLACEMENT, Program, record, scenarios
+from analogrig.hardware.calibration.fit import Calibration, Pots, Stock, calibrate, noise_free_lsb
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, EmulatorDescription, EmulatorRig
 from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import PROGRAMS, Capacitor, Components, OpAmp, Pot, Resistor, SuspensionComputer

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.hardware.by_hand import PlannedChange
-from analogrig.hardware.dating.jump import Instant, NoInstant, date_jump
-from analogrig.hardware.dating.turn import TurnInstants, date_turn
+from analogrig.hardware.dating.instants import Instant, NoInstant, TurnInstants, date_jump, date_turn
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.judging import information
 from analogrig.plant import PARAMETERS, Plant, SampledPlant

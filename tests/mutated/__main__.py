@@ -26,7 +26,7 @@ from tests.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running, beg
 _LOADED = (
     *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.summary"),
     *("analogrig.campaigns.conduct", "analogrig.campaigns.report", "analogrig.rigs.description"),
-    *("analogrig.hardware.self_test.conduct", "analogrig.recordings", "analogrig.links.python_can"),
+    *("analogrig.hardware.self_test", "analogrig.recordings", "analogrig.links.python_can"),
     *("cantools", "asammdf"),
 )
 """Loaded once, before the cases are forked."""

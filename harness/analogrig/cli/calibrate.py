@@ -10,9 +10,7 @@ from analogrig.cli.options import add_command, add_json, add_rig, add_seed, file
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, progress_line, show, show_result
 
 if TYPE_CHECKING:
-    from analogrig.hardware.calibration.fit import Calibration, FittedValue
-    from analogrig.hardware.calibration.recordings import SquareWaveRecording
-    from analogrig.rigs.rig import Rig
+    from analogrig.hardware.calibration.fit import Calibration
 
 MOST_LSB = 1.0
 """Largest rms difference between rig and twin, on data that the fit has not seen."""
@@ -66,8 +64,8 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import ConfigurationError, RigError
-    from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate
-    from analogrig.hardware.calibration.recordings import difference_lsb
+    from analogrig.hardware.calibration.averages import check_scenario, record, scenarios
+    from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate, difference_lsb
     from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
     from analogrig.storage import replacing
@@ -75,9 +73,14 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
     move_aside(arguments.out, files_read(arguments))
+    plays, recordings = [*scenarios(arguments.program), check_scenario(arguments.program)], []
+    show_progress = progress_line("recordings")
     try:
         with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
-            recordings = _recorded(rig, arguments)
+            for play in plays:
+                recordings.append(record(rig, play, arguments.seed))
+                if show_progress is not None:
+                    show_progress(len(recordings), len(plays))
         found = calibrate(
             recordings[:-1],
             op_amp=arguments.op_amp,
@@ -88,54 +91,46 @@ def _run(arguments: argparse.Namespace) -> int:
         check_lsb = difference_lsb(recordings[-1], found.twin, found.estimate("displacement noise").value)
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
-    if check_lsb <= MOST_LSB:
+    is_twin = check_lsb <= MOST_LSB
+    if is_twin:
         with replacing(arguments.out) as file:
             file.write(_toml(found, arguments, check_lsb).encode("utf-8"))
     if arguments.json:
         show_result(_as_json(found, check_lsb, arguments), arguments)
     else:
-        show(_table(found, check_lsb, arguments))
-    return PASSED if check_lsb <= MOST_LSB else FAILED
+        heading = f"{'':20} {'fitted':>10}    {'std error':>9}       stands for"
+        kept = f"kept as {arguments.out}" if is_twin else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
+        show("\n".join([heading, *_values(found), "", *_said(found, check_lsb), kept]))
+    return PASSED if is_twin else FAILED
 
 
-def _recorded(rig: Rig, arguments: argparse.Namespace) -> list[SquareWaveRecording]:
-    """Recordings to fit, and one more on which rig and twin are compared.
-
-    :raises RigError: the rig failed, or is not well.
-    """
-    from analogrig.hardware.calibration.plan import check_scenario, scenarios
-    from analogrig.hardware.calibration.recordings import record
-
-    asked, out = [*scenarios(arguments.program), check_scenario(arguments.program)], []
-    show_progress = progress_line("recordings")
-    for each in asked:
-        out.append(record(rig, each, arguments.seed))
-        if show_progress is not None:
-            show_progress(len(out), len(asked))
-    return out
-
-
-def _table(found: Calibration, check_lsb: float, arguments: argparse.Namespace) -> str:
-    kept = f"kept as {arguments.out}" if check_lsb <= MOST_LSB else f"no twin: more than {MOST_LSB:g} LSB; nothing kept"
-    lines = [f"{'':20} {'fitted':>10}    {'std error':>9}       stands for"]
-    lines += [f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates]
-    return "\n".join([*lines, "", *_said(found, check_lsb), kept])
-
-
-def _value(estimate: FittedValue) -> str:
-    factor, unit = _SHOWN_AS[estimate.unit]
-    return f"{factor * estimate.value:10.4f} +- {factor * estimate.standard_error:9.4f} {unit:3}"
+def _values(found: Calibration) -> list[str]:
+    """One line for each value."""
+    lines = []
+    for each in found.estimates:
+        factor, unit = _SHOWN_AS[each.unit]
+        value = f"{factor * each.value:10.4f} +- {factor * each.standard_error:9.4f} {unit:3}"
+        lines.append(f"{each.name:20} {value}   {each.stands_for}")
+    return lines
 
 
 def _said(found: Calibration, check_lsb: float) -> list[str]:
     """Quality and limits of a calibration, one line each."""
+    from analogrig.hardware.calibration.fit import LEAST_GAIN_OF_DIALS
+
     computer = found.twin.computer
     others = [
         f"{stock}, by {pots} {chi_square - found.chi_square:+.0f}"
         for (stock, pots), chi_square in found.chi_squares.items()
         if (stock, pots) != (computer.components, computer.pots)
     ]
-    lines = [f"kept: {computer.components} capacitors, pots set by {computer.pots}: {_why_kept(found)}"]
+    why = (
+        "of those tried the least chi-square"
+        if found.is_least
+        else "the least chi-square but for dials, which have three unknowns more and gain less than"
+        f" {LEAST_GAIN_OF_DIALS:g} times what is left per degree of freedom"
+    )
+    lines = [f"kept: {computer.components} capacitors, pots set by {computer.pots}: {why}"]
     lines += [f"chi-square of others: {'; '.join(others)}"] if others else []
     lines += [f"hardly told apart: {a} and {b} (correlation {c:+.2f})" for a, b, c in found.alike]
     lines += [f"known no better than by the datasheet: {', '.join(found.unseen)}"] if found.unseen else []
@@ -145,17 +140,6 @@ def _said(found: Calibration, check_lsb: float) -> list[str]:
         *_caveats(found),
         f"on a scenario that was not fitted: within {check_lsb:.2f} LSB rms",
     ]
-
-
-def _why_kept(found: Calibration) -> str:
-    from analogrig.hardware.calibration.fit import LEAST_GAIN_OF_DIALS
-
-    if found.is_least:
-        return "of those tried the least chi-square"
-    return (
-        "the least chi-square but for dials, which have three unknowns more and gain less than"
-        f" {LEAST_GAIN_OF_DIALS:g} times what is left per degree of freedom"
-    )
 
 
 def _caveats(found: Calibration) -> list[str]:
@@ -180,7 +164,7 @@ def _toml(found: Calibration, arguments: argparse.Namespace, check_lsb: float) -
     heading = [
         f"Twin of the rig {arguments.rig!r}, program {arguments.program}: the emulator as fitted by calibrate.",
         "A value stands for all that acts as it does; the parts that are not named are as in the diagram.",
-        *(f"{each.name:20} {_value(each)}   {each.stands_for}" for each in found.estimates),
+        *_values(found),
         *_said(found, check_lsb),
         *(f"{name}: {' '.join(value.split())}" for name, value in made_by),
     ]

@@ -10,7 +10,7 @@ from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trus
 from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
 
 if TYPE_CHECKING:
-    from analogrig.hardware.self_test.checks import Check, Findings
+    from analogrig.hardware.self_test import Check, Findings
 
 
 def add(commands: Any) -> None:
@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     from analogrig.errors import RigError
-    from analogrig.hardware.self_test.conduct import self_test
+    from analogrig.hardware.self_test import self_test
     from analogrig.rigs.description import open_rig
 
     with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:

@@ -7,8 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from analogrig.hardware.dating.jump import NoInstant, date_jump
-from analogrig.hardware.dating.turn import TurnInstants, date_turn
+from analogrig.hardware.dating.instants import NoInstant, TurnInstants, date_jump, date_turn
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import Clock

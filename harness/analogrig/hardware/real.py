@@ -22,7 +22,7 @@ from analogrig.hardware.by_hand import HandChanges, PlannedChange, contradiction
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, Pots, find_driver
 from analogrig.hardware.lock import lock_instrument
-from analogrig.hardware.self_test.conduct import self_test
+from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
 from analogrig.plant import Plant

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,12 @@ class FalseAlarms:
     least: float
     most: float
 
+    @classmethod
+    def of(cls, rows: Sequence[Row], confidence: float) -> Self:
+        """Sum over plays."""
+        alarms, samples = (sum(each[name] for each in rows) for name in ("false_alarms", "samples"))
+        return cls(alarms, samples, *rate_interval(alarms, samples, confidence))
+
 
 @dataclass(frozen=True)
 class RigComparison:
@@ -160,7 +167,7 @@ def compare_rigs(
         invalid=tuple(invalid),
         signals=tuple(signal_difference(runs, name, confidence) for name in MEASURED),
         latency=_latency(rows_a, rows_b, confidence),
-        false_alarms=(_false_alarms(rows_a, confidence), _false_alarms(rows_b, confidence)),
+        false_alarms=(FalseAlarms.of(rows_a, confidence), FalseAlarms.of(rows_b, confidence)),
         verdicts=compare(keyed_a, keyed_b, alpha=round(1.0 - confidence, 12)),
     )
 
@@ -266,8 +273,3 @@ def _latency(a: Sequence[Row], b: Sequence[Row], confidence: float) -> LatencyDi
         within_n=max(abs(least), abs(most), upper_rate(unequal, len(latencies), confidence)),
         quantiles_n=(tuple(map(float, quantiles[0])), tuple(map(float, quantiles[1]))),
     )
-
-
-def _false_alarms(rows: Sequence[Row], confidence: float) -> FalseAlarms:
-    alarms, samples = (sum(each[what] for each in rows) for what in ("false_alarms", "samples"))
-    return FalseAlarms(alarms, samples, *rate_interval(alarms, samples, confidence))

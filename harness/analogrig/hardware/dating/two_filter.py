@@ -1,7 +1,7 @@
 """Likelihood of a plant change at every sample, by two filters (Fraser and Potter 1969).
 
 A Kalman filter with the plant before the change runs forwards; an information filter with the plant after it runs
-backwards. At each instant both are join by the state (displacement and velocity), which is continuous at a change.
+backwards. At each instant both are joined by the state (displacement and velocity), which is continuous at a change.
 
 Unknowns enter linearly, about their best values so far, as columns that the filters carry. Both plants share the offset
 of the displacement and the place of the edges; each has its own offset of the force and logarithms of M, B, K. The
@@ -11,15 +11,15 @@ sampled force does not show where between two samples an edge lies: the deviatio
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import PARAMETERS, Plant, SampledPlant
+from analogrig.plant import PARAMETERS, Plant, discretise
 from analogrig.run import CHANNELS, MEASURED, Channel, missing_samples
 
 Array = NDArray[np.float64]
@@ -29,11 +29,11 @@ COMMON, OWN = 2, 4
 
 _EDGE = 30.0
 """Smallest step of the force that counts as an edge, in rms of its noise."""
-_DIFFUSE = 1e6
+DIFFUSE = 1e6
 """Variance of the state at the first sample, in units of the noise variance."""
 _NEGLIGIBLE = 1e-14
-_STEP = 1e-4
-"""Step in a logarithm of M, B or K for its derivative; a place in a sample period moves by a hundred times that."""
+_STEP, _PLACE_STEP = 1e-4, 1e-2
+"""Steps of the difference quotients: in a logarithm of M, B or K, and in the place of the edges."""
 _PLACES = (np.arange(8) + 0.5) / 4.0 - 1.0
 """Middles of eight parts of the range -1..1."""
 
@@ -81,20 +81,16 @@ class Signals:
         return np.where(np.abs(steps) < _EDGE * self.noise_n, 0.0, steps)
 
 
-@dataclass(frozen=True)
-class EdgePlace:
+class EdgePlace(NamedTuple):
     """Place of the force's edges in a sample period (0..1): uniform within ``half_width`` of ``mean``."""
 
     mean: float
     half_width: float
 
 
-ANYWHERE = EdgePlace(0.5, 0.5)
-
-
 @dataclass(frozen=True, eq=False)
 class PlantModel:
-    """Motion of one plant over one sample period, with derivatives by the logarithms of M, B, K (first axis).
+    """Motion of a plant over one sample period; or of p plants, with one more axis at the front of each array.
 
     State: displacement in rms of its noise, velocity in that per sample.
     """
@@ -103,81 +99,80 @@ class PlantModel:
     response: Array  # (2,) per newton of held force
     edge: Array  # (2,) per newton of an edge, mean over its places
     edge_covariance: Array  # (2, 2) of the same
-    edge_by_place: Array  # (2,)
-    transition_by: Array  # (3, 2, 2)
-    response_by: Array  # (3, 2)
-    edge_by: Array  # (3, 2)
 
     @classmethod
-    def of(cls, plant: Plant, edges: EdgePlace, signals: Signals) -> Self:
-        """Model for the period and the noise of ``signals``."""
-        transition, response = _discretise(plant, 1.0, signals)
-        places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0)
-        late = np.array([_discretise(plant, 1.0 - place, signals)[1] for place in places.tolist()])
-        near = np.clip([edges.mean - 100.0 * _STEP, edges.mean + 100.0 * _STEP], 0.0, 1.0)
-        ends = [_discretise(plant, 1.0 - place, signals)[1] for place in near.tolist()]
-        moved = [plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS]
-        sampled = [_discretise(each, 1.0, signals) for each in moved]
-        middle = _discretise(plant, 1.0 - edges.mean, signals)[1]
-        return cls(
-            transition=transition,
-            response=response,
-            edge=late.mean(axis=0),
-            edge_covariance=np.cov(late.T, bias=True),
-            edge_by_place=(ends[1] - ends[0]) / (near[1] - near[0]),
-            transition_by=np.array([each[0] - transition for each in sampled]) / _STEP,
-            response_by=np.array([each[1] - response for each in sampled]) / _STEP,
-            edge_by=np.array([_discretise(each, 1.0 - edges.mean, signals)[1] - middle for each in moved]) / _STEP,
-        )
+    def of(cls, plants: Sequence[Plant], edges: EdgePlace, signals: Signals) -> list[Self]:
+        """Models for the period and the noise of ``signals``."""
+        parameters = np.array([tuple(plant.parameters().values()) for plant in plants])
+        period_s, noise_m = signals.period_s, signals.noise_m
+        units = np.array([[1.0, 1.0 / period_s, 1.0 / noise_m], [period_s, 1.0, period_s / noise_m]])
+        places = np.clip(edges.mean + edges.half_width * _PLACES, 0.0, 1.0).tolist()
+        whole, *late = (units * discretise(parameters, part * period_s) for part in (1.0, *(1.0 - at for at in places)))
+        edge = np.array(late)[:, :, :, 2]
+        off = edge - edge.mean(axis=0)
+        covariance = np.einsum("pmi,pmj->mij", off, off) / len(places)
+        return list(map(cls, whole[:, :, :2], whole[:, :, 2], edge.mean(axis=0), covariance))
 
-    def inputs(self, signals: Signals, offset: float) -> Array:
-        """(n, 2) effect of the force on the state in the period after each sample.
+    def inputs(self, force_n: Array, edges_n: Array) -> Array:
+        """(n, 2) effect of the force and of its edges, both (n,), on the state in the period after each sample."""
+        return np.asarray(self.response * force_n[:, None] + self.edge * edges_n[:, None])
 
-        :param offset: offset of the force, in rms of its noise.
-        """
-        force = (signals.force_n + offset * signals.noise_n)[:, None]
-        return np.asarray(self.response * force + self.edge * signals.edges_n[:, None])
-
-    def disturbances(self, signals: Signals) -> Array:
+    def disturbances(self, noise_n: float, edges_n: Array) -> Array:
         """(n, 2, 2) covariance of the error of ``inputs``."""
-        noise = signals.noise_n**2 * np.outer(self.response, self.response)
-        return np.asarray(noise + signals.edges_n[:, None, None] ** 2 * self.edge_covariance)
+        noise = noise_n**2 * self.response[..., :, None] * self.response[..., None, :]
+        return np.asarray(noise + edges_n[:, None, None] ** 2 * self.edge_covariance)
 
 
-def _discretise(plant: Plant, part: float, signals: Signals) -> tuple[Array, Array]:
-    """Transition (2, 2) and response (2,) over ``part`` (0..1) of a sample period."""
-    if part <= 0.0:
-        return np.eye(2), np.zeros(2)
-    period_s = signals.period_s
-    sampled = SampledPlant.from_plant(plant, part * period_s)
-    (xx, xv, vx, vv), (xf, vf) = sampled.transition, sampled.response
-    transition = np.array([[xx, xv / period_s], [vx * period_s, vv]])
-    return transition, np.array([xf, vf * period_s]) / signals.noise_m
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One plant on the force of a record, with its derivatives by the unknowns."""
 
+    model: PlantModel
+    moved: tuple[PlantModel, ...]
+    """Models with log M, B, K raised by one step each."""
+    edge_by_place: Array  # (2,)
+    signals: Signals
+    offsets: tuple[float, float]
+    """Offsets of displacement and force, in rms of their noise."""
 
-Offsets = tuple[float, float]
-"""Offsets of displacement and force, in rms of their noise."""
+    @classmethod
+    def of(cls, plant: Plant, edges: EdgePlace, signals: Signals, offsets: tuple[float, float] = (0.0, 0.0)) -> Self:
+        step = _PLACE_STEP if edges.mean < 0.5 else -_PLACE_STEP
+        model, *moved = PlantModel.of(
+            [plant, *(plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS)], edges, signals
+        )
+        (later,) = PlantModel.of([plant], edges._replace(mean=edges.mean + step), signals)
+        return cls(model, tuple(moved), (later.edge - model.edge) / step, signals, offsets)
 
+    @functools.cached_property
+    def force_n(self) -> Array:
+        return self.signals.force_n + self.offsets[1] * self.signals.noise_n
 
-def _columns(model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> tuple[Array, Array]:
-    """Inputs (n, 2, c) of the state after each sample, and measurements (n, c), about a course of the state (n, 2).
+    @functools.cached_property
+    def disturbances(self) -> Array:
+        return self.model.disturbances(self.signals.noise_n, self.signals.edges_n)
 
-    The first of the c columns is known; the others are per unit of an unknown.
-    """
-    n = len(signals)
-    force = (signals.force_n + offsets[1] * signals.noise_n)[:, None]
-    edges = signals.edges_n[:, None]
-    inputs = np.zeros((n, 2, 1 + COMMON + OWN))
-    inputs[:, :, 0] = model.inputs(signals, offsets[1])
-    inputs[:, :, 2] = model.edge_by_place * edges
-    inputs[:, :, 3] = model.response * signals.noise_n
-    for i in range(len(PARAMETERS)):
-        own = course @ model.transition_by[i].T + model.response_by[i] * force
-        inputs[:, :, 4 + i] = own + model.edge_by[i] * edges
-    measured = np.zeros((n, 1 + COMMON + OWN))
-    measured[:, 0] = signals.displacement_m / signals.noise_m - offsets[0]
-    measured[:, 1] = -1.0
-    return inputs, measured
+    @property
+    def measured(self) -> Array:
+        """(n, c) displacement in rms of its noise, in columns."""
+        measured = np.zeros((len(self.signals), 1 + COMMON + OWN))
+        measured[:, 0] = self.signals.displacement_m / self.signals.noise_m - self.offsets[0]
+        measured[:, 1] = -1.0
+        return measured
+
+    @functools.cached_property
+    def known(self) -> Array:
+        """(n, 2) effect of the force on the state in the period after each sample."""
+        return self.model.inputs(self.force_n, self.signals.edges_n)
+
+    def inputs(self, course: Array) -> Array:
+        """(n, 2, c) ``known`` and its derivatives, in columns, about a course of the state (n, 2)."""
+        force_n, edges_n, known = self.force_n, self.signals.edges_n, self.known
+        following = course @ self.model.transition.T + known
+        own = [(course @ each.transition.T + each.inputs(force_n, edges_n) - following) / _STEP for each in self.moved]
+        held = np.tile(self.model.response * self.signals.noise_n, (len(force_n), 1))
+        columns = [known, np.zeros_like(known), self.edge_by_place * edges_n[:, None], held, *own]
+        return np.stack(columns, axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,21 +189,21 @@ class ForwardFilter:
     """(n, c): in standard deviations; 0 where the sample is not valid."""
 
     @classmethod
-    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> Self:
-        """Run a Kalman filter with a diffuse initial state; ``course`` and ``offsets`` as for ``_columns``."""
-        inputs, measured = _columns(model, signals, course, offsets)
-        weight = signals.valid.astype(np.float64)
-        gain, size, covariance = _gains(model, weight, model.disturbances(signals))
-        kept = np.tile(np.eye(2), (len(signals), 1, 1))
+    def of(cls, motion: Motion, course: Array) -> Self:
+        """Run a Kalman filter with a diffuse initial state; ``course`` as for ``Motion.inputs``."""
+        weight, transition = motion.signals.valid.astype(np.float64), motion.model.transition
+        predicted = _riccati(DIFFUSE * np.eye(2), transition, _information_of(weight), motion.disturbances)
+        size = weight * predicted[:, 0, 0] + 1.0
+        gain = predicted[:, :, 0] * (weight / size)[:, None]
+        kept = np.tile(np.eye(2), (len(weight), 1, 1))
         kept[:, :, 0] -= gain
-        entering = _zero_first(inputs[:-1])
-        corrected = gain[:, :, None] * measured[:, None, :]
-        state = scan(kept @ model.transition, kept @ entering + corrected)
-        predicted = _zero_first(model.transition @ state[:-1]) + entering
-        innovation = measured - predicted[:, 0, :]
-        innovation *= np.sqrt(weight / size)[:, None]
+        measured, inputs = motion.measured, motion.inputs(course)
+        entering = np.concatenate([np.zeros_like(inputs[:1]), inputs[:-1]])
+        state = scan(kept @ transition, kept @ entering + gain[:, :, None] * measured[:, None, :])
+        entering[1:] += transition @ state[:-1]
+        innovation = (measured - entering[:, 0, :]) * np.sqrt(weight / size)[:, None]
         misfit = np.cumsum(innovation[:, :, None] * innovation[:, None, :], axis=0)
-        return cls(state, covariance, misfit, np.cumsum(np.log(size)), innovation)
+        return cls(state, kept @ predicted, misfit, np.cumsum(np.log(size)), innovation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,31 +216,26 @@ class BackwardFilter:
     log: Array  # (n,)
 
     @classmethod
-    def of(cls, model: PlantModel, signals: Signals, course: Array, offsets: Offsets) -> Self:
+    def of(cls, motion: Motion, course: Array) -> Self:
         """Run an information filter from zero information after the last sample; parameters as for ForwardFilter."""
-        inputs, measured = _columns(model, signals, course, offsets)
-        weight = signals.valid.astype(np.float64)
-        disturbances = model.disturbances(signals)[:-1]
-        known = _information(model, weight, disturbances)
+        weight, transition = motion.signals.valid.astype(np.float64), motion.model.transition
+        disturbances, inputs, measured = motion.disturbances[:-1], motion.inputs(course)[:-1], motion.measured[1:]
+        measurements = _information_of(weight)[::-1]
+        known = _riccati(measurements[0], transition.T, disturbances[::-1], measurements[1:])[::-1]
         inner = np.eye(2) + known @ disturbances
         softened = disturbances @ np.linalg.inv(inner)
-        back = model.transition.T @ (np.eye(2) - known @ softened)
-        inputs, measured = inputs[:-1], measured[1:]
+        back = transition.T @ (np.eye(2) - known @ softened)
         pushed = known @ inputs
         own = np.zeros_like(pushed)
         own[:, 0, :] = weight[1:, None] * measured
-        vector = scan(back[::-1], (back @ (own - pushed))[::-1])[::-1]
-        whole = _zero_last(vector[1:]) + own
+        vector = np.concatenate([scan(back[::-1], (back @ (own - pushed))[::-1])[::-1], np.zeros_like(own[:1])])
+        whole = vector[1:] + own
         cross = _transpose(whole) @ inputs
         left = whole - pushed
         squares = weight[1:, None, None] * measured[:, :, None] * measured[:, None, :]
         squares += _transpose(inputs) @ pushed - cross - _transpose(cross) - _transpose(left) @ softened @ left
-        return cls(
-            _zero_last(vector),
-            _zero_last(back @ known @ model.transition),
-            _zero_last(np.cumsum(squares[::-1], axis=0)[::-1]),
-            _zero_last(np.cumsum(np.log(np.linalg.det(inner))[::-1])[::-1]),
-        )
+        information = np.concatenate([back @ known @ transition, np.zeros((1, 2, 2))])
+        return cls(vector, information, _sum_later(squares), _sum_later(np.log(np.linalg.det(inner))))
 
 
 def join(state: Array, covariance: Array, vector: Array, information: Array) -> tuple[Array, Array]:
@@ -274,56 +264,40 @@ def scan(factors: Array, terms: Array) -> Array:
     return sums
 
 
-def _gains(model: PlantModel, weight: Array, disturbances: Array) -> tuple[Array, Array, Array]:
-    """Kalman gain (n, 2), innovation variance (n,) and updated covariance (n, 2, 2) at each sample.
+def _riccati(first: Array, transition: Array, lost: Array, gained: Array) -> Array:
+    """Solve S(k+1) = A (S(k)^-1 + lost(k))^-1 A' + gained(k); all but A are (n, 2, 2) and symmetric.
 
     Plain floats: numpy takes ten times as long for a 2 x 2 product.
     """
-    (a, b), (c, d) = model.transition.tolist()
-    p, q, r = _DIFFUSE, 0.0, _DIFFUSE
-    rows = []
-    for w, (pp, pq, _, qq) in zip(weight.tolist(), disturbances.reshape(-1, 4).tolist(), strict=True):
-        size = w * p + 1.0
-        x, v = w * p / size, w * q / size
-        p, q, r = p - x * p, q - x * q, r - v * q
-        rows.append((x, v, size, p, q, q, r))
-        p, q, r = (
-            a * a * p + 2.0 * a * b * q + b * b * r + pp,
-            a * c * p + (a * d + b * c) * q + b * d * r + pq,
-            c * c * p + 2.0 * c * d * q + d * d * r + qq,
-        )
-    steps = np.array(rows)
-    return steps[:, :2], steps[:, 2], steps[:, 3:].reshape(-1, 2, 2)
-
-
-def _information(model: PlantModel, weight: Array, disturbances: Array) -> Array:
-    """(n - 1, 2, 2) information on the state at each sample but the first, from that sample on."""
-    (a, b), (c, d) = model.transition.tolist()
-    p = q = r = 0.0
-    rows = []
-    for w, (pp, pq, _, qq) in zip(weight[:0:-1].tolist(), disturbances[::-1].reshape(-1, 4).tolist(), strict=True):
-        p += w
-        rows.append((p, q, q, r))
-        # (information^-1 + disturbance)^-1 = (information + det(information) adj(disturbance)) / determinant
+    (a, b), (c, d) = transition.tolist()
+    p, q, _, r = first.ravel().tolist()
+    out = []
+    for (pp, pq, _, qq), (dp, dq, _, dr) in zip(
+        lost.reshape(-1, 4).tolist(), gained.reshape(-1, 4).tolist(), strict=True
+    ):
+        out.append((p, q, q, r))
+        # (S^-1 + lost)^-1 = (S + det(S) adj(lost)) / det(1 + S lost)
         det = p * r - q * q
         whole = 1.0 + p * pp + 2.0 * q * pq + r * qq + det * (pp * qq - pq * pq)
         p, q, r = (p + det * qq) / whole, (q - det * pq) / whole, (r + det * pp) / whole
         p, q, r = (
-            a * a * p + 2.0 * a * c * q + c * c * r,
-            a * b * p + (a * d + b * c) * q + c * d * r,
-            b * b * p + 2.0 * b * d * q + d * d * r,
+            a * a * p + 2.0 * a * b * q + b * b * r + dp,
+            a * c * p + (a * d + b * c) * q + b * d * r + dq,
+            c * c * p + 2.0 * c * d * q + d * d * r + dr,
         )
-    return np.array(rows[::-1]).reshape(-1, 2, 2)
+    return np.array(out).reshape(-1, 2, 2)
+
+
+def _information_of(weight: Array) -> Array:
+    """(n, 2, 2) information of measurements of the displacement in units of its noise."""
+    return weight[:, None, None] * np.diag([1.0, 0.0])
+
+
+def _sum_later(terms: Array) -> Array:
+    """Sums of ``terms`` (n - 1, ...) from each sample on, and 0 for the last sample (n, ...)."""
+    return np.concatenate([np.cumsum(terms[::-1], axis=0)[::-1], np.zeros_like(terms[:1])])
 
 
 def _transpose(matrices: Array) -> Array:
     """Transpose each of the matrices (m, r, c)."""
     return np.swapaxes(matrices, 1, 2)
-
-
-def _zero_first(rows: Array) -> Array:
-    return np.concatenate([np.zeros_like(rows[:1]), rows])
-
-
-def _zero_last(rows: Array) -> Array:
-    return np.concatenate([rows, np.zeros_like(rows[:1])])

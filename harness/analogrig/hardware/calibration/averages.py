@@ -1,32 +1,72 @@
-"""Recordings of square waves on a rig, their averages phase by phase, their noise, and their distance from a twin."""
+"""Recordings of square waves on a rig, each with its own pots, levels and frequency; their averages and their noise."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigError
-from analogrig.hardware.calibration.plan import RATE_HZ
-from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.run import CHANNELS, MEASURED, Channel
-from analogrig.scenario import Scenario
-from analogrig_emulator import Sampler
+from analogrig.scenario import PlantChoice, Scenario
+from analogrig_emulator import Excitation
 
 Vector = NDArray[np.float64]
+Program = Literal["front", "shock"]
 
+SAMPLES = 1400
 SETTLING_N = 400
 """Samples left out at the start of each recording: the state before it is unknown."""
+
+RATE_HZ = 20e3
+"""Sample rate of the card. The periods below are whole numbers of its samples."""
 
 FORCE, DISPLACEMENT = range(2)
 """Columns of a recording, as in MEASURED."""
 
 _COLUMNS = [CHANNELS.index(name) for name in MEASURED]
+
+_PLAYS: tuple[tuple[Mapping[Program, tuple[float, float, float]], tuple[float, float, int]], ...] = tuple(
+    ({"front": front, "shock": shock}, wave)
+    for front, shock, wave in (
+        ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.1, 9.9, 50)),
+        ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.6, 9.5, 10)),
+        ((115.0, 3021.0, 18000.0), (2.0, 900.0, 9000.0), (0.2, 8.0, 25)),
+        ((115.0, 2123.0, 20000.0), (2.0, 632.0, 10000.0), (1.0, 9.0, 20)),
+        ((60.0, 3021.0, 24500.0), (1.6, 900.0, 12250.0), (0.3, 9.7, 8)),
+        ((60.0, 4000.0, 28000.0), (1.6, 1200.0, 14000.0), (0.4, 9.2, 16)),
+        ((35.0, 2600.0, 19000.0), (2.6, 780.0, 9500.0), (0.7, 7.5, 20)),
+        ((230.0, 4200.0, 15000.0), (5.5, 1250.0, 7500.0), (0.5, 6.0, 32)),
+        ((160.0, 1600.0, 28000.0), (3.5, 600.0, 14000.0), (3.0, 9.0, 40)),
+        ((31.0, 2500.0, 26500.0), (1.55, 750.0, 13250.0), (0.8, 8.8, 5)),
+        ((80.0, 3600.0, 21500.0), (2.3, 1070.0, 10750.0), (0.1, 8.5, 10)),
+        ((45.0, 2800.0, 16500.0), (4.0, 835.0, 8250.0), (1.2, 6.9, 25)),
+        ((95.0, 2700.0, 22500.0), (1.8, 980.0, 11000.0), (2.0, 8.2, 64)),
+    )
+)
+"""M (kg), B (N s/m), K (N/m) of each program, which cover the ranges of the pots; low and high level (V), half period
+(samples). No amplifier is overloaded, and the displacement stays within -1..9 V. The last play is the check."""
+
+
+def scenarios(program: Program) -> tuple[Scenario, ...]:
+    """Scenarios that the twin is fitted to."""
+    return tuple(_scenario(program, play, f"calibration-{play + 1}") for play in range(len(_PLAYS) - 1))
+
+
+def check_scenario(program: Program) -> Scenario:
+    """Scenario to validate the twin; its pots, levels and frequency differ from all ``scenarios``."""
+    return _scenario(program, -1, "calibration-check")
+
+
+def _scenario(program: Program, play: int, name: str) -> Scenario:
+    plants, (low_v, high_v, half_n) = _PLAYS[play]
+    excitation = Excitation(low_v=low_v, high_v=high_v, frequency_hz=RATE_HZ / (2 * half_n))
+    return Scenario(samples=SAMPLES, excitation=excitation, plant=PlantChoice(program, *plants[program]), name=name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +94,18 @@ class SquareWaveRecording:
             )
         return round(period_n)
 
+    def split_periods(self, values: NDArray[np.generic]) -> NDArray[np.generic]:
+        """(periods, samples of a period): the settled part of ``values`` (n,)."""
+        period_n = self.period_n
+        first = -(-SETTLING_N // period_n) * period_n
+        last = first + (len(values) - first) // period_n * period_n
+        return values[first:last].reshape(-1, period_n)
+
+    def periods(self, channel: int) -> tuple[Vector, NDArray[np.intp]]:
+        """Codes (periods, samples of a period) of a channel, and the phases, in samples, without a clipped sample."""
+        clipped = self.split_periods(self.clipped[:, channel]).any(axis=0)
+        return self.split_periods(self.codes[:, channel]).astype(np.float64), np.flatnonzero(~clipped)
+
 
 def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     """Play the scenario on the rig and return its samples.
@@ -80,8 +132,7 @@ def record(rig: Rig, scenario: Scenario, seed: int) -> SquareWaveRecording:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Averages:
+class Averages(NamedTuple):
     """Means of one channel of a recording over all samples of the same phase."""
 
     phases: NDArray[np.intp]
@@ -89,22 +140,12 @@ class Averages:
     means: Vector
     """(phases,): mean codes."""
     variance: float
-    """Variance of each mean, LSB^2."""
-
-
-def split_periods(recording: SquareWaveRecording, values: NDArray[np.generic]) -> NDArray[np.generic]:
-    """(periods, samples of a period): the settled part of ``values`` (n,)."""
-    period_n = recording.period_n
-    first = -(-SETTLING_N // period_n) * period_n
-    last = first + (len(values) - first) // period_n * period_n
-    return values[first:last].reshape(-1, period_n)
+    """Variance of each mean, LSB^2: that of noise and of rounding, which averaging does not remove."""
 
 
 def average_phases(recording: SquareWaveRecording, channel: int, noise_lsb: float) -> Averages:
-    """Averages of a channel; their variance is that of noise and of rounding, which averaging does not remove."""
-    codes = split_periods(recording, recording.codes[:, channel]).astype(np.float64)
-    clipped = split_periods(recording, recording.clipped[:, channel]).any(axis=0)
-    (phases,) = np.nonzero(~clipped)
+    """Averages of a channel."""
+    codes, phases = recording.periods(channel)
     left = rounding_variance(noise_lsb)
     variance = (noise_lsb**2 + 1.0 / 12.0 - left) / len(codes) + left
     return Averages(phases, codes.mean(axis=0)[phases], variance)
@@ -126,10 +167,9 @@ def estimate_noise(recordings: Sequence[SquareWaveRecording], channel: int) -> t
     """
     squares, levels = [], 0
     for recording in recordings:
-        codes = split_periods(recording, recording.codes[:, channel]).astype(np.float64)
-        kept = ~split_periods(recording, recording.clipped[:, channel]).any(axis=0)
-        squares.append((np.diff(codes[:, kept], axis=0) ** 2).ravel() / 2.0)
-        levels += 2 if channel == FORCE else int(kept.sum())
+        codes, phases = recording.periods(channel)
+        squares.append((np.diff(codes[:, phases], axis=0) ** 2).ravel() / 2.0)
+        levels += 2 if channel == FORCE else len(phases)
     every = np.concatenate(squares)
     if not len(every):
         raise RigError(f"{MEASURED[channel]}: every sample is clipped")
@@ -149,30 +189,3 @@ def _remove_rounding(variance: float) -> float:
         return noise_lsb**2 + 1.0 / 12.0 - rounding_variance(noise_lsb) - variance
 
     return float(brentq(excess, 0.0, 1.0 + math.sqrt(variance))) if excess(0.0) < 0.0 else 0.0
-
-
-def noise_free_lsb(description: EmulatorDescription, scenario: Scenario, seed: int) -> Vector:
-    """(n, 2) force and displacement at an emulated card without noise, before rounding, LSB.
-
-    :raises ConfigurationError: the emulator cannot play the scenario.
-    :raises RigError: the emulator failed.
-    """
-    card = description.card.card()
-    silent = dataclasses.replace(card, noise_lsb=(0.0,) * card.channels)
-    volts = np.concatenate([block.volts for block in EmulatorRig(description).perform(scenario, seed).blocks])
-    return Sampler(silent, np.random.default_rng(0)).seen_lsb(volts)[:, _COLUMNS]
-
-
-def difference_lsb(recording: SquareWaveRecording, twin: EmulatorDescription, noise_lsb: float) -> float:
-    """Upper bound (two standard errors) of the rms difference between the displacements of rig and twin, LSB.
-
-    Compares averages; subtracts the contribution of noise and rounding to the mean square.
-
-    :param noise_lsb: noise of the rig's displacement.
-    :raises ConfigurationError, RigError: as for ``noise_free_lsb``.
-    """
-    average = average_phases(recording, DISPLACEMENT, noise_lsb)
-    there = split_periods(recording, noise_free_lsb(twin, recording.scenario, 0)[:, DISPLACEMENT]).mean(axis=0)
-    mean_square = float(np.mean((average.means - there[average.phases]) ** 2))
-    uncertain = average.variance * math.sqrt(2.0 / len(average.means))
-    return math.sqrt(max(0.0, mean_square - average.variance) + 2.0 * uncertain)

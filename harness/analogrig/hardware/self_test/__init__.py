@@ -1,1 +1,0 @@
-"""Self-test of a rig: finds its faults before any device is judged on it."""
