@@ -52,21 +52,23 @@ either."""
 
 
 def fixtures() -> Path:
-    """The folder of the shipped scenarios, rigs and devices: inside the installed package, or that of the checkout."""
-    installed = Path(__file__).parent / "fixtures"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "fixtures"
+    """The folder of the shipped scenarios, rigs and devices."""
+    return _folder("fixtures", "fixtures")
 
 
 def estimator_c() -> Path:
-    """The folder of the estimator's C sources: inside the installed package, or that of the checkout."""
-    installed = Path(__file__).parent / "estimator_c"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "estimator_c"
+    """The folder of the estimator's C sources."""
+    return _folder("estimator_c", "estimator_c")
 
 
 def generated_c() -> Path:
     """The folder of the C that comes from the message catalogue: codecs of the device's messages."""
-    installed = Path(__file__).parent / "estimator_c" / "generated"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "build" / "generated"
+    return _folder("estimator_c/generated", "build/generated")
+
+
+def _folder(in_package: str, in_checkout: str) -> Path:
+    installed = Path(__file__).parent / in_package
+    return installed if installed.is_dir() else Path(__file__).parents[2] / in_checkout
 
 
 def locate(kind: Kind, name: str) -> Path:

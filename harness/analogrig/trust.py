@@ -132,7 +132,7 @@ class Trust:
         refused = [thing for thing in things if not self._allows(thing)]
         if not refused:
             return
-        what = _printable(f"{where or file}: {' and '.join(thing.sentence() for thing in refused)}")
+        what = f"{where or file}: {' and '.join(thing.sentence() for thing in refused)}"
         names = [thing.shown() for thing in refused]
         if all(name.isprintable() and len(name) <= MOST_NAME for name in names):
             raise ConfigurationError(f"{what}, which no file may order: pass {self._cure(names)}")
@@ -147,10 +147,6 @@ class Trust:
         if not self._option:
             return f"allow={names!r}"
         return " ".join(f"{self._option} {shlex.quote(name)}" for name in names)
-
-
-def _printable(text: str) -> str:
-    return "".join(each if each.isprintable() else "?" for each in text)
 
 
 def _is_shipped(file: str) -> bool:

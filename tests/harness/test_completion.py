@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from analogrig.cli import main
-from analogrig.cli.completion import SHELLS
+from analogrig.cli.listing import SHELLS
 
 pytestmark = pytest.mark.tools("bash")
 
@@ -27,7 +27,7 @@ printf '%s\\n' "${COMPREPLY[@]}"
 
 
 def completed(line: str, capsys: pytest.CaptureFixture[str], **environment: str) -> list[str]:
-    """What bash offers after ``line``, whose last word is being typed."""
+    """Completions by bash after ``line``, whose last word is being typed."""
     assert main(["completion", "bash"]) == 0
     done = subprocess.run(
         ["bash", "-c", COMPLETE, "bash", line],

@@ -58,7 +58,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 Rewrite = Callable[[dict[str, Any], dict[str, Any]], object]
-"""Of the conditions in the header, and of the arrays."""
+"""Change to the conditions in the header and to the arrays."""
 
 
 def rewritten(recording: Path, path: Path, change: Rewrite) -> Path:

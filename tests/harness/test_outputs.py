@@ -174,7 +174,7 @@ def test_disk_that_is_full_at_the_start_leaves_no_older_verdict(out: Path, monke
 
 @contextmanager
 def long_run(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A run of a hundred thousand samples into ``folder``, whose first ones have gone to the device."""
+    """A run of two million samples into ``folder``, whose first ones have gone to the device."""
     scenario = folder.with_name("long.toml")
     text = (ROOT / "fixtures/scenarios/healthy.toml").read_text()
     scenario.write_text(re.sub(r"samples = \d+", "samples = 2000000", text))
@@ -343,7 +343,7 @@ def test_log_of_an_earlier_run_goes_with_it(out: Path) -> None:
 
 
 def test_earlier_results_stay_within_where_nothing_may_stand_beside(out: Path) -> None:
-    """As where the folder is a volume of its own."""
+    """A volume of its own has no place beside it."""
     previous_of(out).write_text("in the way")
     assert main(["run", "--dut", "none.toml", "--out", str(out)]) == 2
     assert verdict(out)["outcome"] == "inconclusive"
@@ -403,7 +403,7 @@ class Killer:
 
 
 def result(folder: Path) -> tuple[Callable[[Path], None], dict[str, str]]:
-    """What a run that has passed puts in place, and its verdict."""
+    """Writer of the files of a run that has passed, and its verdict."""
     recording, page = (folder / "run.npz").read_bytes(), (folder / "report.html").read_text()
 
     def write(parts: Path) -> None:

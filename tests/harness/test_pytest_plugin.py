@@ -24,7 +24,7 @@ from analogrig.devices.host import host_child
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
-from analogrig.testing.experiment import Play, judged
+from analogrig.testing.statement import Play, judge_statement
 from analogrig_emulator import Excitation
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
@@ -80,7 +80,7 @@ def refused(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
 
 
 def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]:
-    """Those of the first test case."""
+    """Properties of the first test case."""
     case = ET.parse(user.path / file).getroot().find(".//testcase")  # noqa: S314 - written a moment ago
     assert case is not None
     return {each.attrib["name"]: each.attrib["value"] for each in case.iter("property")}
@@ -454,7 +454,7 @@ DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
 
 
 def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
-    """What an earlier session has left, as a suite."""
+    """Run the counterexamples of an earlier session as a suite."""
     return run(user, "build/runs", "--hil-scenario-dir", "build/runs", *arguments)
 
 
@@ -479,7 +479,7 @@ def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(use
 def test_property_that_failed_with_every_seed_is_tried_with_every_seed_again(user: pytest.Pytester) -> None:
     user.makepyfile(
         """
-        from analogrig.testing.properties import with_some_seed
+        from analogrig import with_some_seed
 
         def test_it(hil_play):
             assert with_some_seed(hil_play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
@@ -526,7 +526,7 @@ def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_lim
 def test_statement_that_says_nothing_is_refused_before_anything_is_played(told: dict[str, Any], complaint: str) -> None:
     statement = config.build(Statement, told, "the file: statement")
     with pytest.raises(ConfigurationError, match=f"the file: statement: {complaint}"):
-        judged(statement, cast(Play, None), Scenario.load("thesis"), 1, "the file")
+        judge_statement(statement, cast(Play, None), Scenario.load("thesis"), 1, "the file")
 
 
 def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:

@@ -1,4 +1,4 @@
-"""What a command shows while it works."""
+"""Progress, colour and messages on a terminal."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class Witness(Protocol):
 
 @dataclasses.dataclass
 class LeavesFile:
-    """What runs leaves a file."""
+    """Witness of code that leaves a file when it runs."""
 
     path: Path
 
@@ -135,11 +135,11 @@ class Bait:
     """Value of --allow."""
     witness: Witness
     name: str = ""
-    """Of a device: how a scenario or a campaign names it ..."""
+    """Name of a device in a scenario or a campaign; empty for a rig."""
     toml: str = ""
-    """... and its file; of a rig, its file."""
+    """File of the device or the rig."""
     besides: tuple[str, ...] = ()
-    """What else is allowed, for it to be reached."""
+    """Options that allow whatever stands before the thing."""
 
 
 @pytest.fixture(scope="session")
@@ -164,7 +164,7 @@ def instrument() -> Iterator[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where the user is; the files are in the folder ``theirs``. What runs may leave the file ``witness``."""
+    """Working directory of the user; the files are in its folder ``theirs``. Code that runs may leave ``witness``."""
     for variable in [name for name in os.environ if name.startswith("ANALOGRIG_") and name != "ANALOGRIG_FIRMWARE"]:
         monkeypatch.delenv(variable)
     monkeypatch.setenv("TRUST_WITNESS", str(tmp_path / "witness"))

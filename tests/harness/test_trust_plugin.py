@@ -34,7 +34,7 @@ PLAYS = "def test_it(hil_play):\n    hil_play('healthy')\n"
 
 @pytest.fixture
 def folder(user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """As that of test_trust.py."""
+    """Working directory, like the fixture of test_trust.py."""
     monkeypatch.setenv("TRUST_WITNESS", str(user.path / "witness"))
     (user.path / "theirs").mkdir()
     with _OPEN:

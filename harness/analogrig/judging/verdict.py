@@ -101,6 +101,15 @@ class ChangeVerdict:
         return (min(known), max(known)) if known else None
 
     @property
+    def latency_text(self) -> str:
+        """Latency: ``4``, ``1-9`` if the instant is an interval, ``missed``, ``unknown``, or ``-``."""
+        if self.result in {"missed", "not judged"}:
+            return {"missed": "missed", "not judged": "unknown"}[self.result]
+        if self.latencies_n is None:
+            return "-"
+        return "-".join(map(str, dict.fromkeys(self.latencies_n)))
+
+    @property
     def result(self) -> Result:
         """Result under all hypotheses; ``undecided`` if they differ."""
         if self.unseen:

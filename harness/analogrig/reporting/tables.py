@@ -12,7 +12,7 @@ from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEs
 from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.payload import is_thinned, marked_alarms
-from analogrig.reporting.summary import lamps_text, latency_text, load_text
+from analogrig.reporting.summary import lamps_text, load_text
 from analogrig.run import Run
 from analogrig.wording import number_of
 
@@ -221,7 +221,7 @@ def _diagnosis_row(tweak: ChangeVerdict, diagnosis: DiagnosisVerdict) -> str:
 
 
 def _latency(tweak: ChangeVerdict) -> str:
-    return "–" if tweak.latencies_n is None else _text(latency_text(tweak)).replace("-", "–")
+    return "–" if tweak.latencies_n is None else _text(tweak.latency_text).replace("-", "–")
 
 
 def _result(tweak: ChangeVerdict) -> tuple[str, str]:

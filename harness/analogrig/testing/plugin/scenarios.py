@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.testing.plugin.devices import Devices, check_owner
-from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, time_limit_s, trust_of
-from analogrig.testing.plugin.playing import Player
+from analogrig.testing.plugin.devices import DEVICES, check_owner
+from analogrig.testing.plugin.player import Player
+from analogrig.testing.plugin.settings import DUT, RIG, SCENARIO_DIR, Option, time_limit_s, trust_of
 
 if TYPE_CHECKING:
     from analogrig.scenario import Scenario
@@ -26,9 +26,6 @@ _FOLDER = pytest.StashKey[Path]()
 _COMPLAINT = pytest.StashKey[str]()
 """Reason why the folder of the ini file cannot be collected."""
 
-DEVICES = pytest.StashKey[Devices]()
-"""Devices of the session."""
-
 
 def add_folder(config: pytest.Config) -> None:
     """Collect the scenarios on top of all tests; on top of tests that are named only if the command line asks for both.
@@ -37,14 +34,14 @@ def add_folder(config: pytest.Config) -> None:
 
     :raises pytest.UsageError: the folder of the command line cannot be collected.
     """
-    folder = SCENARIO_DIR.said(config)
+    folder = SCENARIO_DIR.of_session(config)
     if not folder.value:
         return
     config.stash[_FOLDER] = path = Path(folder.value).resolve()
     named = config.args_source is pytest.Config.ArgsSource.ARGS
     if named and folder.source != "command line":
         return
-    complaint = SCENARIO_DIR.complaint(folder.value) or ("" if named else _passed_over(folder.value, config))
+    complaint = SCENARIO_DIR.complaint(folder.value) or ("" if named else _recursion_complaint(folder.value, config))
     if complaint and folder.source == "command line":
         raise pytest.UsageError(f"{folder.by}: {complaint}")
     if complaint:
@@ -53,7 +50,7 @@ def add_folder(config: pytest.Config) -> None:
         config.args.append(folder.value)
 
 
-def _passed_over(folder: str, config: pytest.Config) -> str:
+def _recursion_complaint(folder: str, config: pytest.Config) -> str:
     """Reason why pytest does not enter a folder that is not named; empty if pytest enters it."""
     patterns = config.getini("norecursedirs")
     parts = _below(Path(folder).resolve(), config)
@@ -67,7 +64,7 @@ def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
     return path.relative_to(root).parts if path.is_relative_to(root) else ()
 
 
-def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+def collect_file(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     folder = parent.config.stash.get(_FOLDER, None)
     if folder is None or path.suffix != ".toml" or not path.is_relative_to(folder):
         return None
@@ -111,8 +108,8 @@ class ScenarioFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         from analogrig.testing.counterexample import SCENARIO_FILE
 
-        is_left = self.path.name == SCENARIO_FILE  # by a test, after which its folder is called
-        yield ScenarioItem.from_parent(self, name=self.path.parent.name if is_left else self.path.stem)
+        is_counterexample = self.path.name == SCENARIO_FILE  # its folder is named after the test
+        yield ScenarioItem.from_parent(self, name=self.path.parent.name if is_counterexample else self.path.stem)
 
 
 class ScenarioItem(pytest.Item):
@@ -125,27 +122,27 @@ class ScenarioItem(pytest.Item):
 
         check_owner(self)
         scenario = Scenario.load(str(self.path))
-        devices, name, trust = self.config.stash[DEVICES], self._device(scenario), trust_of(self.config)
-        with open_rig(self._rig(scenario), allow=trust) as rig:
+        devices, name, trust = self.config.stash[DEVICES], self._name(DUT, scenario.dut), trust_of(self.config)
+        with open_rig(self._name(RIG, scenario.rig), allow=trust) as rig:
             try:
                 bench = Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config))
-                finding = self._found(Player(self, bench), scenario)
+                finding = self._judge(Player(self, bench), scenario)
             finally:
                 if name == scenario.dut:
                     devices.release(name)
         if not finding:
             raise ScenarioFailed(finding.why)
 
-    def _found(self, play: Player, scenario: Scenario) -> Finding:
+    def _judge(self, play: Player, scenario: Scenario) -> Finding:
         import analogrig.testing.played
-        import analogrig.testing.properties.experiments  # noqa: F401 - each makes known what a file can state
+        import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
         from analogrig.scenario import DEFAULT_SEED
-        from analogrig.testing.experiment import judged
+        from analogrig.testing.statement import judge_statement
 
         if scenario.statement is None:
             return play(scenario).passes()
         seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
-        return judged(scenario.statement, play, scenario, seed, str(self.path))
+        return judge_statement(scenario.statement, play, scenario, seed, str(self.path))
 
     def hil_equipment(self) -> tuple[str, str]:
         """Names of rig and device; empty where the file cannot be read."""
@@ -154,16 +151,13 @@ class ScenarioItem(pytest.Item):
 
         with contextlib.suppress(AnalogrigError):
             scenario = Scenario.load(str(self.path))
-            return self._rig(scenario), self._device(scenario)
+            return self._name(RIG, scenario.rig), self._name(DUT, scenario.dut)
         return "", ""
 
-    def _rig(self, scenario: Scenario) -> str:
-        given = RIG.given(self.config)
-        return given.value if given else scenario.rig or RIG.otherwise(self.config).value
-
-    def _device(self, scenario: Scenario) -> str:
-        given = DUT.given(self.config)
-        return given.value if given else scenario.dut or DUT.otherwise(self.config).value
+    def _name(self, option: Option, own: str) -> str:
+        """Name of rig or device: explicit, else the scenario's ``own``, else that of the session."""
+        setting = option.of_session(self.config)
+        return setting.value if setting.is_explicit else own or setting.value
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         from analogrig.errors import AnalogrigError
