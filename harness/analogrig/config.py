@@ -207,7 +207,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in table:
             raise ConfigurationError(f"{where}: the key {name!r} is lacking")
-    values = {key: converted(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    values = {key: convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
     except (ValueError, ArithmeticError, ConfigurationError, EmulatorError) as error:
@@ -215,7 +215,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
 
 
-def converted(hint: Any, value: Any, where: str) -> Any:
+def convert(hint: Any, value: Any, where: str) -> Any:
     """A plain value as the type ``hint``, as for a field of ``build``; ``where`` leads every error.
 
     :raises ConfigurationError: it is of another type.
@@ -233,7 +233,7 @@ def converted(hint: Any, value: Any, where: str) -> Any:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):
         table = _expect(dict, value, "a table", where)
-        return {key: converted(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
+        return {key: convert(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
     return _convert_scalar(hint, value, where)
 
 
@@ -241,14 +241,14 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
     if (kinds := _by_kind(arguments)) and isinstance(value, dict):
         if "kind" not in value:
             raise ConfigurationError(f"{where}: the key 'kind' is lacking")
-        kind = converted(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
-        return converted(kinds[kind], value, where)
+        kind = convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
+        return convert(kinds[kind], value, where)
     problems = []
     for argument in arguments:
         if argument is types.NoneType:
             continue
         try:
-            return converted(argument, value, where)
+            return convert(argument, value, where)
         except ConfigurationError as error:
             problems.append(str(error).removeprefix(f"{where}: "))
     raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
@@ -265,11 +265,11 @@ def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     items = _expect(list, list(value) if isinstance(value, tuple) else value, "an array", where)
     if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return tuple(converted(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+        return tuple(convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
     if len(items) != len(arguments):
         raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
     return tuple(
-        converted(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
+        convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
     )
 
 

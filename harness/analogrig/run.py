@@ -25,7 +25,7 @@ from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.identity import Identity
 from analogrig.plant import Plant
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 
 if TYPE_CHECKING:
     from analogrig.estimator_config import EstimatorConfig
@@ -309,7 +309,7 @@ class Run:
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
         arrays = {name: getattr(self, name) for name in _ARRAYS | _OPTIONAL_ARRAYS}
-        with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        with replace_file(path) as file, zipfile.ZipFile(file, "w") as archive:
             for name, array in {"header": np.array(header), **arrays}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     _write_array(member, array)

@@ -39,7 +39,7 @@ def number_of(n: int, one: str, several: str = "", *, form: str = "") -> str:
     return f"{n:{form}} {one if n == 1 else several or f'{one}s'}"
 
 
-def number_named(n: int, name: str) -> str:
+def counter_text(n: int, name: str) -> str:
     """A counter with its value: ``12 frames foreign``, ``1 error frame`` of frames_foreign and error_frames."""
     words = name.split("_")
     if n == 1:

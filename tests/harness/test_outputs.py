@@ -223,7 +223,7 @@ import time
 from analogrig import signals
 signals.AGAIN_S = {again_s}
 try:
-    with signals.ending(), signals.held():
+    with signals.raise_signals(), signals.hold_signals():
         print("ready", flush=True)
         while {forever} or not signals._handlers[-1]._held:
             time.sleep(0.01)
@@ -258,7 +258,7 @@ COMPILED = """
 import os, signal, sys
 from analogrig import signals
 try:
-    with signals.ending():
+    with signals.raise_signals():
         exec("os.kill(os.getpid(), signal.SIGINT)")
 except KeyboardInterrupt:
     sys.exit(130)

@@ -194,7 +194,7 @@ def test_work_without_a_count_shows_its_seconds(
     terminals: tuple[Terminal, Terminal], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terminal, "_PROGRESS_S", 0.01)
-    with terminal.working("self-test"):
+    with terminal.show_work("self-test"):
         while "self-test: 0 s" not in terminals[1].getvalue():
             time.sleep(0.001)
     assert terminals[1].getvalue().startswith("\rself-test: 0 s")
@@ -206,16 +206,16 @@ def test_work_is_silent_where_nobody_watches(
 ) -> None:
     monkeypatch.setattr(terminal, "_PROGRESS_S", 0.0)
     threads = threading.active_count()
-    with terminal.working("self-test"):
+    with terminal.show_work("self-test"):
         assert threading.active_count() == threads
     assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.usefixtures("terminals")
 def test_progress_needs_a_terminal_that_can_overwrite(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert terminal.watched() is not None
+    assert terminal.open_progress_line() is not None
     monkeypatch.setenv("TERM", "dumb")
-    assert terminal.watched() is None
+    assert terminal.open_progress_line() is None
 
 
 def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
-from analogrig.trust import FiledName, Thing, Trust, beside
+from analogrig.trust import FiledName, Thing, Trust, resolve_name
 from tests.harness.served import served
 
 pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")
@@ -641,7 +641,7 @@ def test_relative_path_is_relative_to_the_file_that_names_it(folder: Path) -> No
         assert [thing.name for thing in describe(name).things] == [expected]
     assert scenario.rig == "theirs/rig.toml:bench"
     assert (spec.scenario, spec.rigs) == ("theirs/scenario.toml", ("theirs/rig.toml",))
-    assert beside(Path("theirs/scenario.toml"), "recording:run.npz") == "recording:theirs/run.npz"
+    assert resolve_name(Path("theirs/scenario.toml"), "recording:run.npz") == "recording:theirs/run.npz"
     assert [thing.name for thing in describe("inproc:lib.so").things] == [str(folder / "lib.so")]
 
 

@@ -27,7 +27,7 @@ from analogrig.cli import (
     thesis,
 )
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
-from analogrig.signals import ending
+from analogrig.signals import raise_signals
 
 _COMMANDS = (
     playing.add_run,
@@ -62,7 +62,7 @@ _EXHAUSTED = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Every failure is one line on standard error."""
     open_standard_streams()
-    with ending():
+    with raise_signals():
         try:
             parser = _parser()
             if listing.COMPLETION_VARIABLE in os.environ:

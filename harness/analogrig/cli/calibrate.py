@@ -70,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.hardware.calibration.recordings import difference_lsb
     from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
-    from analogrig.storage import replacing
+    from analogrig.storage import replace_file
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
@@ -89,7 +89,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except RigError as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if check_lsb <= MOST_LSB:
-        with replacing(arguments.out) as file:
+        with replace_file(arguments.out) as file:
             file.write(_toml(found, arguments, check_lsb).encode("utf-8"))
     if arguments.json:
         show_result(_as_json(found, check_lsb, arguments), arguments)

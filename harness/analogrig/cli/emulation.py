@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import FILE, add_command, add_json, add_what_to_play, files_read, open_what_to_play
-from analogrig.cli.terminal import PASSED, progress_line, show, show_plain, show_result, working
+from analogrig.cli.terminal import PASSED, progress_line, show, show_plain, show_result, show_work
 
 
 def add_emulate(commands: Any) -> None:
@@ -82,13 +82,13 @@ def _netlist(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         move_aside(arguments.out, files_read(arguments))
     from analogrig.reporting.netlist import netlist
-    from analogrig.storage import replacing
+    from analogrig.storage import replace_file
 
     with open_what_to_play(arguments) as (rig, scenario, seed):
         deck = netlist(rig, scenario, seed)
     text = deck.text()
     if arguments.out is not None:
-        with replacing(arguments.out) as file:
+        with replace_file(arguments.out) as file:
             file.write(text.encode("ascii"))
     if arguments.json:
         where = {"deck": text} if arguments.out is None else {"file": str(arguments.out)}
@@ -109,7 +109,7 @@ def _effects(arguments: argparse.Namespace) -> int:
         if arguments.out.suffix != ".svg":
             raise ConfigurationError(f"{arguments.out}: the file's name must end with .svg")
         move_aside(arguments.out)
-    with working("playing each fault"):
+    with show_work("playing each fault"):
         table = effects.measure([arguments.set] if arguments.set else ["shock", "front"])
     if arguments.out is not None:
         effects.write_picture(table, arguments.out)

@@ -25,7 +25,16 @@ from analogrig.cli.options import (
     open_what_to_play,
     trust_of,
 )
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show, show_json, working
+from analogrig.cli.terminal import (
+    INCONCLUSIVE,
+    INTERRUPTED,
+    STATUS,
+    complain,
+    progress_line,
+    show,
+    show_json,
+    show_work,
+)
 
 if TYPE_CHECKING:
     from analogrig.devices.dut import Dut
@@ -144,7 +153,7 @@ def _play(
     from analogrig.errors import ConfigurationError, RecordingError
     from analogrig.output import CAN_LOG
     from analogrig.recordings import WRITTEN, CanLog
-    from analogrig.signals import held
+    from analogrig.signals import hold_signals
 
     log = None
     if arguments.can_log != "none":
@@ -157,7 +166,7 @@ def _play(
             log.begin()
         bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
         run = bench.play(scenario, seed)
-        with held():
+        with hold_signals():
             try:
                 if log is not None:
                     log.close()
@@ -184,7 +193,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
         write_report(run, verdict, folder / REPORT_FILE)
 
     try:
-        with working("judging, writing run and report"):
+        with show_work("judging, writing run and report"):
             verdict = judge(run)
             table = _as_json(run, verdict, identity, output)
             output.conclude(write, table)

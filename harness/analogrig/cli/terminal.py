@@ -148,7 +148,7 @@ class ProgressLine:
     """
 
     lock: ClassVar[threading.RLock] = threading.RLock()
-    """Held while anything is printed: `working` prints from a thread."""
+    """Held while anything is printed: `show_work` prints from a thread."""
     unfinished: ClassVar[ProgressLine | None] = None
     """The line that the cursor is in."""
 
@@ -182,14 +182,14 @@ class ProgressLine:
             self._width = 0
 
 
-def watched() -> ProgressLine | None:
+def open_progress_line() -> ProgressLine | None:
     """A progress line; None if standard error is no terminal."""
     return ProgressLine() if _is_terminal(sys.stderr) else None
 
 
 def progress_line(of: str = "samples") -> Progress | None:
     """A callback that shows how many of how many, and percent; None if standard error is no terminal."""
-    line = watched()
+    line = open_progress_line()
     if line is None:
         return None
 
@@ -200,9 +200,9 @@ def progress_line(of: str = "samples") -> Progress | None:
 
 
 @contextlib.contextmanager
-def working(on: str) -> Iterator[None]:
+def show_work(on: str) -> Iterator[None]:
     """Show what the command works on and for how long, where there is nothing to count."""
-    line = watched()
+    line = open_progress_line()
     if line is None:
         yield
         return

@@ -363,7 +363,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_reaching(gathered, expect.late_information_ratio * level)
+        late = information.first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -372,7 +372,7 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_reaching(gathered, level),
+                bound_n=information.first_at_level(gathered, level),
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None

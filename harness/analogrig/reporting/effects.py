@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 
 __all__ = ["as_json", "measure", "text", "write_picture"]
@@ -71,7 +71,7 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
 
     :raises RecordingError: the file cannot be written.
     """
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(_svg(table).encode("utf-8"))
 
 

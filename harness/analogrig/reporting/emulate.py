@@ -15,7 +15,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.rig import Block, Rig
 from analogrig.run import CHANNELS
 from analogrig.scenario import Scenario
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 
 
 def write_signals(
@@ -36,7 +36,7 @@ def write_signals(
         blocks.append(block)
         if progress is not None:
             progress(block.first + len(block.codes), scenario.samples)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         if path.suffix == ".csv":
             file.write(_csv(blocks).encode("ascii"))
         else:

@@ -9,7 +9,7 @@ from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEs
 from analogrig.plant import UNITS
 from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.run import Run
-from analogrig.wording import number_named, number_of
+from analogrig.wording import counter_text, number_of
 
 SHOWN_ALARMS = 10
 
@@ -53,7 +53,7 @@ def summary(run: Run, verdict: Verdict) -> str:
 
 def traffic_text(link_counters: Mapping[str, int]) -> str:
     """Other traffic on the line: ``12 frames foreign, 1 error frame``."""
-    return ", ".join(number_named(n, name) for name, n in link_counters.items() if n)
+    return ", ".join(counter_text(n, name) for name, n in link_counters.items() if n)
 
 
 def lamps_text(overloads: Mapping[str, int]) -> str:

@@ -207,7 +207,7 @@ class CardDescription:
         :raises ConfigurationError: one is of another type.
         """
         hints = typing.get_type_hints(Card)
-        return {name: config.converted(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
+        return {name: config.convert(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
 
     def _noises_lsb(self) -> tuple[float, ...] | None:
         """Noise of each channel in LSB; None if not given."""

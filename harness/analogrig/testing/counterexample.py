@@ -58,7 +58,7 @@ class Counterexample:
     def _options(self, allow: str, *, with_device: bool) -> list[str]:
         """Options that allow the things which the files of the counterexample name."""
         device = recorded(self.run.conditions.dut).things if with_device else ()
-        return [word for thing in (*device, *_rig_things(self.run)) for word in (allow, thing.shown())]
+        return [word for thing in (*device, *_rig_things(self.run)) for word in (allow, thing.display_name())]
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Write the counterexample into ``folder``, all or nothing: the old content stays until the new one is

@@ -70,9 +70,9 @@ class Option:
         if not value:
             return Setting(self.default, self.flag, "default")
         if self in (RIG, DUT) and config.inipath is not None:  # the name counts as one that a file holds
-            from analogrig.trust import beside
+            from analogrig.trust import resolve_name
 
-            value = beside(config.inipath, value)
+            value = resolve_name(config.inipath, value)
         return Setting(value, f"{config.inipath}: {self.name}", "ini file")
 
     def of(self, item: pytest.Item) -> Setting:
