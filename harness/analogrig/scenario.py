@@ -11,8 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from analogrig import config
-from analogrig.plant import LEAST_PARAMETER, MOST_PARAMETER, Plant
-from analogrig.run import MAX_CHANGES, MAX_SAMPLES, Segment
+from analogrig.plant import LEAST_PARAMETER, MAX_CHANGES, MAX_SAMPLES, MOST_PARAMETER, Plant, Segment
 from analogrig.trust import FiledName, resolve_name
 from analogrig.wording import number_of
 from analogrig_emulator import PROGRAMS, Excitation

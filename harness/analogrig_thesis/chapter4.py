@@ -12,8 +12,7 @@ import numpy as np
 
 from analogrig.devices.reference import ReferenceEstimator
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import Plant
-from analogrig.run import Segment
+from analogrig.plant import Plant, Segment
 from analogrig_thesis.document import Drawing, Facts, ReproducedChapter, Signal
 from analogrig_thesis.plants import (
     FRONT,

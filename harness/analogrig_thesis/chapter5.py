@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import AT_REST, Plant, SampledPlant
-from analogrig.run import Run, Segment
+from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
+from analogrig.run import Run
 from analogrig_thesis.circuit_runs import (
     BATCH,
     COMPARISON,

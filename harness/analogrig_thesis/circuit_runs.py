@@ -13,10 +13,10 @@ from analogrig.config import fixtures
 from analogrig.devices.dut import connect
 from analogrig.devices.host import HostDevice
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import Excitation
 from analogrig_thesis.document import Signal

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.plant import AT_REST, Plant, SampledPlant
-from analogrig.run import Segment
+from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
 from analogrig_thesis.document import Signal
 
 PERIOD_S = 0.01

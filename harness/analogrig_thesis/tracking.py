@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
-from analogrig.plant import Plant, physical_parameters
-from analogrig.run import Run, Segment
+from analogrig.plant import Plant, Segment, physical_parameters
+from analogrig.run import Run
 from analogrig_thesis.document import Mark, Signal
 from analogrig_thesis.plants import CHANGE_LABELS, PERIOD_S, stretches
 

@@ -14,10 +14,10 @@ from analogrig.campaigns.rows import row
 from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from analogrig.testing.played import Played
 from analogrig.testing.plugin.junit import latency_property
 from tests.harness.runs import made_run

@@ -8,7 +8,7 @@ from typing import Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
-from analogrig.run import MAX_SAMPLES
+from analogrig.plant import MAX_SAMPLES
 from analogrig.trust import resolve_name
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000

@@ -15,9 +15,10 @@ from analogrig.errors import ConfigurationError
 from analogrig.hardware.by_hand import PlannedChange
 from analogrig.hardware.instrument import InputRecord, Instrument
 from analogrig.hardware.wiring import RealDescription, check_wiring
+from analogrig.plant import Segment
 from analogrig.rigs.emulator import Stream, emulator_errors, settings_of
 from analogrig.rigs.rig import CHANNEL_UNITS
-from analogrig.run import CHANNELS, MEASURED, Channel, Segment
+from analogrig.run import CHANNELS, MEASURED, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation, SuspensionComputer
 

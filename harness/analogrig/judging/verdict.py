@@ -25,8 +25,8 @@ from analogrig import config
 from analogrig.catalogue import Change, SteppedFlag
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
-from analogrig.plant import PARAMETERS, physical_parameters
-from analogrig.run import LOST, Run, Segment
+from analogrig.plant import PARAMETERS, Segment, physical_parameters
+from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Channel, Segment
+from analogrig.run import CHANNELS, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
