@@ -85,7 +85,7 @@ def locate(kind: Kind, name: str) -> Path:
     if _is_file(path):
         return path
     known = ", ".join(names(kind))
-    raise ConfigurationError(f"no {kind[:-1]} is called {_shown(name)}: there are {known}, or give a .toml file")
+    raise ConfigurationError(f"no {kind[:-1]} is called {_quote(name)}: there are {known}, or give a .toml file")
 
 
 def _is_file(path: Path) -> bool:
@@ -202,7 +202,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     hints = typing.get_type_hints(cls)
     for key in table:
         if key not in fields:
-            raise ConfigurationError(f"{where}: unknown key {_shown(key)} (known: {', '.join(fields)})")
+            raise ConfigurationError(f"{where}: unknown key {_quote(key)} (known: {', '.join(fields)})")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in table:
@@ -226,7 +226,7 @@ def convert(hint: Any, value: Any, where: str) -> Any:
     if origin is Literal:
         if value in arguments:
             return value
-        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_quote(value)}")
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
     if origin is tuple:
@@ -279,9 +279,9 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if hint is float:
         if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER:
             return float(value)
-        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_quote(value)}")
     if hint is int and (isinstance(value, bool) or (isinstance(value, int) and abs(value) > MOST_INTEGER)):
-        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_quote(value)}")
     words = {int: "a whole number", bool: "true or false", str: "a text"}
     return _expect(hint, value, words[hint], where)
 
@@ -289,10 +289,10 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
 def _expect(kind: type[T], value: Any, words: str, where: str) -> T:
     if isinstance(value, kind):
         return value
-    raise ConfigurationError(f"{where}: must be {words}, not {_shown(value)}")
+    raise ConfigurationError(f"{where}: must be {words}, not {_quote(value)}")
 
 
-def _shown(value: Any) -> str:
+def _quote(value: Any) -> str:
     """A value in an error, in one line of bounded length."""
     return "a longer one" if isinstance(value, int) and abs(value) > MOST_INTEGER else _brief(repr(value))
 

@@ -84,7 +84,7 @@ class OutputFolder:
         self._check_reads()
         make_folder(self.path)
         self._check_places()
-        self._lock = _locked(self.path)
+        self._lock = _lock_folder(self.path)
         try:
             with hold_signals():
                 self._begin()
@@ -260,7 +260,7 @@ def make_folder(out: Path) -> None:
         raise ConfigurationError(f"--out {out}: cannot be written to")
 
 
-def _locked(folder: Path) -> int | None:
+def _lock_folder(folder: Path) -> int | None:
     """Descriptor that holds the folder until it is closed; None where folders cannot be locked.
 
     :raises ConfigurationError: another command holds it.

@@ -77,7 +77,7 @@ def check_inconclusive(folder: Path, reason: str) -> None:
 
 
 def test_device_that_does_not_answer_leaves_no_older_verdict(out: Path) -> None:
-    """Item 6: the PASSED report of an earlier run stood there, for a CI job to publish."""
+    """A CI job would publish the PASSED report of an earlier run."""
     assert main(["run", "--dut", "inproc", "--wire-faults", "drop@1.0", "--out", str(out)]) == 2
     check_inconclusive(out, "Hello")
 
@@ -204,7 +204,7 @@ def test_folder_says_from_the_start_that_the_run_has_not_ended(out: Path) -> Non
 
 @pytest.mark.parametrize("number", ENDING)
 def test_signal_keeps_what_was_recorded(out: Path, number: signal.Signals) -> None:
-    """Item 8: only Ctrl-C did. The signal comes twice, as from ``timeout``, which is one request."""
+    """The signal comes twice, as from ``timeout``, which is one request."""
     with long_run(out) as process:
         process.send_signal(number)
         process.send_signal(number)

@@ -150,44 +150,44 @@ def test_json_has_null_for_numbers_that_are_not_finite(capsys: pytest.CaptureFix
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.0, [None]], "c": {"d": None}}
 
 
-def test_error_never_continues_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
+@pytest.fixture
+def progress(terminals: tuple[Terminal, Terminal]) -> tuple[ProgressLine, Clock]:
+    """A line that stands at 9 of 10, and its clock."""
+    assert terminals[1].getvalue() == ""
     clock = Clock()
     line = ProgressLine(clock)
     clock.now_s = 2.0
     line.show("9 of 10", is_last=False)
+    return line, clock
+
+
+@pytest.mark.usefixtures("progress")
+def test_message_never_continues_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
+    terminal.show("done")
     terminal.complain("the device reset", 3)
+    assert terminals[0].getvalue() == "done\n"
     assert terminals[1].getvalue() == "\r9 of 10\nanalogrig: the device reset\n"
 
 
-def test_results_never_continue_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    line = ProgressLine(clock)
-    clock.now_s = 2.0
-    line.show("9 of 10", is_last=False)
-    terminal.show("done")
-    assert (terminals[0].getvalue(), terminals[1].getvalue()) == ("done\n", "\r9 of 10\n")
-
-
-def test_progress_goes_on_below_a_message(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    line = ProgressLine(clock)
-    clock.now_s = 2.0
-    line.show("3 of 10", is_last=False)
+def test_progress_goes_on_below_a_message(
+    terminals: tuple[Terminal, Terminal], progress: tuple[ProgressLine, Clock]
+) -> None:
+    line, clock = progress
     terminal.complain("one sample was lost", 0)
     clock.now_s = 4.0
-    line.show("4 of 10", is_last=False)
+    line.show("10 of 10", is_last=False)
     line.show("10 of 10", is_last=True)
-    assert terminals[1].getvalue() == "\r3 of 10\nanalogrig: one sample was lost\n\r4 of 10\r10 of 10\n"
+    assert terminals[1].getvalue() == "\r9 of 10\nanalogrig: one sample was lost\n\r10 of 10\r10 of 10\n"
 
 
-def test_second_progress_begins_on_a_line_of_its_own(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    lines = [ProgressLine(clock), ProgressLine(clock)]
-    clock.now_s = 2.0
-    for number, line in enumerate(lines):
-        line.show(f"line {number}", is_last=False)
-    lines[1].end()
-    assert terminals[1].getvalue() == "\rline 0\n\rline 1\n"
+def test_second_progress_begins_on_a_line_of_its_own(
+    terminals: tuple[Terminal, Terminal], progress: tuple[ProgressLine, Clock]
+) -> None:
+    second = ProgressLine(progress[1])
+    progress[1].now_s = 4.0
+    second.show("second", is_last=False)
+    second.end()
+    assert terminals[1].getvalue() == "\r9 of 10\n\rsecond\n"
 
 
 def test_work_without_a_count_shows_its_seconds(
@@ -221,18 +221,7 @@ def test_progress_needs_a_terminal_that_can_overwrite(monkeypatch: pytest.Monkey
 def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -> None:
     """A pseudo-terminal, a run at a fraction of real time, Ctrl-C once progress is shown."""
     ours, theirs = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "analogrig.cli",
-        "run",
-        "--real-time",
-        "500",
-        "--dut",
-        "host",
-        "--out",
-        str(tmp_path),
-    ]
+    command = [sys.executable, "-m", "analogrig.cli", "run", "--real-time", "500", "--dut", "host", "--out", tmp_path]
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, env=environment) as process:
         os.close(theirs)

@@ -170,7 +170,7 @@ def isolation_bounds(run: Run) -> list[int | None]:
         for name in PARAMETERS:
             if changed != (name,):
                 apart = (_rival_displacements(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
-                least = np.minimum(least, _interpolated_minimum(np.cumsum(apart, axis=1)))
+                least = np.minimum(least, _interpolate_minimum(np.cumsum(apart, axis=1)))
         out.append(first_at_level(least, ISOLATION_INFORMATION))
     return out
 
@@ -241,7 +241,7 @@ def _rival_displacements(change: _Change, name: str, period_s: float) -> NDArray
     return out
 
 
-def _interpolated_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Minimum over evenly spaced f of (f, n), interpolated by a parabola through three points: (n,)."""
     at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
     low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))
