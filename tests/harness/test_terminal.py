@@ -221,7 +221,18 @@ def test_progress_needs_a_terminal_that_can_overwrite(monkeypatch: pytest.Monkey
 def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -> None:
     """A pseudo-terminal, a run at a fraction of real time, Ctrl-C once progress is shown."""
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "analogrig.cli", "run", "--real-time", "500", "--dut", "host", "--out", tmp_path]
+    command = [
+        sys.executable,
+        "-m",
+        "analogrig.cli",
+        "run",
+        "--real-time",
+        "500",
+        "--dut",
+        "host",
+        "--out",
+        f"{tmp_path}",
+    ]
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, env=environment) as process:
         os.close(theirs)

@@ -116,15 +116,6 @@ factor = _number_in(1e-3, 1e6, "a number from 0.001 to 1000000", float)
 seconds = _number_in(1e-3, 1e9, "a number of seconds from 0.001 to 1e9", float)
 
 
-def add_time_limit(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--time-limit",
-        type=seconds,
-        metavar="SECONDS",
-        help="end the run after that time; it is then INCONCLUSIVE, and what was recorded is kept (default: no limit)",
-    )
-
-
 def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
     command.add_argument(
         "--dut",
@@ -156,25 +147,6 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
         metavar="FACTOR",
         help="send samples at the machine's rate, or FACTOR times slower; implies --exchange stream",
     )
-
-
-def add_can_log(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--can-log",
-        choices=("log", "blf", "asc", "mf4", "none"),
-        help="format of the CAN log beside run.npz: candump, BLF, ASC or MF4 (default: log on a CAN bus)",
-    )
-
-
-def add_output(command: argparse.ArgumentParser, default: str) -> None:
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path(default),
-        metavar="DIR",
-        help="folder for run.npz and report.html (default: %(default)s)",
-    )
-    add_json(command)
 
 
 def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -11,18 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import (
     FILE,
-    add_can_log,
     add_capture,
     add_command,
     add_dut,
-    add_output,
-    add_time_limit,
+    add_json,
     add_what_to_play,
     changes_of_dut,
     files_read,
     is_capture,
     load_capture,
     open_what_to_play,
+    seconds,
     trust_of,
 )
 from analogrig.cli.terminal import (
@@ -57,9 +56,8 @@ def add_run(commands: Any) -> None:
     )
     add_what_to_play(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")
-    add_output(command, "build/run")
-    add_can_log(command)
-    add_time_limit(command)
+    _add_output(command, "build/run")
+    _add_play(command)
     command.set_defaults(command=_run)
 
 
@@ -75,9 +73,8 @@ def add_replay(commands: Any) -> None:
     command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
     add_dut(command, default=None, shown="that of the recording")
-    add_output(command, "build/replay")
-    add_can_log(command)
-    add_time_limit(command)
+    _add_output(command, "build/replay")
+    _add_play(command)
     command.set_defaults(command=_replay)
 
 
@@ -91,8 +88,33 @@ def add_judge(commands: Any) -> None:
     )
     command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
-    add_output(command, "build/judge")
+    _add_output(command, "build/judge")
     command.set_defaults(command=_judge)
+
+
+def _add_output(command: argparse.ArgumentParser, default: str) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path(default),
+        metavar="DIR",
+        help="folder for run.npz and report.html (default: %(default)s)",
+    )
+    add_json(command)
+
+
+def _add_play(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--can-log",
+        choices=("log", "blf", "asc", "mf4", "none"),
+        help="format of the CAN log beside run.npz: candump, BLF, ASC or MF4 (default: log on a CAN bus)",
+    )
+    command.add_argument(
+        "--time-limit",
+        type=seconds,
+        metavar="SECONDS",
+        help="end the run after that time; it is then INCONCLUSIVE, and what was recorded is kept (default: no limit)",
+    )
 
 
 def _run(arguments: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -26,14 +26,6 @@ _FOLDER = "analogrig_owned"
 
 _SPREADING = ("load", "worksteal")
 """Values of --dist with which pytest-xdist gives any test to any worker."""
-
-
-@runtime_checkable
-class Equipped(Protocol):
-    """An item that names its own rig and device; other plugins' items have no such method."""
-
-    def hil_equipment(self) -> tuple[str, str]:
-        """Names of rig and device; empty if unknown."""
 
 
 @dataclass
@@ -163,8 +155,8 @@ def check_owner(item: pytest.Item) -> None:
 
 def single_equipment(item: pytest.Item) -> str:
     """Description of the single rig or device that a test needs and one worker owns; empty if the test needs none."""
-    if isinstance(item, Equipped):
-        return _single_equipment(*item.hil_equipment())
+    if (equipment := getattr(item, "hil_equipment", None)) is not None:  # a scenario file
+        return _single_equipment(*equipment())
     wanted = getattr(item, "fixturenames", ())
     rig, dut = (option.of(item).value if option.name in wanted else "" for option in (RIG, DUT))
     return _single_equipment(rig, dut)

@@ -15,7 +15,6 @@ from analogrig.testing.plugin.player import Player
 from analogrig.testing.plugin.settings import DUT, RIG, SCENARIO_DIR, Option, time_limit_s, trust_of
 
 if TYPE_CHECKING:
-    from analogrig.scenario import Scenario
     from analogrig.testing.statement import Finding
 
 RIG_KINDS = ("emulator", "real")
@@ -116,33 +115,38 @@ class ScenarioItem(pytest.Item):
     """One scenario: what a test asserted of it holds, or what it expects of the device."""
 
     def runtest(self) -> None:
-        from analogrig.bench import Bench
-        from analogrig.rigs.description import open_rig
-        from analogrig.scenario import Scenario
+        from analogrig.errors import AnalogrigError
+        from analogrig.testing.statement import Finding
+        from analogrig_emulator import EmulatorError
 
         check_owner(self)
+        try:
+            finding = self._judge()
+        except (AnalogrigError, EmulatorError) as error:
+            finding = Finding(holds=False, why=str(error).removeprefix(f"{self.path}: "))
+        if not finding:
+            pytest.fail(f"{self.path}: {finding.why}", pytrace=False)
+
+    def _judge(self) -> Finding:
+        import analogrig.testing.played
+        import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
+        from analogrig.bench import Bench
+        from analogrig.rigs.description import open_rig
+        from analogrig.scenario import DEFAULT_SEED, Scenario
+        from analogrig.testing.statement import judge_statement
+
         scenario = Scenario.load(str(self.path))
+        seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
         devices, name, trust = self.config.stash[DEVICES], self._name(DUT, scenario.dut), trust_of(self.config)
         with open_rig(self._name(RIG, scenario.rig), allow=trust) as rig:
             try:
-                bench = Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config))
-                finding = self._judge(Player(self, bench), scenario)
+                play = Player(self, Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config)))
+                if scenario.statement is None:
+                    return play(scenario).passes()
+                return judge_statement(scenario.statement, play, scenario, seed, str(self.path))
             finally:
                 if name == scenario.dut:
                     devices.release(name)
-        if not finding:
-            raise ScenarioFailed(finding.why)
-
-    def _judge(self, play: Player, scenario: Scenario) -> Finding:
-        import analogrig.testing.played
-        import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
-        from analogrig.scenario import DEFAULT_SEED
-        from analogrig.testing.statement import judge_statement
-
-        if scenario.statement is None:
-            return play(scenario).passes()
-        seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
-        return judge_statement(scenario.statement, play, scenario, seed, str(self.path))
 
     def hil_equipment(self) -> tuple[str, str]:
         """Names of rig and device; empty where the file cannot be read."""
@@ -159,17 +163,5 @@ class ScenarioItem(pytest.Item):
         setting = option.of_session(self.config)
         return setting.value if setting.is_explicit else own or setting.value
 
-    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        from analogrig.errors import AnalogrigError
-        from analogrig_emulator import EmulatorError
-
-        if isinstance(excinfo.value, ScenarioFailed | AnalogrigError | EmulatorError):
-            return f"{self.path}: {str(excinfo.value).removeprefix(f'{self.path}: ')}"
-        return super().repr_failure(excinfo, style)
-
     def reportinfo(self) -> tuple[Path, int, str]:
         return self.path, 0, f"scenario {self.name}"
-
-
-class ScenarioFailed(Exception):  # noqa: N818 - a verdict, not an error
-    """The device did not do what the scenario asks."""
