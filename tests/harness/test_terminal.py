@@ -98,45 +98,33 @@ def test_reason_on_standard_error_is_coloured(terminals: tuple[Terminal, Termina
 
 
 @pytest.mark.parametrize(
-    ("environment", "is_coloured"),
+    ("environment", "on_terminal", "on_pipe"),
     [
-        ({"NO_COLOR": "1"}, False),
-        ({"NO_COLOR": ""}, True),
-        ({"TERM": "dumb"}, False),
-        ({"NO_COLOR": "1", "FORCE_COLOR": "1"}, False),
-        ({"TERM": "dumb", "FORCE_COLOR": "1"}, True),
+        ({}, True, False),
+        ({"NO_COLOR": "1"}, False, False),
+        ({"NO_COLOR": ""}, True, False),
+        ({"TERM": "dumb"}, False, False),
+        ({"NO_COLOR": "1", "FORCE_COLOR": "1"}, False, False),
+        ({"TERM": "dumb", "FORCE_COLOR": "1"}, True, True),
+        ({"FORCE_COLOR": "0"}, True, False),
+        ({"CLICOLOR_FORCE": "1"}, True, True),
     ],
 )
-def test_environment_decides_about_colour_on_a_terminal(
+def test_environment_decides_about_colour(
     environment: dict[str, str],
     *,
-    is_coloured: bool,
+    on_terminal: bool,
+    on_pipe: bool,
     terminals: tuple[Terminal, Terminal],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     terminal.show("FAILED")
-    assert ("\x1b" in terminals[0].getvalue()) is is_coloured
-
-
-@pytest.mark.parametrize(
-    ("environment", "is_coloured"),
-    [({}, False), ({"FORCE_COLOR": "1"}, True), ({"FORCE_COLOR": "0"}, False), ({"CLICOLOR_FORCE": "1"}, True)],
-)
-def test_pipe_is_coloured_on_demand_only(
-    environment: dict[str, str],
-    *,
-    is_coloured: bool,
-    terminals: tuple[Terminal, Terminal],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     pipe = io.StringIO()
     monkeypatch.setattr(terminal, "sys", SimpleNamespace(stdout=pipe, stderr=terminals[1]))
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
     terminal.show("FAILED")
-    assert ("\x1b" in pipe.getvalue()) is is_coloured
+    assert ["\x1b" in stream.getvalue() for stream in (terminals[0], pipe)] == [on_terminal, on_pipe]
 
 
 def test_json_is_never_coloured(terminals: tuple[Terminal, Terminal], monkeypatch: pytest.MonkeyPatch) -> None:
