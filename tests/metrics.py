@@ -35,8 +35,8 @@ CONCRETE = re.compile(
 """Classes of rigs and devices that have an interface."""
 
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("errors", "config", "wording", "catalogue", "_catalogue", "estimator_config", "storage", "header", "plant"),
-    ("run", "scenario", "trust", "identity", "signals", "output"),
+    ("errors", "config", "wording", "catalogue", "_catalogue", "estimator_config", "storage", "plant"),
+    ("run", "scenario", "header", "trust", "identity", "signals", "output"),
     ("links",),
     ("protocol",),
     ("devices", "rigs", "judging"),

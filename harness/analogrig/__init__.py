@@ -25,8 +25,8 @@ test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_se
 errors         ``AnalogrigError`` and its kinds; ``EmulatorError``
 =============  =========================================================================================
 
-``strategies`` (a module) and ``with_some_seed`` need the extra ``analogrig[pytest]``. Importing ``analogrig`` loads
-nothing else: each name loads what it needs on first use.
+``strategies`` (a module) needs the extra ``analogrig[pytest]``. Importing ``analogrig`` loads nothing else: each name
+loads what it needs on first use.
 """
 
 from __future__ import annotations
@@ -55,10 +55,8 @@ if TYPE_CHECKING:
     from analogrig.run import Conditions, Run
     from analogrig.scenario import Expectations, PlantChoice, PotChange, Scenario
     from analogrig.testing import strategies
-    from analogrig.testing.experiment import Play
     from analogrig.testing.played import Played, rate_below
-    from analogrig.testing.properties import with_some_seed
-    from analogrig.testing.statement import Finding
+    from analogrig.testing.statement import Finding, Play, with_some_seed
     from analogrig_emulator import EmulatorError, Excitation
 
     __version__: str
@@ -79,10 +77,8 @@ else:
         "analogrig.rigs.rig": "Rig",
         "analogrig.run": "Conditions Run",
         "analogrig.scenario": "Expectations PlantChoice Scenario PotChange",
-        "analogrig.testing.experiment": "Play",
         "analogrig.testing.played": "Played rate_below",
-        "analogrig.testing.properties": "with_some_seed",
-        "analogrig.testing.statement": "Finding",
+        "analogrig.testing.statement": "Finding Play with_some_seed",
         "analogrig_emulator": "EmulatorError Excitation",
     }
 

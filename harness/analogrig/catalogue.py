@@ -11,65 +11,8 @@ from math import isfinite
 from struct import Struct
 from typing import Any, NamedTuple
 
-from analogrig._catalogue import (
-    CATALOGUE_HASH,
-    LAYOUTS,
-    Alarm,
-    Change,
-    Command,
-    Configure,
-    Configured,
-    Control,
-    Controlled,
-    Counter,
-    Diagnosis,
-    Element,
-    Estimate,
-    Firmware,
-    FirmwareId,
-    Hello,
-    Identify,
-    Key,
-    Message,
-    Result,
-    Sample,
-    SampleBlock,
-    SampleFlag,
-    Status,
-    Stepped,
-    SteppedFlag,
-    Trigger,
-)
-
-__all__ = [
-    "CATALOGUE_HASH",
-    "LAYOUTS",
-    "Alarm",
-    "Change",
-    "Command",
-    "Configure",
-    "Configured",
-    "Control",
-    "Controlled",
-    "Counter",
-    "Diagnosis",
-    "Element",
-    "Estimate",
-    "Firmware",
-    "FirmwareId",
-    "Hello",
-    "Identify",
-    "Key",
-    "Message",
-    "Result",
-    "Sample",
-    "SampleBlock",
-    "SampleFlag",
-    "Status",
-    "Stepped",
-    "SteppedFlag",
-    "Trigger",
-]  # generated names, for import from here
+from analogrig._catalogue import *  # noqa: F403 - the generated names, for import from here
+from analogrig._catalogue import LAYOUTS, Message, SampleBlock, SteppedFlag
 
 BLOCK_SAMPLES = sum(name.startswith("force") for name in LAYOUTS["SampleBlock"].fields)
 """Samples in a full SampleBlock."""

@@ -52,21 +52,23 @@ either."""
 
 
 def fixtures() -> Path:
-    """The folder of the shipped scenarios, rigs and devices: inside the installed package, or that of the checkout."""
-    installed = Path(__file__).parent / "fixtures"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "fixtures"
+    """The folder of the shipped scenarios, rigs and devices."""
+    return _folder("fixtures", "fixtures")
 
 
 def estimator_c() -> Path:
-    """The folder of the estimator's C sources: inside the installed package, or that of the checkout."""
-    installed = Path(__file__).parent / "estimator_c"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "estimator_c"
+    """The folder of the estimator's C sources."""
+    return _folder("estimator_c", "estimator_c")
 
 
 def generated_c() -> Path:
     """The folder of the C that comes from the message catalogue: codecs of the device's messages."""
-    installed = Path(__file__).parent / "estimator_c" / "generated"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "build" / "generated"
+    return _folder("estimator_c/generated", "build/generated")
+
+
+def _folder(in_package: str, in_checkout: str) -> Path:
+    installed = Path(__file__).parent / in_package
+    return installed if installed.is_dir() else Path(__file__).parents[2] / in_checkout
 
 
 def locate(kind: Kind, name: str) -> Path:
@@ -83,7 +85,7 @@ def locate(kind: Kind, name: str) -> Path:
     if _is_file(path):
         return path
     known = ", ".join(names(kind))
-    raise ConfigurationError(f"no {kind[:-1]} is called {_shown(name)}: there are {known}, or give a .toml file")
+    raise ConfigurationError(f"no {kind[:-1]} is called {_quote(name)}: there are {known}, or give a .toml file")
 
 
 def _is_file(path: Path) -> bool:
@@ -200,12 +202,12 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     hints = typing.get_type_hints(cls)
     for key in table:
         if key not in fields:
-            raise ConfigurationError(f"{where}: unknown key {_shown(key)} (known: {', '.join(fields)})")
+            raise ConfigurationError(f"{where}: unknown key {_quote(key)} (known: {', '.join(fields)})")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in table:
             raise ConfigurationError(f"{where}: the key {name!r} is lacking")
-    values = {key: converted(hints[key], value, f"{where}: {key}") for key, value in table.items()}
+    values = {key: convert(hints[key], value, f"{where}: {key}") for key, value in table.items()}
     try:
         return cls(**values)
     except (ValueError, ArithmeticError, ConfigurationError, EmulatorError) as error:
@@ -213,7 +215,7 @@ def build(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         raise ConfigurationError(f"{where}: {str(error).removeprefix(f'{table_name}: ')}") from error
 
 
-def converted(hint: Any, value: Any, where: str) -> Any:
+def convert(hint: Any, value: Any, where: str) -> Any:
     """A plain value as the type ``hint``, as for a field of ``build``; ``where`` leads every error.
 
     :raises ConfigurationError: it is of another type.
@@ -224,14 +226,14 @@ def converted(hint: Any, value: Any, where: str) -> Any:
     if origin is Literal:
         if value in arguments:
             return value
-        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be one of {', '.join(map(repr, arguments))}, not {_quote(value)}")
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(Any, hint), _expect(dict, value, "a table", where), where)
     if origin is tuple:
         return _convert_tuple(arguments, value, where)
     if origin in (Mapping, dict):
         table = _expect(dict, value, "a table", where)
-        return {key: converted(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
+        return {key: convert(arguments[1], item, f"{where}.{key}") for key, item in table.items()}
     return _convert_scalar(hint, value, where)
 
 
@@ -239,14 +241,14 @@ def _convert_union(arguments: tuple[Any, ...], value: Any, where: str) -> Any:
     if (kinds := _by_kind(arguments)) and isinstance(value, dict):
         if "kind" not in value:
             raise ConfigurationError(f"{where}: the key 'kind' is lacking")
-        kind = converted(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
-        return converted(kinds[kind], value, where)
+        kind = convert(Literal[tuple(kinds)], value["kind"], f"{where}: kind")
+        return convert(kinds[kind], value, where)
     problems = []
     for argument in arguments:
         if argument is types.NoneType:
             continue
         try:
-            return converted(argument, value, where)
+            return convert(argument, value, where)
         except ConfigurationError as error:
             problems.append(str(error).removeprefix(f"{where}: "))
     raise ConfigurationError(f"{where}: {'; or '.join(problems)}")
@@ -263,11 +265,11 @@ def _by_kind(arguments: tuple[Any, ...]) -> dict[str, Any]:
 def _convert_tuple(arguments: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
     items = _expect(list, list(value) if isinstance(value, tuple) else value, "an array", where)
     if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return tuple(converted(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
+        return tuple(convert(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(items))
     if len(items) != len(arguments):
         raise ConfigurationError(f"{where}: must have {len(arguments)} elements, not {len(items)}")
     return tuple(
-        converted(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
+        convert(hint, item, f"{where}[{i}]") for i, (hint, item) in enumerate(zip(arguments, items, strict=True))
     )
 
 
@@ -277,9 +279,9 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if hint is float:
         if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER:
             return float(value)
-        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_quote(value)}")
     if hint is int and (isinstance(value, bool) or (isinstance(value, int) and abs(value) > MOST_INTEGER)):
-        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_shown(value)}")
+        raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_quote(value)}")
     words = {int: "a whole number", bool: "true or false", str: "a text"}
     return _expect(hint, value, words[hint], where)
 
@@ -287,10 +289,10 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
 def _expect(kind: type[T], value: Any, words: str, where: str) -> T:
     if isinstance(value, kind):
         return value
-    raise ConfigurationError(f"{where}: must be {words}, not {_shown(value)}")
+    raise ConfigurationError(f"{where}: must be {words}, not {_quote(value)}")
 
 
-def _shown(value: Any) -> str:
+def _quote(value: Any) -> str:
     """A value in an error, in one line of bounded length."""
     return "a longer one" if isinstance(value, int) and abs(value) > MOST_INTEGER else _brief(repr(value))
 

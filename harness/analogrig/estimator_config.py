@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
@@ -18,18 +18,20 @@ TriggerName = Literal["none", "prediction-error", "mean-between-faults", "cusum"
 ResetName = Literal["covariance", "all"]
 EdgeInstants = Literal["locked", "may-slip", "anywhere"]
 
-_RESETS: tuple[ResetName, ...] = ("covariance", "all")
-"""Names in the order of est_reset_t."""
-
-_EDGE_INSTANTS: tuple[EdgeInstants, ...] = ("locked", "may-slip", "anywhere")
-"""Names in the order of est_edge_instants_t."""
-
-_SETTINGS = (
+_MODEL_SETTINGS = (
     *("na", "nb", "nk", "nc", "offset", "noise_estimated", "refresh_n", "stuck_n", "idle_n"),
     *("forgetting", "random_walk", "p0", "p0_offset", "noise_variance", "edge_codes", "code_low", "code_high"),
     *("isolation", "force_zero"),
 )
-"""Fields with the same name and value in the device."""
+_TRIGGER_SETTINGS = ("trigger", "ceiling", "hold_off_n", "warm_up_n", "absolute", "edge_instants", "reset")
+"""Fields with the same name in the device. The coefficients of C come between the two groups."""
+
+_WORDS: Mapping[str, Sequence[str]] = {
+    "trigger": [trigger.name.lower().replace("_", "-") for trigger in Trigger],
+    "edge_instants": get_args(EdgeInstants),
+    "reset": get_args(ResetName),
+}
+"""Fields whose value in the device is the index of a word: in the order of est_edge_instants_t and est_reset_t."""
 
 DEFAULT_ARL0 = 1e5
 
@@ -67,9 +69,7 @@ _IN_RANGE: Mapping[str, tuple[int, int] | tuple[float, float]] = {
     "hold_off_n": _U16,
     "warm_up_n": _U16,
     "absolute": _SWITCH,
-    "trigger": (0, len(Trigger) - 1),
-    "edge_instants": (0, len(_EDGE_INSTANTS) - 1),
-    "reset": (0, len(_RESETS) - 1),
+    **{name: (0, len(words) - 1) for name, words in _WORDS.items()},
 }
 """Widest ranges of est_config_valid() over all builds. Fields with whole limits have whole values."""
 
@@ -165,17 +165,14 @@ class EstimatorConfig:
 
     def settings(self) -> Iterator[tuple[Key, float]]:
         """Every key of the device with its value, in an order that keeps each intermediate state valid."""
-        for name in _SETTINGS:
+        for name in _MODEL_SETTINGS:
             yield Key[name.upper()], float(getattr(self, name))
         for i in range(self.na):
             yield Key[f"C{i + 1}"], self.c[i] if i < len(self.c) else 0.0
-        yield Key.TRIGGER, float(Trigger[self.trigger.replace("-", "_").upper()])
-        if self.statistic_ceiling is not None:
-            yield Key.CEILING, self.statistic_ceiling
-        for name in ("hold_off_n", "warm_up_n", "absolute"):
-            yield Key[name.upper()], float(getattr(self, name))
-        yield Key.EDGE_INSTANTS, float(_EDGE_INSTANTS.index(self.edge_instants))
-        yield Key.RESET, float(_RESETS.index(self.reset))
+        for name in _TRIGGER_SETTINGS:
+            value = self.statistic_ceiling if name == "ceiling" else getattr(self, name)
+            if value is not None:
+                yield Key[name.upper()], float(_WORDS[name].index(value) if name in _WORDS else value)
 
     def check_ranges(self) -> None:
         """:raises ValueError: a setting is out of range in every build of the device."""
@@ -197,18 +194,10 @@ class EstimatorConfig:
                 raise ConfigurationError(f"{where}: {key.name.lower()} = {value:g} is no setting of an estimator")
         table: dict[str, Any] = {}
         kinds: dict[str, Any] = {each.name: type(each.default) for each in dataclasses.fields(cls)}
-        for name in (*_SETTINGS, "ceiling", "hold_off_n", "warm_up_n", "absolute"):
-            if Key[name.upper()] in reported:
+        for name in (*_MODEL_SETTINGS, *_TRIGGER_SETTINGS):
+            if (number := reported.get(Key[name.upper()])) is not None:
                 kind = kinds[name] if kinds[name] in (int, bool) else float
-                table[name] = kind(reported[Key[name.upper()]])
-        words: Mapping[Key, Sequence[str]] = {
-            Key.TRIGGER: [trigger.name.lower().replace("_", "-") for trigger in Trigger],
-            Key.EDGE_INSTANTS: _EDGE_INSTANTS,
-            Key.RESET: _RESETS,
-        }
-        for key, names in words.items():
-            if key in reported:
-                table[key.name.lower()] = names[int(reported[key])]
+                table[name] = _WORDS[name][int(number)] if name in _WORDS else kind(number)
         if table.get("trigger") == "none":
             table.pop("ceiling", None)
         if Key.C1 in reported:

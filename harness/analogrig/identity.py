@@ -98,13 +98,14 @@ def commit() -> str:
 
 def commit_of(checkout: Path) -> str:
     """Commit that a checkout stands at, with ``+dirty`` if tracked files differ from it; empty if git fails."""
-    head = _git(checkout, "rev-parse", f"--short={_COMMIT_DIGITS}", "HEAD")
+    head = git(checkout, "rev-parse", f"--short={_COMMIT_DIGITS}", "HEAD")
     if not head:
         return ""
-    return f"{head}+dirty" if _git(checkout, "status", "--porcelain", "--untracked-files=no") else head
+    return f"{head}+dirty" if git(checkout, "status", "--porcelain", "--untracked-files=no") else head
 
 
-def _git(checkout: Path, *words: str) -> str:
+def git(checkout: Path, *words: str) -> str:
+    """Output of a git command in ``checkout``; empty if it fails."""
     # In a hook git sets GIT_DIR and others, which would name the repository of somebody else.
     environment = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:

@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
-from analogrig.signals import held
+from analogrig.signals import hold_signals
 
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
 
@@ -84,9 +84,9 @@ class OutputFolder:
         self._check_reads()
         make_folder(self.path)
         self._check_places()
-        self._lock = _locked(self.path)
+        self._lock = _lock_folder(self.path)
         try:
-            with held():
+            with hold_signals():
                 self._begin()
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
@@ -112,7 +112,7 @@ class OutputFolder:
 
         :raises RecordingError: not all of it can be written; the folder then says so.
         """
-        with held():
+        with hold_signals():
             try:
                 write(self.parts)
                 self._write_verdict(verdict)
@@ -124,7 +124,7 @@ class OutputFolder:
 
     def fail(self, reason: str) -> None:
         """Mark the folder INCONCLUSIVE for this reason; it holds no other result."""
-        with held():
+        with hold_signals():
             self._concluded = True
             with contextlib.suppress(OSError):  # then the folder still says that the command has not ended
                 for name in self._holds:
@@ -260,7 +260,7 @@ def make_folder(out: Path) -> None:
         raise ConfigurationError(f"--out {out}: cannot be written to")
 
 
-def _locked(folder: Path) -> int | None:
+def _lock_folder(folder: Path) -> int | None:
     """Descriptor that holds the folder until it is closed; None where folders cannot be locked.
 
     :raises ConfigurationError: another command holds it.

@@ -6,14 +6,22 @@ the samples of a run.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 PARAMETERS = ("M", "B", "K")
 """Names of the physical parameters, in the order of every array of them."""
+
+MAX_SAMPLES = 10_000_000
+"""Largest number of samples. A run is kept in memory, about 70 bytes a sample."""
+
+MAX_CHANGES = 1_000
+"""Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
 
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 
@@ -61,6 +69,45 @@ class Plant:
         """Parameters in which ``other`` differs, as ``{name: (before, after)}``."""
         pairs = zip(PARAMETERS, self.parameters().values(), other.parameters().values(), strict=True)
         return {name: (before, after) for name, before, after in pairs if before != after}
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Plant from a sample on, until the next segment. Instants are sample indices."""
+
+    start: int
+    """First sample, or the likeliest one if estimated from the samples."""
+    plant: Plant
+    ramp_n: int = 0
+    """Samples from ``start`` to the end of the ramp; 0: a jump."""
+    start_low: int | None = None
+    """Earliest possible ``start``; None: ``start`` is exact."""
+    start_high: int | None = None
+    """Latest possible ``start``; None: ``start`` is exact."""
+    end_low: int | None = None
+    """Earliest possible end of the ramp; None: ``ramp_n`` is exact."""
+    end_high: int | None = None
+    """Latest possible end of the ramp; None: ``ramp_n`` is exact."""
+    unseen: str = ""
+    """Reason that the change could not be found in the samples; empty otherwise."""
+
+    def earliest(self) -> Self:
+        """The same segment with its change at the earliest possible instants."""
+        return self._move_to(self.start_low, self.end_low)
+
+    def latest(self) -> Self:
+        """The same segment with its change at the latest possible instants."""
+        return self._move_to(self.start_high, self.end_high)
+
+    def _move_to(self, start: int | None, end: int | None) -> Self:
+        start = self.start if start is None else start
+        ramp_n = self.ramp_n if end is None else max(0, end - start)
+        return dataclasses.replace(self, start=start, ramp_n=ramp_n)
+
+    @property
+    def is_exact(self) -> bool:
+        """True if start and end are known, not estimated from the samples."""
+        return self.start_low is None and self.start_high is None and self.end_low is None and self.end_high is None
 
 
 State = tuple[float, float]

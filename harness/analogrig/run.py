@@ -15,7 +15,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, Self
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +23,17 @@ from numpy.typing import NDArray
 from analogrig import config
 from analogrig.catalogue import Change
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.header import check_tables
 from analogrig.identity import Identity
-from analogrig.plant import Plant
-from analogrig.storage import replacing
-
-if TYPE_CHECKING:
-    from analogrig.estimator_config import EstimatorConfig
+from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
+from analogrig.storage import replace_file
 
 FORMAT = "analogrig-run"
 FORMAT_VERSION = 1
 
 CHUNK_SAMPLES = 1 << 16
 """Samples per chunk. Long runs are processed in chunks to bound the memory of intermediate results."""
-
-MAX_SAMPLES = 10_000_000
-"""Largest number of samples. A run is kept in memory, about 70 bytes a sample."""
-
-MAX_CHANGES = 1_000
-"""Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""
 
 MAX_CODES = 1 << 16
 
@@ -115,45 +108,6 @@ def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n,) bool from (n, 4) bool: samples whose force or displacement was clipped."""
     used = [CHANNELS.index(name) for name in MEASURED]
     return np.asarray(clipped[:, used].any(axis=1))
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Plant from a sample on, until the next segment. Instants are sample indices."""
-
-    start: int
-    """First sample, or the likeliest one if estimated from the samples."""
-    plant: Plant
-    ramp_n: int = 0
-    """Samples from ``start`` to the end of the ramp; 0: a jump."""
-    start_low: int | None = None
-    """Earliest possible ``start``; None: ``start`` is exact."""
-    start_high: int | None = None
-    """Latest possible ``start``; None: ``start`` is exact."""
-    end_low: int | None = None
-    """Earliest possible end of the ramp; None: ``ramp_n`` is exact."""
-    end_high: int | None = None
-    """Latest possible end of the ramp; None: ``ramp_n`` is exact."""
-    unseen: str = ""
-    """Reason that the change could not be found in the samples; empty otherwise."""
-
-    def earliest(self) -> Self:
-        """The same segment with its change at the earliest possible instants."""
-        return self._move_to(self.start_low, self.end_low)
-
-    def latest(self) -> Self:
-        """The same segment with its change at the latest possible instants."""
-        return self._move_to(self.start_high, self.end_high)
-
-    def _move_to(self, start: int | None, end: int | None) -> Self:
-        start = self.start if start is None else start
-        ramp_n = self.ramp_n if end is None else max(0, end - start)
-        return dataclasses.replace(self, start=start, ramp_n=ramp_n)
-
-    @property
-    def is_exact(self) -> bool:
-        """True if start and end are known, not estimated from the samples."""
-        return self.start_low is None and self.start_high is None and self.end_low is None and self.end_high is None
 
 
 @dataclass(frozen=True)
@@ -309,7 +263,7 @@ class Run:
         """
         header = json.dumps({"format": FORMAT, "version": FORMAT_VERSION, "conditions": _to_json(self.conditions)})
         arrays = {name: getattr(self, name) for name in _ARRAYS | _OPTIONAL_ARRAYS}
-        with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        with replace_file(path) as file, zipfile.ZipFile(file, "w") as archive:
             for name, array in {"header": np.array(header), **arrays}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     _write_array(member, array)
@@ -342,8 +296,6 @@ class Run:
 
         :raises RecordingError: a table of the header lacks a key that a verdict reads, or has a wrong one.
         """
-        from analogrig.header import check_tables  # imports scenario, which imports this module
-
         conditions = self.conditions
         try:
             return check_tables(

@@ -11,9 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from analogrig import config
-from analogrig.plant import LEAST_PARAMETER, MOST_PARAMETER, Plant
-from analogrig.run import MAX_CHANGES, MAX_SAMPLES, Segment
-from analogrig.trust import FiledName, beside
+from analogrig.plant import LEAST_PARAMETER, MAX_CHANGES, MAX_SAMPLES, MOST_PARAMETER, Plant, Segment
+from analogrig.trust import FiledName, resolve_name
 from analogrig.wording import number_of
 from analogrig_emulator import PROGRAMS, Excitation
 
@@ -197,7 +196,7 @@ class Scenario:
         """
         path = config.locate("scenarios", name)
         scenario = cls.from_table(config.read_toml(path), str(path), default_name=path.stem)
-        rig, dut = (beside(path, each) for each in (scenario.rig, scenario.dut))
+        rig, dut = (resolve_name(path, each) for each in (scenario.rig, scenario.dut))
         return dataclasses.replace(scenario, rig=rig, dut=dut)
 
     @classmethod

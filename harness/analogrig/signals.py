@@ -1,6 +1,7 @@
 """Signals that end a command: SIGINT, SIGTERM and SIGHUP are all handled like Ctrl-C.
 
-Only the command line installs handlers (``ending``). As a library, analogrig leaves the signals of its host alone.
+Only the command line installs handlers (``raise_signals``). As a library, analogrig leaves the signals of its host
+alone.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class _Handler:
         self._first_s: float | None = None
         self._holds = 0
         self._held = ""
-        """Name of the signal that waits for the end of ``held``."""
+        """Name of the signal that waits for the end of ``hold_signals``."""
 
     def __call__(self, number: int, _: FrameType | None) -> None:
         now_s = time.monotonic()
@@ -63,11 +64,11 @@ class _Handler:
 
 
 _handlers: list[_Handler] = []
-"""Handler installed by ``ending``, while it is in force."""
+"""Handler installed by ``raise_signals``, while it is in force."""
 
 
 @contextlib.contextmanager
-def ending() -> Iterator[None]:
+def raise_signals() -> Iterator[None]:
     """Raise Interrupted in the block at the first of ``ENDING``, and end the process at a later one.
 
     A signal that the parent has set to be ignored (``nohup``) stays ignored; one that has a handler keeps it.
@@ -90,7 +91,7 @@ def ending() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def held() -> Iterator[None]:
+def hold_signals() -> Iterator[None]:
     """Delay a first signal until the block ends, so that a file being written is written in full."""
     handler = _handlers[-1] if _handlers and threading.current_thread() is threading.main_thread() else None
     if handler is None:
@@ -103,7 +104,7 @@ def held() -> Iterator[None]:
         handler.release()
 
 
-def awaited() -> asyncio.Future[int]:
+def signal_future() -> asyncio.Future[int]:
     """In a running event loop: a future that raises Interrupted at a signal that ends the command.
 
     There, a handler that raises would end the task that happens to run at that moment.

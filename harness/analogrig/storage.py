@@ -12,7 +12,7 @@ from analogrig.errors import RecordingError
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
+def replace_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write to that takes the place of ``path`` when the block ends well; folders are made as needed.
 
     :raises RecordingError: it cannot be written; whatever stood at ``path`` before still does.

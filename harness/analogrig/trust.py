@@ -46,7 +46,7 @@ class Thing:
     def is_path(self) -> bool:
         return self.kind in ("library", "firmware", "command", "serial port") and Path(self.name).is_absolute()
 
-    def shown(self) -> str:
+    def display_name(self) -> str:
         """Its name as a user would type it here."""
         if not self.is_path:
             return self.name
@@ -54,18 +54,19 @@ class Thing:
         return self.name if relative.startswith("..") else f"./{relative}"
 
     def sentence(self) -> str:
-        text = " ".join((self.order, shlex.join((self.shown(), *self.arguments)) if self.arguments else self.shown()))
+        name = self.display_name()
+        text = f"{self.order} {shlex.join((name, *self.arguments)) if self.arguments else name}"
         return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
-def placed(path: str, folder: Path) -> str:
+def absolute_path(path: str, folder: Path) -> str:
     """A path that a file in ``folder`` names, as an absolute one; an empty one stays empty."""
     return str(folder.absolute() / path) if path else ""
 
 
-def placed_port(url: str, folder: Path) -> str:
-    """Serial port as an absolute path, like ``placed``; a URL stays as it is."""
-    return url if "://" in url else placed(url, folder)
+def absolute_port(url: str, folder: Path) -> str:
+    """Serial port as an absolute path, like ``absolute_path``; a URL stays as it is."""
+    return url if "://" in url else absolute_path(url, folder)
 
 
 class FiledName(str):
@@ -83,7 +84,7 @@ class FiledName(str):
         return FiledName, (str(self), self.file)
 
 
-def beside(file: Path, name: str) -> str:
+def resolve_name(file: Path, name: str) -> str:
     """The name of a rig, device or scenario that ``file`` holds, for use in the working directory.
 
     A relative path is relative to the folder of the file, also behind ``recording:`` and in FILE.toml:TABLE.
@@ -132,8 +133,8 @@ class Trust:
         refused = [thing for thing in things if not self._allows(thing)]
         if not refused:
             return
-        what = _printable(f"{where or file}: {' and '.join(thing.sentence() for thing in refused)}")
-        names = [thing.shown() for thing in refused]
+        what = f"{where or file}: {' and '.join(thing.sentence() for thing in refused)}"
+        names = [thing.display_name() for thing in refused]
         if all(name.isprintable() and len(name) <= MOST_NAME for name in names):
             raise ConfigurationError(f"{what}, which no file may order: pass {self._cure(names)}")
         raise ConfigurationError(f"{what}, which no file may order, and no option can name")
@@ -147,10 +148,6 @@ class Trust:
         if not self._option:
             return f"allow={names!r}"
         return " ".join(f"{self._option} {shlex.quote(name)}" for name in names)
-
-
-def _printable(text: str) -> str:
-    return "".join(each if each.isprintable() else "?" for each in text)
 
 
 def _is_shipped(file: str) -> bool:

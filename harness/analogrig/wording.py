@@ -11,10 +11,10 @@ def one_line(text: str) -> str:
 
     Messages quote files, devices and instruments. Their control characters would drive the user's terminal.
     """
-    return _shortened(printable(" ".join(_shortened(text).split())))
+    return _shorten(printable(" ".join(_shorten(text).split())))
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     end = MOST_MESSAGE // 3
     return text if len(text) <= MOST_MESSAGE else f"{text[: MOST_MESSAGE - end - 5]} ... {text[-end:]}"
 
@@ -23,10 +23,10 @@ def printable(text: str) -> str:
     """The text with control characters, line ends excepted, as escape sequences of Python."""
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
-    return "".join(char if char.isprintable() or char == "\n" else _escaped(char) for char in text)
+    return "".join(char if char.isprintable() or char == "\n" else _escape(char) for char in text)
 
 
-def _escaped(char: str) -> str:
+def _escape(char: str) -> str:
     return char.encode("unicode_escape").decode("ascii")
 
 
@@ -39,7 +39,7 @@ def number_of(n: int, one: str, several: str = "", *, form: str = "") -> str:
     return f"{n:{form}} {one if n == 1 else several or f'{one}s'}"
 
 
-def number_named(n: int, name: str) -> str:
+def counter_text(n: int, name: str) -> str:
     """A counter with its value: ``12 frames foreign``, ``1 error frame`` of frames_foreign and error_frames."""
     words = name.split("_")
     if n == 1:

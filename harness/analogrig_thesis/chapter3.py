@@ -136,6 +136,7 @@ def _measure_convergence(facts: Facts, clean: Mapping[str, Track], first: Track,
         },
     }
 
+
 def _measure_filters(u: Signal, noise: Signal) -> dict[str, Facts]:
     """Values behind the claims about the wind-up of P and the Kalman filter, by identifier."""
     silent, config = u.copy(), SCHEMES["forgetting"]

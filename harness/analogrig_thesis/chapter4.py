@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import Plant
-from analogrig.run import Segment
+from analogrig.plant import Plant, Segment
 from analogrig_thesis.double_precision import PlainEstimator
 from analogrig_thesis.models import (
     ERROR,

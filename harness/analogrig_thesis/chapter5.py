@@ -17,10 +17,10 @@ from analogrig.config import fixtures
 from analogrig.devices.dut import connect
 from analogrig.devices.host import HostDevice
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.plant import AT_REST, Plant, SampledPlant
+from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.rig import Rig
-from analogrig.run import Channel, Run, Segment
+from analogrig.run import Channel, Run
 from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import Excitation
 from analogrig_thesis.models import (

@@ -19,8 +19,8 @@ from scipy.signal import freqz, lfilter, lfiltic
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
-from analogrig.plant import AT_REST, Plant, SampledPlant, physical_parameters
-from analogrig.run import Run, Segment
+from analogrig.plant import AT_REST, Plant, SampledPlant, Segment, physical_parameters
+from analogrig.run import Run
 from analogrig_thesis.texts import Mark, Signal
 
 PERIOD_S = 0.01

@@ -14,7 +14,7 @@ import numpy as np
 
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 from analogrig_thesis import chapter3, chapter4, chapter5
 from analogrig_thesis.chapter4 import Simulation
 from analogrig_thesis.chapter5 import (
@@ -68,11 +68,11 @@ class Reproduction:
         :raises RecordingError: a file cannot be written.
         """
         for name, text in ((PAGE, self.page()), (CLAIMS, self.claims())):
-            with replacing(folder / name) as file:
+            with replace_file(folder / name) as file:
                 file.write(text.encode())
         for name, run in self.circuit.by_file.items():
             run.save(folder / RECORDINGS / f"{name}.npz")
-        with replacing(folder / RECORDINGS / "simulated.npz") as file:
+        with replace_file(folder / RECORDINGS / "simulated.npz") as file:
             np.savez_compressed(file, allow_pickle=False, **self.simulated)
 
     def page(self) -> str:

@@ -23,7 +23,7 @@ CONFIDENCE = 0.998
 
 
 def figures(numbers: Iterable[int] = range(RIGS_N), *, talkative: bool = False) -> Iterator[Figure]:
-    """Distances on two scenarios that were not fitted, kinds told right, and chi-squares value by value."""
+    """Figures of the rigs: distances on two scenarios outside the fit, kinds told right, chi-square of each value."""
     thesis, check, deviations = [], [], dict[str, list[float]]()
     right = 0
     for number in numbers:
@@ -46,7 +46,7 @@ def figures(numbers: Iterable[int] = range(RIGS_N), *, talkative: bool = False) 
 
 
 def _coverage(name: str, z: np.ndarray) -> Figure:
-    """Of standard errors that cover, the chi-square lies in the range that is given with probability CONFIDENCE."""
+    """Chi-square of a value over the rigs. Correct standard errors keep it in the given range with CONFIDENCE."""
     low, high = (float(chi2.ppf(0.5 + side * CONFIDENCE / 2, len(z))) for side in (-1, 1))
     remark = f"expected {len(z)}, {low:.1f} to {high:.1f}; the farthest {np.abs(z).max():.1f} standard errors off"
     return Figure(f"calibration: chi-square of {name}", float(z @ z), "", remark)

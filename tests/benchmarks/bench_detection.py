@@ -1,4 +1,4 @@
-"""How soon the shipped device sees the thesis's changes, over 100 seeds, against the information bound.
+"""Detection delay of the shipped device for the thesis's changes, over 100 seeds, beside the information bound.
 
 python -m tests.benchmarks.bench_detection [FIRST_SEED END_SEED]
 """
@@ -23,7 +23,7 @@ CASES = [(scenario, rig) for rig in ("emulator", "emulator-0-10v") for scenario 
 
 
 def figures(first_seed: int = DEFAULT_SEEDS[0], end_seed: int = DEFAULT_SEEDS[1]) -> Iterator[Figure]:
-    """What the device missed, raised falsely and estimated; bounds are two standard errors either side."""
+    """Missed changes, false alarms and estimates of the device; bounds are two standard errors either side."""
     for scenario, rig in CASES:
         detection = detect(scenario, rig, range(first_seed, end_seed))
         name = f"{scenario} on {rig}"

@@ -1,4 +1,4 @@
-"""How fast the emulator is, beside ngspice on the same deck.
+"""Speed of the emulator, beside ngspice on the same deck.
 
 python -m tests.benchmarks engine
 
@@ -52,7 +52,7 @@ THESIS_TWEAKS: tuple[PotTurn, ...] = (
 )
 
 REPEATS = 5
-"""The best of so many is reported."""
+"""Number of repetitions, of which the best is reported."""
 
 RATE_HZ = 20e3
 LSB_V = 10.0 / 4096
@@ -99,7 +99,7 @@ def run_trials(count: int, *, noisy: bool = False) -> None:
 
 
 def digitise(card: Card, samples: int, *, noisy: bool) -> None:
-    """Circuit and card, 4 channels, in blocks."""
+    """Play circuit and card with 4 channels, in blocks."""
     sampler = Sampler(card, np.random.default_rng(1))
     for volts in front(1, noisy=noisy).play(Excitation(), samples, (), 4096):
         sampler.sample(volts)
@@ -118,7 +118,7 @@ def streams() -> Iterator[tuple[str, Excitation]]:
 
 
 def with_states(states: int) -> Circuit:
-    """The front suspension with low-passes behind its output, one state each."""
+    """Front suspension with low-passes behind its output, one state each."""
     ends = ["u5", *(f"x{i}" for i in range(states - 7))]
     elements = list(SuspensionComputer("front").circuit.elements)
     for i, (a, b) in enumerate(itertools.pairwise(ends)):
@@ -181,7 +181,7 @@ def decks(samples: int, tweaks: Sequence[PotTurn]) -> Iterator[str]:
 
 
 def variants(deck: str) -> Iterator[str]:
-    """A deck with time points on every sample, with time points at the start alone, and so with leaner op-amps.
+    """Variants of a deck: time points on every sample, at the start alone, and the latter with leaner op-amps.
 
     Without any time point at the start ngspice's first step is too long, and it misses the first edge by 0.3 LSB.
     """
@@ -193,7 +193,7 @@ def variants(deck: str) -> Iterator[str]:
 
 
 def _replaced(expression: str, by: str, deck: str) -> str:
-    """The deck with its one match replaced: a deck that is no longer written so must not be measured by mistake."""
+    """Replace the one match in a deck. Another number of matches would measure the wrong deck and is an error."""
     out, count = re.subn(expression, by, deck, flags=re.MULTILINE)
     if count != 1:
         raise ValueError(f"the deck has {count} matches of {expression!r}: adapt tests/benchmarks to the deck's text")
@@ -201,7 +201,7 @@ def _replaced(expression: str, by: str, deck: str) -> str:
 
 
 def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:
-    """Seconds of processor, and the displacement at the samples in V."""
+    """CPU time in seconds, and the displacement at the samples in V."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "deck.cir").write_text(deck)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -213,7 +213,7 @@ def simulate(deck: str, samples: int) -> tuple[float, NDArray[np.float64]]:
 
 
 def fastest_ngspice_s(samples: int, tweaks: Sequence[PotTurn]) -> float:
-    """Of the decks that come within TOLERATED_LSB of the displacement at every sample."""
+    """Fastest deck that comes within TOLERATED_LSB of the displacement at every sample."""
     exact = np.concatenate(list(SuspensionComputer("front").play(Excitation(), samples, tweaks)))[:, 1]
     runs = [simulate(deck, samples) for deck in decks(samples, tweaks)]
     return min(spent_s for spent_s, volts in runs if np.abs(volts - exact).max() <= TOLERATED_LSB * LSB_V)

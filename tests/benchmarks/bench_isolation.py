@@ -1,4 +1,4 @@
-"""Which of M, B, K has changed: how often right, how soon against the isolation bound, and the extent.
+"""Isolation of changes of M, B and K: error rate, delay beside the isolation bound, and extent.
 
 Full range, 12 bits and 1 LSB; 400 trials a cell, random phase and onset, fixed seed.
 """

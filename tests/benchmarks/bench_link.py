@@ -1,4 +1,4 @@
-"""How fast samples go through a device, with all elements of the estimate returned for every one; and real time.
+"""Sample rate through a device that returns every element of the estimate for every sample; and real time.
 
 python -m tests.benchmarks link
 """
@@ -29,7 +29,7 @@ from .figure import Figure
 SAMPLES = 20_000
 SAMPLES_SLOW = 3000
 REPEATS = 5
-"""The best of so many is reported: the machine is shared."""
+"""Number of repetitions, of which the best is reported: the machine is shared."""
 REAL_TIME_S = 60.0
 
 QEMU = (
@@ -63,11 +63,11 @@ CASES: tuple[DeviceDescription, ...] = (
     ),
 )
 SLOW = ("QEMU", "CAN")
-"""Names of those that play fewer samples."""
+"""Names of devices that play fewer samples."""
 
 
 def samples_per_s(description: DeviceDescription, samples: int) -> float:
-    """Of one run with ARX(2, 3), offset and the default trigger."""
+    """Rate of one run with ARX(2, 3), offset and the default trigger."""
     index = np.arange(samples)
     force = np.where((index // 50) % 2, 3900, 150).astype(np.uint16)
     displacement = (2000 + 3 * (index % 100)).astype(np.uint16)
@@ -79,7 +79,7 @@ def samples_per_s(description: DeviceDescription, samples: int) -> float:
 
 
 def overruns(duration_s: float) -> Pace:
-    """Of a run of the emulator and the host device in real time."""
+    """Figures of a run of the emulator and the host device in real time."""
     paces = []
 
     class Watched(Bench):
@@ -94,7 +94,7 @@ def overruns(duration_s: float) -> Pace:
 
 
 def figures() -> Iterator[Figure]:
-    """One for each way of exchange; the bounds are the slowest and the fastest run."""
+    """One figure for each exchange mode; the bounds are the slowest and the fastest run."""
     for description in CASES:
         samples = SAMPLES_SLOW if any(word in description.name for word in SLOW) else SAMPLES
         rates = [samples_per_s(description, samples) for _ in range(REPEATS)]

@@ -1,4 +1,4 @@
-"""How well the instant of a turn is learned from the samples: coverage of its interval, and its width beside the least
+"""Dating of pot changes from the samples: coverage of the interval, and its width beside the least
 that any could have. Trials of tests.harness.dating_trials; fixed seeds.
 
 python -m tests.benchmarks.bench_onset [jump] [ramp] [still] [several]
@@ -32,9 +32,9 @@ CLOCKS: tuple[Clock, ...] = ("card", "free")
 
 WRONG_BY_N = (2, 5, 10, 30, 100)
 SIZES = {"below 10 %": 0.1, "below 20 %": 0.2, "below 40 %": 0.4, "more": 1.0}
-"""Of a change, as a part of the larger value."""
+"""Largest change of each class, as a part of the larger value."""
 WRONG_N = 25
-"""Records, of which every turn is told wrong."""
+"""Number of records in which every given instant is wrong."""
 
 Found = TypeVar("Found", Instant, TurnInstants)
 
@@ -73,7 +73,7 @@ def _searched(
     clock: Clock,
     trials: int,
 ) -> tuple[list[tuple[Trial, Found]], float]:
-    """The trials of which something was found, with it; and the CPU time of one search, ms."""
+    """Trials in which something was found, with it; and the CPU time of one search, ms."""
     played = [play(seed, clock) for seed in range(trials)]
     begun_s = time.process_time()
     found = [search(trial) for trial in played]
@@ -91,14 +91,14 @@ def _width(name: str, intervals: Sequence[Instant], remark: str) -> Figure:
 
 
 def quiet(trials: int = STILL_N) -> Iterator[Figure]:
-    """Pots that were to be turned, and were not."""
+    """Records in which a planned pot change was left out."""
     for clock in CLOCKS:
         said = [isinstance(still(seed, clock).date_jump(), NoInstant) for seed in range(trials)]
         yield _coverage(f"no turn, clock {clock}: said so", said, trials)
 
 
 def several(records: int = SEVERAL_N) -> Iterator[Figure]:
-    """Eight turns a record, each looked for in all samples that no other one changes; then told wrong instants of."""
+    """Eight pot changes a record, each searched between its neighbours; then with wrong instants given."""
     for clock in CLOCKS:
         yield from _told(f"several, clock {clock}", [Several.of(seed, clock) for seed in range(records)])
     with _served() as rig:
@@ -132,7 +132,7 @@ def _told(name: str, every: Sequence[Several]) -> Iterator[Figure]:
 
 
 def _wrong(name: str, every: Sequence[Several]) -> Iterator[Figure]:
-    """By the error of the instant, either way, and the size of the change."""
+    """Figures by the error of the given instant, either way, and by the size of the change."""
     for error_n in WRONG_BY_N:
         said: dict[str, list[bool]] = {size: [] for size in SIZES}
         for record in every:
@@ -150,7 +150,7 @@ def _size(tweak: PlannedChange) -> str:
 
 
 def _doubted(record: Several, tweak: PlannedChange, alone: range, error_n: int) -> bool:
-    """The turn by itself, told so many samples beside where it was."""
+    """True if the change alone contradicts an instant that is given ``error_n`` samples off."""
     first = alone.start - 1
     told = dataclasses.replace(tweak, sample=tweak.sample - first + error_n)
     return bool(contradictions(record.signals.part(first, alone.stop), [told], first))
@@ -169,7 +169,7 @@ PARTS: Mapping[str, Callable[[], Iterator[Figure]]] = {"jump": jumps, "ramp": ra
 
 
 def figures(*parts: str) -> Iterator[Figure]:
-    """The rows of the parts named, or of all."""
+    """Figures of the named parts, or of all."""
     for part in parts or PARTS:
         yield from PARTS[part]()
 

@@ -22,7 +22,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
-from analogrig.testing.properties import TRIES, is_playable
+from analogrig.testing.properties.experiments import is_playable
 from analogrig.testing.properties.test_detection import (
     ARL0,
     DOUBTFUL_LATENCY,
@@ -33,6 +33,7 @@ from analogrig.testing.properties.test_detection import (
     PLAYS_N,
 )
 from analogrig.testing.properties.test_estimates import WITHIN
+from analogrig.testing.statement import TRIES
 from analogrig.testing.strategies import profile, scenarios, seeds
 
 from .figure import Figure
@@ -42,7 +43,7 @@ EXAMPLES = profile("ci").max_examples
 
 
 def figures() -> Iterator[Figure]:
-    """Chances a run of all tests."""
+    """Probabilities of a false failure in a run of all tests."""
     yield from _latency()
     clipped = _trials("emulator-0-10v")
     thesis = Scenario.load("thesis")
@@ -63,7 +64,7 @@ def _trials(name: str) -> Trials:
 
 
 def _of_some_seed(name: str, failed: int, plays: int) -> Figure:
-    """That of so many examples one fails with every seed, from how many single plays have."""
+    """Probability that one example fails with every seed, from the failures of single plays."""
     chance = EXAMPLES * upper_rate(failed, plays, CONFIDENCE) ** TRIES
     return Figure(f"chance to fail a sound device: {name} ({failed} of {plays} plays failed)", chance, "a run")
 
@@ -74,7 +75,7 @@ def _failures(
     statement: Callable[[Played], object],
     is_meant: Callable[[Scenario], bool],
 ) -> tuple[int, int]:
-    """How many of the scenarios that were drawn fail, and their number."""
+    """Number of drawn scenarios that fail, and of those played."""
     rig = open_rig("emulator")
     held: list[bool] = []
 
@@ -96,8 +97,7 @@ def _failures(
 
 
 def _latency() -> Iterator[Figure]:
-    """The mean over many plays, by Chernoff's bound from the distribution of one: its tail is longer than a normal
-    one's."""
+    """Ratio of latency to bound, and the probability to fail a sound device: Chernoff's bound, as the tail is long."""
     trials, thesis = _trials("emulator"), Scenario.load("thesis")
     latency_n, bound_n = np.array([_sums(Played(trials.run(thesis, 1000 + seed))) for seed in range(PLAYS)]).T
     ratio = latency_n.sum() / bound_n.sum()
@@ -110,12 +110,12 @@ def _latency() -> Iterator[Figure]:
 
 
 def _sums(played: Played) -> tuple[float, float]:
-    """Of latencies and bounds, in samples."""
+    """Sums of the latencies and of the bounds of a play, in samples."""
     tweaks = played.verdict.tweaks
     return float(sum(each.latency_n or 0 for each in tweaks)), float(sum(each.bound_n or 0 for each in tweaks))
 
 
 def _beyond(values: NDArray[np.float64], count: int) -> float:
-    """A bound of the probability that so many values, drawn from these, add up to more than 0."""
+    """Upper bound of the probability that so many values, drawn from these, add up to more than 0."""
     logs = [np.log(np.mean(np.exp(theta * values))) for theta in np.linspace(0.001, 2.0, 400)]
     return float(np.exp(count * min(logs)))

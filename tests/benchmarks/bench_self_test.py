@@ -1,4 +1,4 @@
-"""How often the self-test finds something wrong with a machine that is within tolerance, and how near it comes to that.
+"""False-positive rate of the self-test on machines within tolerance, and their distance from its limits.
 
 python -m tests.benchmarks self-test
 """
@@ -17,13 +17,13 @@ from analogrig.run import CHANNELS
 from .figure import Figure
 
 MACHINES = 200
-"""Of each program, drawn from the seeds from 0 on."""
+"""Machines of each program, drawn from the seeds from 0 on."""
 
 CONFIDENCE = 0.95
 
 
 def figures() -> Iterator[Figure]:
-    """Machines that are found wrong; the largest part of its limit that each quantity takes."""
+    """Machines with a false positive; for each quantity the largest part of its limit that was measured."""
     card = CardDescription(range_v=dict.fromkeys(CHANNELS, (-10.0, 10.0)), noise_lsb=1.0)
     rig = EmulatorRig(EmulatorDescription(card, computer=ComputerDescription(components="polyester"), name="drawn"))
     for program in ("front", "shock"):

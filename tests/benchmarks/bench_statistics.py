@@ -1,4 +1,4 @@
-"""How soon the estimator sees a change against the information bound, how often it is wrong, and how well it estimates.
+"""Statistics of the estimator: detection delay beside the information bound, false alarms, and errors of estimates.
 
 Plants of tests.estimator_c.plants; at least 400 trials a cell, random phase and onset, fixed seeds, ARL0 = 1e5.
 
@@ -43,7 +43,7 @@ def changes(excitation: Excitation) -> Iterator[tuple[str, float]]:
 def delays(
     estimator: Estimator, settings: Settings, excitations: Mapping[Excitation, float], trials: int
 ) -> Iterator[Figure]:
-    """One row a change; excitations with the ratio that is allowed."""
+    """One figure a change; excitations with the allowed ratio."""
     for excitation, limit in excitations.items():
         for seed, (parameter, factor) in enumerate(changes(excitation)):
             found = delay(estimator, settings, (FRONT, FRONT.scaled(parameter, factor)), excitation, trials, seed)
@@ -101,7 +101,7 @@ PARTS: Mapping[str, Callable[[Estimator], Iterator[Figure]]] = {
 
 
 def figures(*parts: str) -> Iterator[Figure]:
-    """The rows of the parts named, or of all."""
+    """Figures of the named parts, or of all."""
     with tempfile.TemporaryDirectory() as folder:
         estimator = Estimator(compile_driver(Path(folder)))
         for part in parts or PARTS:

@@ -1,4 +1,4 @@
-"""How fast closed-loop trials go: circuit, card and estimator in one process; and what a second process is worth.
+"""Speed of closed-loop trials with circuit, card and estimator in one process, and the gain by a second process.
 
 python -m tests.benchmarks trials
 
@@ -25,7 +25,7 @@ from analogrig.scenario import Scenario
 from .figure import Figure
 
 REPEATS = 5
-"""The best of so many is reported: the machine is shared."""
+"""Number of repetitions, of which the best is reported: the machine is shared."""
 
 LONG_N, THESIS_LATER_N = 100_000, 20_000
 
@@ -63,7 +63,7 @@ def _cases() -> Iterator[tuple[str, Scenario, int]]:
 
 
 def _rate(play: Callable[[Scenario, int], object], scenario: Scenario, count: int) -> float:
-    """The best of REPEATS."""
+    """Best of REPEATS."""
     play(scenario, 0)
     best_s = float("inf")
     for _ in range(REPEATS):
@@ -75,7 +75,7 @@ def _rate(play: Callable[[Scenario, int], object], scenario: Scenario, count: in
 
 
 def rate_of_this_process() -> float:
-    """Of long healthy trials, by CPU time."""
+    """Rate of long healthy trials, by CPU time."""
     rig = open_rig("emulator")
     assert isinstance(rig, EmulatorRig)
     _, scenario, count = next(_cases())
@@ -83,14 +83,14 @@ def rate_of_this_process() -> float:
 
 
 def _processes(count: int) -> float:
-    """The sum of the rates of so many at the same time."""
+    """Sum of the rates of so many processes at the same time."""
     program = f"from {__name__} import rate_of_this_process; print(rate_of_this_process())"
     running = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(count)]
     return sum(float(process.communicate()[0]) for process in running)
 
 
 def _certificate(*command: str) -> tuple[float, float]:
-    """On the wall and of CPU time, start and end of the command included."""
+    """Wall-clock and CPU time of a command, start and end included."""
     before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-m", "analogrig.cli", *command], check=True, stdout=subprocess.DEVNULL)
     wall_s, after = time.perf_counter() - start_s, resource.getrusage(resource.RUSAGE_CHILDREN)

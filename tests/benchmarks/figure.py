@@ -1,4 +1,4 @@
-"""What a benchmark measures, as a line of a table and as an entry of build/bench.json."""
+"""Figures of benchmarks: lines of a table and entries of build/bench.json."""
 
 from __future__ import annotations
 

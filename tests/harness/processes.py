@@ -1,4 +1,4 @@
-"""What the operating system says about processes."""
+"""Processes, as the operating system shows them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def ends(pid: int, within_s: float = LONG_S) -> bool:
-    """Whether a process ends in time, or has ended."""
+    """True if a process ends in time, or has ended."""
     try:
         fd = os.pidfd_open(pid)
     except ProcessLookupError:

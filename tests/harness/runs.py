@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.catalogue import Change
-from analogrig.plant import Plant
-from analogrig.run import CHANNELS, Channel, Conditions, Run, Segment
+from analogrig.plant import Plant, Segment
+from analogrig.run import CHANNELS, Channel, Conditions, Run
 
 N_PER_CODE, M_PER_CODE = 2940.0 / 4096, 0.1996 / 4096
 

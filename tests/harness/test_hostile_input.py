@@ -27,7 +27,7 @@ from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.recordings.files import CapturedFrames
 from analogrig.scenario import Scenario
-from analogrig.wording import MOST_MESSAGE, number_named, number_of, one_line
+from analogrig.wording import MOST_MESSAGE, counter_text, number_of, one_line
 
 SCENARIO = """
 samples = 300
@@ -58,7 +58,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 Rewrite = Callable[[dict[str, Any], dict[str, Any]], object]
-"""Of the conditions in the header, and of the arrays."""
+"""Change to the conditions in the header and to the arrays."""
 
 
 def rewritten(recording: Path, path: Path, change: Rewrite) -> Path:
@@ -474,9 +474,9 @@ def test_counts_have_their_nouns_in_number() -> None:
     assert number_of(0, "false alarm") == "0 false alarms"
     assert number_of(1234, "sample", form=",") == "1,234 samples"
     assert number_of(1, "sample was", "samples were") == "1 sample was"
-    assert number_named(1, "error_frames") == "1 error frame"
-    assert number_named(2, "frames_foreign") == "2 frames foreign"
-    assert number_named(1, "messages_of_other_runs") == "1 message of other runs"
+    assert counter_text(1, "error_frames") == "1 error frame"
+    assert counter_text(2, "frames_foreign") == "2 frames foreign"
+    assert counter_text(1, "messages_of_other_runs") == "1 message of other runs"
 
 
 def test_message_of_any_length_is_one_printable_line() -> None:

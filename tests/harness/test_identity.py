@@ -53,7 +53,6 @@ def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 
 
 def test_run_says_what_made_it_everywhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Item 9: neither version nor commit, no command line, no hash of the device's library, no date."""
     mine = Path(shutil.copy(LIBRARY, tmp_path / "mine one.so"))
     begun = datetime.now(UTC).replace(microsecond=0)
     words = ["run", "--dut", f"inproc:{mine}", "--out", str(tmp_path / "out"), "--json"]

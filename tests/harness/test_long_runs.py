@@ -13,10 +13,10 @@ import pytest
 
 from analogrig.config import locate
 from analogrig.judging.verdict import judge
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.reporting import render
 from analogrig.reporting.payload import MOST_POINTS, Piece, condense, pieces
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from tests.harness.long_runs import FIRM, long_run
 from tests.harness.reported import Page
 

@@ -77,7 +77,7 @@ def check_inconclusive(folder: Path, reason: str) -> None:
 
 
 def test_device_that_does_not_answer_leaves_no_older_verdict(out: Path) -> None:
-    """Item 6: the PASSED report of an earlier run stood there, for a CI job to publish."""
+    """A CI job would publish the PASSED report of an earlier run."""
     assert main(["run", "--dut", "inproc", "--wire-faults", "drop@1.0", "--out", str(out)]) == 2
     check_inconclusive(out, "Hello")
 
@@ -174,7 +174,7 @@ def test_disk_that_is_full_at_the_start_leaves_no_older_verdict(out: Path, monke
 
 @contextmanager
 def long_run(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A run of a hundred thousand samples into ``folder``, whose first ones have gone to the device."""
+    """A run of two million samples into ``folder``, whose first ones have gone to the device."""
     scenario = folder.with_name("long.toml")
     text = (ROOT / "fixtures/scenarios/healthy.toml").read_text()
     scenario.write_text(re.sub(r"samples = \d+", "samples = 2000000", text))
@@ -204,7 +204,7 @@ def test_folder_says_from_the_start_that_the_run_has_not_ended(out: Path) -> Non
 
 @pytest.mark.parametrize("number", ENDING)
 def test_signal_keeps_what_was_recorded(out: Path, number: signal.Signals) -> None:
-    """Item 8: only Ctrl-C did. The signal comes twice, as from ``timeout``, which is one request."""
+    """The signal comes twice, as from ``timeout``, which is one request."""
     with long_run(out) as process:
         process.send_signal(number)
         process.send_signal(number)
@@ -223,7 +223,7 @@ import time
 from analogrig import signals
 signals.AGAIN_S = {again_s}
 try:
-    with signals.ending(), signals.held():
+    with signals.raise_signals(), signals.hold_signals():
         print("ready", flush=True)
         while {forever} or not signals._handlers[-1]._held:
             time.sleep(0.01)
@@ -258,7 +258,7 @@ COMPILED = """
 import os, signal, sys
 from analogrig import signals
 try:
-    with signals.ending():
+    with signals.raise_signals():
         exec("os.kill(os.getpid(), signal.SIGINT)")
 except KeyboardInterrupt:
     sys.exit(130)
@@ -343,7 +343,7 @@ def test_log_of_an_earlier_run_goes_with_it(out: Path) -> None:
 
 
 def test_earlier_results_stay_within_where_nothing_may_stand_beside(out: Path) -> None:
-    """As where the folder is a volume of its own."""
+    """A volume of its own has no place beside it."""
     previous_of(out).write_text("in the way")
     assert main(["run", "--dut", "none.toml", "--out", str(out)]) == 2
     assert verdict(out)["outcome"] == "inconclusive"
@@ -403,7 +403,7 @@ class Killer:
 
 
 def result(folder: Path) -> tuple[Callable[[Path], None], dict[str, str]]:
-    """What a run that has passed puts in place, and its verdict."""
+    """Writer of the files of a run that has passed, and its verdict."""
     recording, page = (folder / "run.npz").read_bytes(), (folder / "report.html").read_text()
 
     def write(parts: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a play shows, as a test says it."""
+"""Statements about a play, and the rate over several."""
 
 from __future__ import annotations
 

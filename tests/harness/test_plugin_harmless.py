@@ -206,7 +206,7 @@ def test_start_loads_only_the_modules_of_the_plugin() -> None:
 
 def test_every_name_of_the_plugin_carries_its_prefix() -> None:
     from analogrig.testing import plugin
-    from analogrig.testing.plugin.options import OPTIONS
+    from analogrig.testing.plugin.settings import OPTIONS
 
     fixtures = {
         name for name, value in vars(plugin).items() if type(value).__name__ == "FixtureFunctionDefinition"
@@ -220,7 +220,7 @@ def test_every_name_of_the_plugin_carries_its_prefix() -> None:
         "hil_runs_dir",
         "hil_scenario_dir",
     }
-    assert all(option.flag.startswith("--hil-") and option.ini.startswith("hil_") for option in OPTIONS)
+    assert all(option.flag.startswith("--hil-") and option.name.startswith("hil_") for option in OPTIONS)
 
 
 def test_help_names_every_option_with_its_source(repository: pytest.Pytester) -> None:

@@ -17,12 +17,12 @@ from analogrig.devices.dut import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging import information
 from analogrig.judging.verdict import as_json, judge
-from analogrig.plant import Plant, SampledPlant
+from analogrig.plant import Plant, SampledPlant, Segment
 from analogrig.reporting.export import netlist
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from analogrig.scenario import PlantChoice, PotChange, Scenario
 from analogrig_emulator import PROGRAMS, SuspensionComputer
 from tests.harness.runs import made_run

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +22,7 @@ from analogrig.devices.host import host_child
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
-from analogrig.testing.experiment import Play, judged
+from analogrig.testing.statement import Play, judge_statement
 from analogrig_emulator import Excitation
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import ends
@@ -80,7 +78,7 @@ def refused(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
 
 
 def properties(user: pytest.Pytester, file: str = "junit.xml") -> dict[str, str]:
-    """Those of the first test case."""
+    """Properties of the first test case."""
     case = ET.parse(user.path / file).getroot().find(".//testcase")  # noqa: S314 - written a moment ago
     assert case is not None
     return {each.attrib["name"]: each.attrib["value"] for each in case.iter("property")}
@@ -436,17 +434,6 @@ def board() -> Iterator[str]:
         child.end()
 
 
-def test_nothing_heavy_is_imported_before_a_test_asks() -> None:
-    heavy = "{'numpy', 'hypothesis', 'scipy', 'can'}"
-    collect = "pytest.main(['--collect-only', '-q', '-p', 'no:cacheprovider', '/dev/null'])"
-    script = f"import sys, pytest; {collect}; print(sorted({heavy} & set(sys.modules)))"
-    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": "analogrig.testing.plugin"}
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment, cwd="/"
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
 # ------------------------------------------------------------------------------------------------ folder of what failed
 
 
@@ -454,7 +441,7 @@ DETECTS_SOON = PLAYS.format(assertion="assert played.detects(within={within})")
 
 
 def again(user: pytest.Pytester, *arguments: str) -> pytest.RunResult:
-    """What an earlier session has left, as a suite."""
+    """Run the counterexamples of an earlier session as a suite."""
     return run(user, "build/runs", "--hil-scenario-dir", "build/runs", *arguments)
 
 
@@ -479,7 +466,7 @@ def test_property_that_failed_fails_again_with_its_device_until_it_is_mended(use
 def test_property_that_failed_with_every_seed_is_tried_with_every_seed_again(user: pytest.Pytester) -> None:
     user.makepyfile(
         """
-        from analogrig.testing.properties import with_some_seed
+        from analogrig import with_some_seed
 
         def test_it(hil_play):
             assert with_some_seed(hil_play, "short.toml", 7, lambda played: played.estimates(within=1e-5), tries=3)
@@ -526,7 +513,7 @@ def test_shipped_property_in_a_file_sets_the_device_itself_and_judges_by_the_lim
 def test_statement_that_says_nothing_is_refused_before_anything_is_played(told: dict[str, Any], complaint: str) -> None:
     statement = config.build(Statement, told, "the file: statement")
     with pytest.raises(ConfigurationError, match=f"the file: statement: {complaint}"):
-        judged(statement, cast(Play, None), Scenario.load("thesis"), 1, "the file")
+        judge_statement(statement, cast(Play, None), Scenario.load("thesis"), 1, "the file")
 
 
 def test_device_elsewhere_is_not_opened_on_the_word_of_a_file(user: pytest.Pytester) -> None:

@@ -12,10 +12,11 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.devices.dut import open_dut
 from analogrig.judging.verdict import judge
+from analogrig.plant import Segment
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from analogrig.scenario import PotChange, Scenario
 
 RECORD_N = 700

@@ -1,4 +1,4 @@
-"""What the strategies draw: playable, within what the device is held to, and simple when it is shrunk."""
+"""The strategies draw scenarios that are playable, within what the device is held to, and simple when it is shrunk."""
 
 from __future__ import annotations
 

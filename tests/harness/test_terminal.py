@@ -1,4 +1,4 @@
-"""What a command shows while it works."""
+"""Progress, colour and messages on a terminal."""
 
 from __future__ import annotations
 
@@ -98,45 +98,33 @@ def test_reason_on_standard_error_is_coloured(terminals: tuple[Terminal, Termina
 
 
 @pytest.mark.parametrize(
-    ("environment", "is_coloured"),
+    ("environment", "on_terminal", "on_pipe"),
     [
-        ({"NO_COLOR": "1"}, False),
-        ({"NO_COLOR": ""}, True),
-        ({"TERM": "dumb"}, False),
-        ({"NO_COLOR": "1", "FORCE_COLOR": "1"}, False),
-        ({"TERM": "dumb", "FORCE_COLOR": "1"}, True),
+        ({}, True, False),
+        ({"NO_COLOR": "1"}, False, False),
+        ({"NO_COLOR": ""}, True, False),
+        ({"TERM": "dumb"}, False, False),
+        ({"NO_COLOR": "1", "FORCE_COLOR": "1"}, False, False),
+        ({"TERM": "dumb", "FORCE_COLOR": "1"}, True, True),
+        ({"FORCE_COLOR": "0"}, True, False),
+        ({"CLICOLOR_FORCE": "1"}, True, True),
     ],
 )
-def test_environment_decides_about_colour_on_a_terminal(
+def test_environment_decides_about_colour(
     environment: dict[str, str],
     *,
-    is_coloured: bool,
+    on_terminal: bool,
+    on_pipe: bool,
     terminals: tuple[Terminal, Terminal],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     terminal.show("FAILED")
-    assert ("\x1b" in terminals[0].getvalue()) is is_coloured
-
-
-@pytest.mark.parametrize(
-    ("environment", "is_coloured"),
-    [({}, False), ({"FORCE_COLOR": "1"}, True), ({"FORCE_COLOR": "0"}, False), ({"CLICOLOR_FORCE": "1"}, True)],
-)
-def test_pipe_is_coloured_on_demand_only(
-    environment: dict[str, str],
-    *,
-    is_coloured: bool,
-    terminals: tuple[Terminal, Terminal],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     pipe = io.StringIO()
     monkeypatch.setattr(terminal, "sys", SimpleNamespace(stdout=pipe, stderr=terminals[1]))
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
     terminal.show("FAILED")
-    assert ("\x1b" in pipe.getvalue()) is is_coloured
+    assert ["\x1b" in stream.getvalue() for stream in (terminals[0], pipe)] == [on_terminal, on_pipe]
 
 
 def test_json_is_never_coloured(terminals: tuple[Terminal, Terminal], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,51 +138,51 @@ def test_json_has_null_for_numbers_that_are_not_finite(capsys: pytest.CaptureFix
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.0, [None]], "c": {"d": None}}
 
 
-def test_error_never_continues_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
+@pytest.fixture
+def progress(terminals: tuple[Terminal, Terminal]) -> tuple[ProgressLine, Clock]:
+    """A line that stands at 9 of 10, and its clock."""
+    assert terminals[1].getvalue() == ""
     clock = Clock()
     line = ProgressLine(clock)
     clock.now_s = 2.0
     line.show("9 of 10", is_last=False)
+    return line, clock
+
+
+@pytest.mark.usefixtures("progress")
+def test_message_never_continues_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
+    terminal.show("done")
     terminal.complain("the device reset", 3)
+    assert terminals[0].getvalue() == "done\n"
     assert terminals[1].getvalue() == "\r9 of 10\nanalogrig: the device reset\n"
 
 
-def test_results_never_continue_a_progress_line(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    line = ProgressLine(clock)
-    clock.now_s = 2.0
-    line.show("9 of 10", is_last=False)
-    terminal.show("done")
-    assert (terminals[0].getvalue(), terminals[1].getvalue()) == ("done\n", "\r9 of 10\n")
-
-
-def test_progress_goes_on_below_a_message(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    line = ProgressLine(clock)
-    clock.now_s = 2.0
-    line.show("3 of 10", is_last=False)
+def test_progress_goes_on_below_a_message(
+    terminals: tuple[Terminal, Terminal], progress: tuple[ProgressLine, Clock]
+) -> None:
+    line, clock = progress
     terminal.complain("one sample was lost", 0)
     clock.now_s = 4.0
-    line.show("4 of 10", is_last=False)
+    line.show("10 of 10", is_last=False)
     line.show("10 of 10", is_last=True)
-    assert terminals[1].getvalue() == "\r3 of 10\nanalogrig: one sample was lost\n\r4 of 10\r10 of 10\n"
+    assert terminals[1].getvalue() == "\r9 of 10\nanalogrig: one sample was lost\n\r10 of 10\r10 of 10\n"
 
 
-def test_second_progress_begins_on_a_line_of_its_own(terminals: tuple[Terminal, Terminal]) -> None:
-    clock = Clock()
-    lines = [ProgressLine(clock), ProgressLine(clock)]
-    clock.now_s = 2.0
-    for number, line in enumerate(lines):
-        line.show(f"line {number}", is_last=False)
-    lines[1].end()
-    assert terminals[1].getvalue() == "\rline 0\n\rline 1\n"
+def test_second_progress_begins_on_a_line_of_its_own(
+    terminals: tuple[Terminal, Terminal], progress: tuple[ProgressLine, Clock]
+) -> None:
+    second = ProgressLine(progress[1])
+    progress[1].now_s = 4.0
+    second.show("second", is_last=False)
+    second.end()
+    assert terminals[1].getvalue() == "\r9 of 10\n\rsecond\n"
 
 
 def test_work_without_a_count_shows_its_seconds(
     terminals: tuple[Terminal, Terminal], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terminal, "_PROGRESS_S", 0.01)
-    with terminal.working("self-test"):
+    with terminal.show_work("self-test"):
         while "self-test: 0 s" not in terminals[1].getvalue():
             time.sleep(0.001)
     assert terminals[1].getvalue().startswith("\rself-test: 0 s")
@@ -206,16 +194,16 @@ def test_work_is_silent_where_nobody_watches(
 ) -> None:
     monkeypatch.setattr(terminal, "_PROGRESS_S", 0.0)
     threads = threading.active_count()
-    with terminal.working("self-test"):
+    with terminal.show_work("self-test"):
         assert threading.active_count() == threads
     assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.usefixtures("terminals")
 def test_progress_needs_a_terminal_that_can_overwrite(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert terminal.watched() is not None
+    assert terminal.open_progress_line() is not None
     monkeypatch.setenv("TERM", "dumb")
-    assert terminal.watched() is None
+    assert terminal.open_progress_line() is None
 
 
 def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -> None:
@@ -231,7 +219,7 @@ def test_interrupted_run_on_a_terminal_ends_its_progress_first(tmp_path: Path) -
         "--dut",
         "host",
         "--out",
-        str(tmp_path),
+        f"{tmp_path}",
     ]
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs, env=environment) as process:

@@ -20,10 +20,10 @@ from tests.harness.test_trust import (
     instrument,
     library,
     pytestmark,
-    rig_file,
     scenario_of,
     scenario_of_file,
     scenario_on,
+    written,
 )
 
 __all__ = ["instrument", "library", "pytestmark", "user"]
@@ -34,75 +34,44 @@ PLAYS = "def test_it(hil_play):\n    hil_play('healthy')\n"
 
 @pytest.fixture
 def folder(user: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """As that of test_trust.py."""
+    """Working directory, like the fixture of test_trust.py."""
     monkeypatch.setenv("TRUST_WITNESS", str(user.path / "witness"))
     (user.path / "theirs").mkdir()
     with _OPEN:
         yield user.path
 
 
-def by_ini(bait: Bait, user: pytest.Pytester) -> list[str]:
-    """The ini file is where the user is, and its paths are relative to it."""
-    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
-    user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\nhil_dut = {name}\n")
-    return []
+ROUTES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "ini": ("hil_dut = {name}", ()),
+    "ini and file": ("hil_dut = {file}", ()),
+    "addopts": ("addopts = --hil-dut {name}", ()),
+    "file of addopts": ("addopts = @words", ()),
+    "addopts that hide": ("addopts = --hil-dut={name} -o addopts=", ()),
+    "device file": ("", ("--hil-dut", "{file}")),
+    "rig file": ("", ("--hil-dut", "inproc", "--hil-rig", "{file}")),
+    "ini of rig": ("hil_rig = {file}", ("--hil-dut", "inproc")),
+}
+"""Line of the ini file, and arguments, by which a device or a rig is named."""
+
+SCENARIO_ROUTES: dict[str, Callable[[Bait], str]] = {
+    "scenario": lambda bait: scenario_of(bait, Path()),
+    "scenario and file": lambda bait: scenario_of_file(bait, Path()),
+    "scenario on rig": scenario_on,
+}
 
 
-def by_ini_and_file(bait: Bait, user: pytest.Pytester) -> list[str]:
-    user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\nhil_dut = {device_file(bait)}\n")
-    return []
-
-
-def by_addopts(bait: Bait, user: pytest.Pytester) -> list[str]:
-    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
-    user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\naddopts = --hil-dut {name}\n")
-    return []
-
-
-def by_file_of_addopts(bait: Bait, user: pytest.Pytester) -> list[str]:
-    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
+def arguments_of(route: str, bait: Bait, user: pytest.Pytester) -> list[str]:
+    """Write the files of a route; return the arguments of pytest."""
+    if route in SCENARIO_ROUTES:
+        device = ("--hil-dut", "inproc") if route == "scenario on rig" else ()
+        return [*device, "--hil-scenario-dir", str(Path(SCENARIO_ROUTES[route](bait)).parent)]
+    name = bait.name.replace("inproc:", "inproc:./theirs/")
+    file = written("named.toml", bait.toml)
+    ini, words = ROUTES[route]
     user.makepyfile(PLAYS)
     (user.path / "words").write_text(f"--hil-dut={name}\n")
-    user.makeini("[pytest]\naddopts = @words\n")
-    return []
-
-
-def by_addopts_that_hide(bait: Bait, user: pytest.Pytester) -> list[str]:
-    name = bait.name.replace("inproc:", "inproc:./theirs/").replace("qemu-m4:", "qemu-m4:theirs/")
-    user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\naddopts = --hil-dut={name} -o addopts=\n")
-    return []
-
-
-def by_device_file(bait: Bait, user: pytest.Pytester) -> list[str]:
-    user.makepyfile(PLAYS)
-    return ["--hil-dut", device_file(bait)]
-
-
-def by_scenario(bait: Bait, user: pytest.Pytester) -> list[str]:  # noqa: ARG001
-    return ["--hil-scenario-dir", str(Path(scenario_of(bait, Path())).parent)]
-
-
-def by_scenario_and_file(bait: Bait, user: pytest.Pytester) -> list[str]:  # noqa: ARG001
-    return ["--hil-scenario-dir", str(Path(scenario_of_file(bait, Path())).parent)]
-
-
-def by_rig_file(bait: Bait, user: pytest.Pytester) -> list[str]:
-    user.makepyfile(PLAYS)
-    return ["--hil-dut", "inproc", "--hil-rig", rig_file(bait)]
-
-
-def by_ini_of_rig(bait: Bait, user: pytest.Pytester) -> list[str]:
-    user.makepyfile(PLAYS)
-    user.makeini(f"[pytest]\nhil_rig = {rig_file(bait)}\n")
-    return ["--hil-dut", "inproc"]
-
-
-def by_scenario_on_rig(bait: Bait, user: pytest.Pytester) -> list[str]:  # noqa: ARG001
-    return ["--hil-dut", "inproc", "--hil-scenario-dir", str(Path(scenario_on(bait)).parent)]
+    user.makeini("[pytest]\n" + ini.format(name=name, file=file))
+    return [word.format(file=file) for word in words]
 
 
 def check(user: pytest.Pytester, bait: Bait, arguments: list[str]) -> None:
@@ -116,55 +85,39 @@ def check(user: pytest.Pytester, bait: Bait, arguments: list[str]) -> None:
     assert bait.witness.happened()
 
 
-DEVICE_ROUTES = (
-    by_ini,
-    by_ini_and_file,
-    by_addopts,
-    by_file_of_addopts,
-    by_addopts_that_hide,
-    by_device_file,
-    by_scenario,
-    by_scenario_and_file,
-)
-RIG_ROUTES = (by_rig_file, by_ini_of_rig, by_scenario_on_rig)
+OF_RIGS = ("rig file", "ini of rig")
 
 
 @pytest.mark.parametrize(
     ("kind", "route"),
     [
-        *((kind, by_scenario) for kind in DEVICES),
-        *((a_url, route) for route in DEVICE_ROUTES if route is not by_scenario),
-        (a_library, by_ini),
+        *((kind, "scenario") for kind in DEVICES),
+        *((a_url, route) for route in (*ROUTES, "scenario and file") if route not in OF_RIGS),
+        (a_library, "ini"),
     ],
 )
 def test_what_a_file_names_as_device_is_opened_in_pytest_only_if_it_is_allowed(
     kind: Callable[..., Bait],
-    route: Callable[[Bait, pytest.Pytester], list[str]],
+    route: str,
     user: pytest.Pytester,
     folder: Path,
     library: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bait = kind(folder, monkeypatch, library)
-    check(user, bait, route(bait, user))
+    check(user, bait, arguments_of(route, bait, user))
 
 
 @pytest.mark.parametrize(
     ("kind", "route"),
-    [
-        *((kind, by_scenario_on_rig) for kind in RIGS),
-        *((an_instrument, route) for route in RIG_ROUTES if route is not by_scenario_on_rig),
-    ],
+    [*((kind, "scenario on rig") for kind in RIGS), *((an_instrument, route) for route in OF_RIGS)],
 )
 def test_what_a_file_names_as_rig_is_opened_in_pytest_only_if_it_is_allowed(
-    kind: Callable[..., Bait],
-    route: Callable[[Bait, pytest.Pytester], list[str]],
-    user: pytest.Pytester,
-    folder: Path,
-    request: pytest.FixtureRequest,
+    kind: Callable[..., Bait], route: str, user: pytest.Pytester, folder: Path, request: pytest.FixtureRequest
 ) -> None:
     bait = kind(folder, lambda: request.getfixturevalue("instrument"))
-    check(user, bait, [*route(bait, user), *(word.replace("--allow", "--hil-allow") for word in bait.besides)])
+    besides = [word.replace("--allow", "--hil-allow") for word in bait.besides]
+    check(user, bait, [*arguments_of(route, bait, user), *besides])
 
 
 @pytest.fixture
@@ -178,7 +131,7 @@ def bait(
 
 
 def test_conftest_allows_what_the_ini_file_names(user: pytest.Pytester, bait: Bait) -> None:
-    arguments = by_ini(bait, user)
+    arguments = arguments_of("ini", bait, user)
     user.makeconftest(f"def pytest_configure(config):\n    config.option.hil_allow = ['{bait.allow}']\n")
     run(user, *arguments)
     assert bait.witness.happened()

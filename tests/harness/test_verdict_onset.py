@@ -14,12 +14,12 @@ from analogrig.campaigns.rows import row
 from analogrig.catalogue import Change
 from analogrig.errors import RecordingError
 from analogrig.judging.verdict import Verdict, as_json, judge
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.reporting.page import render
 from analogrig.reporting.summary import summary
-from analogrig.run import Run, Segment
+from analogrig.run import Run
 from analogrig.testing.played import Played
-from analogrig.testing.plugin.playing import _latency
+from analogrig.testing.plugin.junit import latency_property
 from tests.harness.runs import made_run
 
 FRONT = Plant(115.0, 3021.0, 24500.0)
@@ -172,7 +172,7 @@ def test_interval_is_shown_in_summary_page_json_and_junit() -> None:
     (tweak,) = as_json(verdict)["tweaks"]
     wanted = {"sample": 400, "between": [395, 402], "latency": 4, "latencies": [2, 9], "result": "detected"}
     assert tweak.items() >= wanted.items()
-    assert _latency(verdict.tweaks[0]) == "2..9"
+    assert latency_property(verdict.tweaks[0]) == "2..9"
 
 
 def test_undecided_result_is_shown_in_summary_and_page() -> None:
@@ -194,7 +194,7 @@ def test_exact_instants_are_shown_without_an_interval() -> None:
     run = learned(Segment(400, SOFT), alarms=[404])
     text, page, verdict = shown(run)
     assert "between" not in text and ">400</button>" in page
-    assert _latency(verdict.tweaks[0]) == "4"
+    assert latency_property(verdict.tweaks[0]) == "4"
 
 
 # ---- findings of a test

@@ -1,4 +1,4 @@
-"""Whether the shipped properties notice a device that is wrong: defects planted in its C, one at a time.
+"""Defects planted in the C of the device, one at a time.
 
 `make defects` plants each of defects.toml, runs the property that is to find it until the failure is shrunk to the
 simplest scenario, and writes the table of README.md. test_planted_defects.py does it without shrinking.
@@ -45,7 +45,7 @@ class Defect:
 
 @dataclass(frozen=True)
 class Found:
-    """What pytest made of it."""
+    """Result of pytest on a device with a defect."""
 
     failed: bool
     output: str
@@ -54,7 +54,7 @@ class Found:
 
     @property
     def why(self) -> str:
-        """What the property found, as the plugin tells it; empty if it has found nothing."""
+        """Finding of the property, as the plugin reports it; empty without one."""
         found = re.findall(r"^found: (.*)$", self.output, re.MULTILINE)
         return re.sub(r"device \S+: ", "", found[0])[:110] if found else ""
 

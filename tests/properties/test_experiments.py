@@ -15,14 +15,13 @@ from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
-from analogrig.testing.experiment import Play
 from analogrig.testing.properties.experiments import false_alarms_at_most, false_alarms_of_plants_rarer
-from analogrig.testing.statement import Finding
+from analogrig.testing.statement import Finding, Play
 
 
 @dataclasses.dataclass
 class Alone:
-    """As much of the fixture ``hil_play`` as trials need."""
+    """Part of the fixture ``hil_play`` that trials need."""
 
     bench: Bench
 

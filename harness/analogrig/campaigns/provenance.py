@@ -11,7 +11,7 @@ from analogrig import config
 from analogrig.campaigns.plan import device_as_planned
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.identity import DeviceFile, Identity
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign-identity", 1
 
@@ -55,5 +55,5 @@ def load(path: Path) -> tuple[Identity, ...]:
 def save(path: Path, played_by: tuple[Identity, ...]) -> None:
     """:raises RecordingError: it cannot be written."""
     table = {"format": FORMAT, "version": FORMAT_VERSION, "played_by": [each.as_table() for each in played_by]}
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(f"{json.dumps(table, indent=1)}\n".encode())

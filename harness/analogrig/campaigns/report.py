@@ -13,7 +13,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.identity import Identity
 from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 
 _TEMPLATE = FOLDER / "campaign.html"
 
@@ -67,7 +67,7 @@ def write_page(results: Results, path: Path, played_by: Sequence[Identity] = ())
     :param played_by: the commands that have played the campaign.
     :raises RecordingError: the page cannot be written.
     """
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(render(results, played_by).encode("utf-8", "replace"))
 
 

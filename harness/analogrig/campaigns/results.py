@@ -14,8 +14,8 @@ from analogrig.campaigns.plan import Cell, Plan
 from analogrig.campaigns.rows import RATES, Row, changes, check_row, counts, is_valid, valid
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import PARAMETERS
-from analogrig.storage import replacing
-from analogrig.wording import number_named, number_of
+from analogrig.storage import replace_file
+from analogrig.wording import counter_text, number_of
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 
@@ -38,7 +38,7 @@ class Results:
         :raises RecordingError: the file cannot be written.
         """
         head = {"format": FORMAT, "version": FORMAT_VERSION, "plan": self.plan.as_table()}
-        with replacing(path) as file:
+        with replace_file(path) as file:
             file.write(f'{json.dumps(head, sort_keys=True)[:-1]}, "cells": [\n'.encode())
             for i, rows in enumerate(self.rows):
                 lines = ",\n".join(json.dumps(row, sort_keys=True, separators=(",", ":")) for row in rows)
@@ -172,7 +172,7 @@ def anytime_text(counted: Mapping[str, int]) -> str:
     for name, rate in RATES.items():
         if counted[rate.exposure]:
             below = rate.known(counted, CONFIDENCE).bounds[1]
-            events, exposure = number_named(counted[name], name), number_named(counted[rate.exposure], rate.unit)
+            events, exposure = counter_text(counted[name], name), counter_text(counted[rate.exposure], rate.unit)
             parts.append(f"{events} in {exposure} (rate below {below:.2g})")
     return ", ".join(parts)
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import ChangeVerdict, Verdict
-from analogrig.plant import PARAMETERS
-from analogrig.run import MAX_SAMPLES, Run
+from analogrig.plant import MAX_SAMPLES, PARAMETERS
+from analogrig.run import Run
 
 Row = dict[str, Any]
 """Record of one trial, in plain values; see ``row``."""

@@ -8,8 +8,8 @@ from typing import Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
-from analogrig.run import MAX_SAMPLES
-from analogrig.trust import beside
+from analogrig.plant import MAX_SAMPLES
+from analogrig.trust import resolve_name
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
@@ -140,5 +140,5 @@ class CampaignSpec:
         spec = config.build(cls, {"name": path.stem, **config.read_toml(path)}, str(path))
         if "/" in spec.name or spec.name in {"", ".", ".."} or not spec.name.isprintable():
             raise ConfigurationError(f"{path}: name must be one that a file can have, not {spec.name!r}")
-        rigs, devices = (tuple(beside(path, each) for each in names) for names in (spec.rigs, spec.devices))
-        return dataclasses.replace(spec, scenario=beside(path, spec.scenario), rigs=rigs, devices=devices)
+        rigs, devices = (tuple(resolve_name(path, each) for each in names) for names in (spec.rigs, spec.devices))
+        return dataclasses.replace(spec, scenario=resolve_name(path, spec.scenario), rigs=rigs, devices=devices)

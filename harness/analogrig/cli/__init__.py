@@ -1,4 +1,4 @@
-"""The command ``analogrig``: one module for each of its commands, and their common options and output.
+"""The command ``analogrig``: its commands, and their common options and output.
 
 Everything heavy is imported inside the command that needs it, so that ``--help`` answers at once.
 """
@@ -19,40 +19,35 @@ from analogrig.cli import (
     certify,
     compare,
     compare_rigs,
-    completion,
     doctor,
-    effects,
-    emulate,
-    judge,
+    emulation,
     listing,
-    netlist,
-    replay,
-    run,
+    playing,
     serve,
     thesis,
 )
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
-from analogrig.signals import ending
+from analogrig.signals import raise_signals
 
 _COMMANDS = (
-    run,
-    replay,
-    judge,
-    campaign,
-    certify,
-    compare,
-    thesis,
-    emulate,
-    serve,
-    doctor,
-    calibrate,
-    compare_rigs,
-    effects,
-    netlist,
-    listing,
-    completion,
+    playing.add_run,
+    playing.add_replay,
+    playing.add_judge,
+    campaign.add,
+    certify.add,
+    compare.add,
+    thesis.add,
+    emulation.add_emulate,
+    serve.add,
+    doctor.add,
+    calibrate.add,
+    compare_rigs.add,
+    emulation.add_effects,
+    emulation.add_netlist,
+    listing.add_list,
+    listing.add_completion,
 )
-"""Modules of the commands in the order of ``--help``; each has ``add(commands)``."""
+"""Functions that add the commands to the parser, in the order of ``--help``."""
 
 
 _EXHAUSTED = {
@@ -67,26 +62,21 @@ _EXHAUSTED = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Every failure is one line on standard error."""
     open_standard_streams()
-    with ending():
+    with raise_signals():
         try:
             parser = _parser()
-            if completion.VARIABLE in os.environ:
-                completion.complete(parser)
+            if listing.COMPLETION_VARIABLE in os.environ:
+                listing.complete(parser)
             arguments = parser.parse_args(argv)
             arguments.command_line = shlex.join(["analogrig", *(sys.argv[1:] if argv is None else argv)])
-            arguments.started = _now()
+            from analogrig.identity import now  # here, for --help needs none
+
+            arguments.started = now()
             return int(arguments.command(arguments))
         except KeyboardInterrupt:
             return complain("interrupted", INTERRUPTED)
         except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
             return _explain(error)
-
-
-def _now() -> str:
-    """Return the start time; imported here, for ``--help`` needs none."""
-    from analogrig.identity import now
-
-    return now()
 
 
 def _explain(error: Exception) -> int:
@@ -120,8 +110,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=_Version)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in _COMMANDS:
-        command.add(commands)
+    for add in _COMMANDS:
+        add(commands)
     return parser
 
 

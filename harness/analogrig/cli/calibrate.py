@@ -68,7 +68,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.hardware.calibration.fit import POTS, STOCKS, calibrate, difference_lsb
     from analogrig.output import move_aside
     from analogrig.rigs.description import open_rig
-    from analogrig.storage import replacing
+    from analogrig.storage import replace_file
 
     if arguments.out.suffix != ".toml":
         raise ConfigurationError(f"--out {arguments.out}: must be a .toml file, for --rig to open")
@@ -93,7 +93,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     is_twin = check_lsb <= MOST_LSB
     if is_twin:
-        with replacing(arguments.out) as file:
+        with replace_file(arguments.out) as file:
             file.write(_toml(found, arguments, check_lsb).encode("utf-8"))
     if arguments.json:
         show_result(_as_json(found, check_lsb, arguments), arguments)

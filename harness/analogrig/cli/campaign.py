@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import CAMPAIGN, FILE, add_allow, add_command, add_json, trust_of
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, show, show_result, watched
+from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, open_progress_line, show, show_result
 
 if TYPE_CHECKING:
     from analogrig.campaigns.conduct import Tally
@@ -144,7 +144,7 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
     """Callback that shows the progress of a plan; None if nobody watches."""
-    line = watched()
+    line = open_progress_line()
     if line is None:
         return None
     from analogrig.campaigns.results import anytime_text

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.campaign import add_workers, begin, workers
 from analogrig.cli.options import DUT, SCENARIO, add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, watched
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, open_progress_line, show, show_result
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
 
 
 def _progress() -> Callable[[int, int, int], None] | None:
-    line = watched()
+    line = open_progress_line()
     if line is None:
         return None
 

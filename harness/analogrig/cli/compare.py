@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import FILE, add_command, add_json
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, show_work
 
 if TYPE_CHECKING:
     from analogrig.campaigns.comparison import Comparison
@@ -46,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from analogrig.campaigns.comparison import PAIRED, compare
     from analogrig.campaigns.sides import load, matched
 
-    with working(f"comparing {arguments.a} and {arguments.b}"):
+    with show_work(f"comparing {arguments.a} and {arguments.b}"):
         found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
     if arguments.json:
         show_result(asdict(found), arguments)

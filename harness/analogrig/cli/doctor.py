@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import add_command, add_json, add_rig, add_seed, trust_of
-from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, working
+from analogrig.cli.terminal import FAILED, INCONCLUSIVE, PASSED, complain, show, show_result, show_work
 
 if TYPE_CHECKING:
     from analogrig.hardware.self_test import Check, Findings
@@ -41,7 +41,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with open_rig(arguments.rig, self_test=False, allow=trust_of(arguments)) as rig:
         program = arguments.program or str(rig.description().get("plant", "front"))
         try:
-            with working(f"self-test of {arguments.rig}"):
+            with show_work(f"self-test of {arguments.rig}"):
                 findings = self_test(rig, arguments.seed, program)
         except RigError as error:
             return complain(f"INCONCLUSIVE: the self-test could not be made: {error}", INCONCLUSIVE)

@@ -1,25 +1,28 @@
-"""``analogrig list``: the names that commands take, with a line on each."""
+"""``analogrig list`` and ``completion``: the names that commands take, for people and for shells."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from typing import TYPE_CHECKING, Any, get_args
+from collections.abc import Iterator
+from typing import Any, cast
 
-from analogrig.cli.options import PROGRAMS, add_command, add_json
-from analogrig.cli.terminal import PASSED, show, show_json
-
-if TYPE_CHECKING:
-    from analogrig.config import Kind
+from analogrig.cli.options import CAMPAIGN, DUT, PROGRAMS, RIG, SCENARIO, add_command, add_json
+from analogrig.cli.terminal import PASSED, show, show_json, show_plain
 
 KINDS = ("scenarios", "rigs", "devices", "campaigns", "programs")
+SHELLS = ("bash", "zsh", "fish")
 
+COMPLETION_VARIABLE = "_ARGCOMPLETE"
+"""Set by the shell when it asks for completions instead of running the command."""
 
-_FILLED_IN = re.compile(r"\[|[A-Z]+")
+_KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN: "campaigns"}
+
+_PLACEHOLDER = re.compile(r"\[|[A-Z]+")
 """Beginning of what a user fills in, in the usage of a kind of device."""
 
 
-def add(commands: Any) -> None:
+def add_list(commands: Any) -> None:
     command = add_command(
         commands,
         "list",
@@ -30,62 +33,59 @@ def add(commands: Any) -> None:
     )
     command.add_argument("kind", nargs="?", choices=KINDS, help="kind to list (default: all)")
     add_json(command)
-    command.set_defaults(command=_run)
+    command.set_defaults(command=_list)
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    listed = {kind: entries(kind) for kind in ([arguments.kind] if arguments.kind else KINDS)}
+def add_completion(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "completion",
+        "print the script that lets a shell complete analogrig's commands, options and names",
+        "completion bash >> ~/.bashrc",
+        "completion zsh >> ~/.zshrc",
+        "completion fish > ~/.config/fish/completions/analogrig.fish",
+    )
+    command.add_argument("shell", choices=SHELLS, help="shell that reads the script")
+    command.set_defaults(command=_completion)
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    found = {kind: _entries(kind) for kind in ([arguments.kind] if arguments.kind else KINDS)}
     if arguments.json:
-        show_json(listed)
+        show_json(found)
     else:
-        show("\n\n".join(_text(kind, found) for kind, found in listed.items()))
+        show("\n\n".join(_text(kind, entries) for kind, entries in found.items()))
     return PASSED
 
 
-def _text(kind: str, found: list[dict[str, str]]) -> str:
-    width = max(len(each["name"]) for each in found)
-    return "\n".join([f"{kind}:", *(f"  {each['name']:{width}}  {each['description']}".rstrip() for each in found)])
+def _text(kind: str, entries: list[dict[str, str]]) -> str:
+    width = max(len(each["name"]) for each in entries)
+    return "\n".join([f"{kind}:", *(f"  {each['name']:{width}}  {each['description']}".rstrip() for each in entries)])
 
 
-def entries(kind: str) -> list[dict[str, str]]:
+def _entries(kind: str) -> list[dict[str, str]]:
     """Name, description and file of each; file is "" where there is none.
 
     :raises ConfigurationError: a file cannot be read.
     """
     if kind == "programs":
-        return [_entry(name, does) for name, does in PROGRAMS.items()]
-    own = _own_rigs() if kind == "rigs" else []
-    taken = {each["name"] for each in own}
-    shipped = [each for each in _shipped(kind) if each["name"] not in taken]
-    return [*own, *shipped, *(_device_kinds() if kind == "devices" else ())]
-
-
-def names(kind: str) -> list[str]:
-    """Names for completion. Of a kind of device, the part before what a user fills in."""
-    return list(
-        dict.fromkeys(each["name"] if each["file"] else _FILLED_IN.split(each["name"])[0] for each in entries(kind))
-    )
-
-
-def _shipped(kind: str) -> list[dict[str, str]]:
+        return [_entry(name, description) for name, description in PROGRAMS.items()]
     from analogrig import config
 
-    shipped: Kind = next(each for each in get_args(config.Kind) if each == kind)
-    paths = [config.locate(shipped, name) for name in config.names(shipped)]
-    return [_entry(path.stem, config.read_toml(path).get("description", ""), str(path)) for path in paths]
+    found: dict[str, dict[str, str]] = {}
+    if kind == "rigs":
+        from analogrig.rigs.description import own_rigs
 
+        file, rigs = own_rigs()
+        found = {name: _entry(name, table.get("description", ""), file) for name, table in rigs.items()}
+    shipped = cast("config.Kind", kind)
+    for path in (config.locate(shipped, name) for name in config.names(shipped)):
+        found.setdefault(path.stem, _entry(path.stem, config.read_toml(path).get("description", ""), str(path)))
+    if kind == "devices":
+        from analogrig.devices.registry import KINDS as DEVICE_KINDS
 
-def _own_rigs() -> list[dict[str, str]]:
-    from analogrig.rigs.description import own_rigs
-
-    file, rigs = own_rigs()
-    return [_entry(name, table.get("description", ""), file) for name, table in rigs.items()]
-
-
-def _device_kinds() -> list[dict[str, str]]:
-    from analogrig.devices.registry import KINDS as DEVICE_KINDS
-
-    return [_entry(kind.usage, kind.summary) for kind in DEVICE_KINDS.values()]
+        found |= {each.usage: _entry(each.usage, each.summary) for each in DEVICE_KINDS.values()}
+    return list(found.values())
 
 
 def _entry(name: str, description: Any, file: str = "") -> dict[str, str]:
@@ -95,3 +95,28 @@ def _entry(name: str, description: Any, file: str = "") -> dict[str, str]:
 def _one_line(text: str) -> str:
     """Text of a file, which may hold control characters, in one line."""
     return " ".join("".join(each if each.isprintable() else " " for each in text).split())
+
+
+def _completion(arguments: argparse.Namespace) -> int:
+    from argcomplete.shell_integration import shellcode
+
+    show_plain(shellcode(["analogrig"], shell=arguments.shell).strip("\n"))
+    return PASSED
+
+
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Answer the shell, and end the process."""
+    import argcomplete
+
+    argcomplete.autocomplete(parser, default_completer=cast(Any, _names_and_files))
+
+
+def _names_and_files(prefix: str, action: argparse.Action, **_: Any) -> Iterator[str]:
+    """Completions: the names that an option takes, and files, which stand for any of them."""
+    from argcomplete.completers import FilesCompleter
+
+    if kind := _KIND_OF_METAVAR.get(str(action.metavar)):
+        entries = _entries(kind)
+        names = [each["name"] if each["file"] else _PLACEHOLDER.split(each["name"])[0] for each in entries]
+        yield from (name for name in dict.fromkeys(names) if name.startswith(prefix))
+    yield from FilesCompleter()(prefix)

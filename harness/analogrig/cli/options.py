@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,45 +97,23 @@ def add_json(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="print one JSON object instead of text")
 
 
-def seed(text: str) -> int:
-    if text.isascii() and text.isdecimal() and len(text) <= 19 and int(text) < 2**63:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2^63 - 1, not {text[:40]!r}")
+def _number_in(low: float, high: float, words: str, kind: type[int | float]) -> Callable[[str], Any]:
+    """Parser of a number from ``low`` to ``high``; ``words`` are its message."""
+
+    def parse(text: str) -> Any:
+        with contextlib.suppress(ValueError):
+            number = kind(text)
+            if low <= number <= high and (kind is float or (text.isascii() and text.isdecimal())):
+                return number
+        raise argparse.ArgumentTypeError(f"must be {words}, not {text[:40]!r}")
+
+    return parse
 
 
-def count(text: str) -> int:
-    if text.isascii() and text.isdecimal() and len(text) <= 9:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 999999999, not {text[:40]!r}")
-
-
-def factor(text: str) -> float:
-    try:
-        factor = float(text)
-    except ValueError:
-        factor = 0.0
-    if 1e-3 <= factor <= 1e6:
-        return factor
-    raise argparse.ArgumentTypeError(f"must be a number from 0.001 to 1000000, not {text[:40]!r}")
-
-
-def seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if 1e-3 <= seconds <= 1e9:
-        return seconds
-    raise argparse.ArgumentTypeError(f"must be a number of seconds from 0.001 to 1e9, not {text[:40]!r}")
-
-
-def add_time_limit(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--time-limit",
-        type=seconds,
-        metavar="SECONDS",
-        help="end the run after that time; it is then INCONCLUSIVE, and what was recorded is kept (default: no limit)",
-    )
+seed = _number_in(0, 2**63 - 1, "a whole number from 0 to 2^63 - 1", int)
+count = _number_in(0, 999_999_999, "a whole number from 0 to 999999999", int)
+factor = _number_in(1e-3, 1e6, "a number from 0.001 to 1000000", float)
+seconds = _number_in(1e-3, 1e9, "a number of seconds from 0.001 to 1e9", float)
 
 
 def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = "$ANALOGRIG_DUT or host") -> None:
@@ -171,25 +149,6 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
     )
 
 
-def add_can_log(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--can-log",
-        choices=("log", "blf", "asc", "mf4", "none"),
-        help="format of the CAN log beside run.npz: candump, BLF, ASC or MF4 (default: log on a CAN bus)",
-    )
-
-
-def add_output(command: argparse.ArgumentParser, default: Path = Path("build/run")) -> None:
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=default,
-        metavar="DIR",
-        help="folder for run.npz and report.html (default: %(default)s)",
-    )
-    add_json(command)
-
-
 def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
     """Changes of the device settings that the command line makes beyond the device's name."""
     in_real_time = "stream" if arguments.real_time is not None else None
@@ -203,7 +162,7 @@ def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def opened(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
+def open_what_to_play(arguments: argparse.Namespace) -> Iterator[tuple[Rig, Scenario, int]]:
     """Open the requested rig, scenario and seed; the scenario or the recording supplies those not given."""
     from dataclasses import replace
 
@@ -252,8 +211,8 @@ def is_capture(path: Path) -> bool:
     return path.suffix != ".npz"
 
 
-def recorded(arguments: argparse.Namespace) -> Run:
-    """The run in the file that is named.
+def load_capture(arguments: argparse.Namespace) -> Run:
+    """Run in the recording or CAN log that the command line names.
 
     :raises RecordingError: it cannot be read.
     :raises ConfigurationError: it is a CAN log, and the scenario is not given, or not the one.

@@ -1,49 +1,169 @@
-"""One play of a scenario, from the options to the files and the exit status."""
+"""``analogrig run``, ``replay`` and ``judge``: one play or recording, from the options to the files and exit status."""
 
 from __future__ import annotations
 
 import argparse
+import functools
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, STATUS, complain, progress_line, show, show_json, working
+from analogrig.cli.options import (
+    FILE,
+    add_capture,
+    add_command,
+    add_dut,
+    add_json,
+    add_what_to_play,
+    changes_of_dut,
+    files_read,
+    is_capture,
+    load_capture,
+    open_what_to_play,
+    seconds,
+    trust_of,
+)
+from analogrig.cli.terminal import (
+    INCONCLUSIVE,
+    INTERRUPTED,
+    STATUS,
+    complain,
+    progress_line,
+    show,
+    show_json,
+    show_work,
+)
 
 if TYPE_CHECKING:
     from analogrig.devices.dut import Dut
     from analogrig.identity import Identity
     from analogrig.judging.verdict import Verdict
     from analogrig.output import OutputFolder
-    from analogrig.recordings import CanLog
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
 
 
-def output_folder(arguments: argparse.Namespace) -> OutputFolder:
+def add_run(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "run",
+        "play a scenario on a rig through a device, and judge the device's alarms",
+        "run --seed 7",
+        "run --scenario slow --dut inproc --out build/slow",
+        "run --rig emulator-0-10v --dut qemu-m4 --json",
+    )
+    add_what_to_play(command)
+    add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")
+    _add_output(command, "build/run")
+    _add_play(command)
+    command.set_defaults(command=_run)
+
+
+def add_replay(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "replay",
+        "play a recorded run through a device again, and judge it",
+        "replay build/run/run.npz",
+        "replay build/run/run.npz --dut mean-between-faults --out build/mean",
+        "replay build/can/can.log --scenario thesis --dut inproc",
+    )
+    command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
+    add_capture(command)
+    add_dut(command, default=None, shown="that of the recording")
+    _add_output(command, "build/replay")
+    _add_play(command)
+    command.set_defaults(command=_replay)
+
+
+def add_judge(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "judge",
+        "judge a recorded run or a CAN log, without a device",
+        "judge build/run/run.npz",
+        "judge build/can/can.log --scenario thesis --json",
+    )
+    command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
+    add_capture(command)
+    _add_output(command, "build/judge")
+    command.set_defaults(command=_judge)
+
+
+def _add_output(command: argparse.ArgumentParser, default: str) -> None:
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path(default),
+        metavar="DIR",
+        help="folder for run.npz and report.html (default: %(default)s)",
+    )
+    add_json(command)
+
+
+def _add_play(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--can-log",
+        choices=("log", "blf", "asc", "mf4", "none"),
+        help="format of the CAN log beside run.npz: candump, BLF, ASC or MF4 (default: log on a CAN bus)",
+    )
+    command.add_argument(
+        "--time-limit",
+        type=seconds,
+        metavar="SECONDS",
+        help="end the run after that time; it is then INCONCLUSIVE, and what was recorded is kept (default: no limit)",
+    )
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    with _output_folder(arguments) as output, open_what_to_play(arguments) as (rig, scenario, seed):
+        from analogrig.devices.dut import open_dut
+
+        device = functools.partial(open_dut, arguments.dut or scenario.dut or "host")
+        return _play(rig, scenario, seed, device, output, arguments)
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    with _output_folder(arguments) as output:
+        from analogrig.devices.dut import open_dut, reopen_dut
+        from analogrig.errors import ConfigurationError
+        from analogrig.rigs.recording import RecordingRig
+
+        if arguments.dut is None and is_capture(arguments.file):
+            raise ConfigurationError(f"{arguments.file}: does not say which device it was: say --dut")
+        with RecordingRig.of(load_capture(arguments), arguments.file) as rig:
+            conditions = rig.run.conditions
+            device: Callable[..., Dut] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))
+            if arguments.dut:
+                device = functools.partial(open_dut, arguments.dut)
+            return _play(rig, rig.scenario(), conditions.seed, device, output, arguments)
+
+
+def _judge(arguments: argparse.Namespace) -> int:
+    with _output_folder(arguments) as output:
+        from analogrig.rigs.recording import RecordingRig
+
+        run = load_capture(arguments)
+        RecordingRig.of(run, arguments.file)
+        return _conclude(run, output, output.identity(), arguments)
+
+
+def _output_folder(arguments: argparse.Namespace) -> OutputFolder:
     """The folder of --out for the results of a run, as yet untouched."""
-    from analogrig.cli.options import files_read
     from analogrig.output import OutputFolder
 
     return OutputFolder(arguments.out, arguments.command_line, arguments.started, reads=files_read(arguments))
 
 
-def can_log(output: OutputFolder, arguments: argparse.Namespace) -> CanLog | None:
-    """Listener to the CAN frames of the run, if they shall be kept; a run on another link has none."""
-    from analogrig.output import CAN_LOG
-    from analogrig.recordings import WRITTEN, CanLog
-
-    asked = arguments.can_log or WRITTEN[0]
-    return None if asked == "none" else CanLog(output.parts / f"{CAN_LOG}.{asked}")
-
-
-def play(
+def _play(
     rig: Rig,
-    dut: Dut,
     scenario: Scenario,
     seed: int,
+    open_device: Callable[..., Dut],
     output: OutputFolder,
     arguments: argparse.Namespace,
-    log: CanLog | None = None,
 ) -> int:
     """Play a scenario with the options of the command line.
 
@@ -52,37 +172,34 @@ def play(
     from dataclasses import replace
 
     from analogrig.bench import Bench
-    from analogrig.errors import ConfigurationError
-    from analogrig.signals import held
+    from analogrig.errors import ConfigurationError, RecordingError
+    from analogrig.output import CAN_LOG
+    from analogrig.recordings import WRITTEN, CanLog
+    from analogrig.signals import hold_signals
 
-    if arguments.can_log is not None and log is not None and not log.has_frames:
-        raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
-    identity = replace(output.identity(), devices=dut.files())
-    if log is not None:
-        log.begin()
-    bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
-    run = bench.play(scenario, seed)
-    with held():
-        return conclude(_with_log(run, log, output).with_identity(identity), output, identity, arguments)
-
-
-def _with_log(run: Run, log: CanLog | None, output: OutputFolder) -> Run:
-    """Return the run, invalid if its CAN log could not be written."""
-    from dataclasses import replace
-
-    from analogrig.errors import RecordingError
-
-    try:
+    log = None
+    if arguments.can_log != "none":
+        log = CanLog(output.parts / f"{CAN_LOG}.{arguments.can_log or WRITTEN[0]}")
+    with open_device(allow=trust_of(arguments), listener=log, **changes_of_dut(arguments)) as dut:
+        if arguments.can_log is not None and log is not None and not log.has_frames:
+            raise ConfigurationError(f"--can-log {arguments.can_log}: device {dut.name} is not on a CAN bus")
+        identity = replace(output.identity(), devices=dut.files())
         if log is not None:
-            log.close()
-    except RecordingError as error:
-        faults = (*run.conditions.faults, output.reason(error))
-        return replace(run, conditions=replace(run.conditions, faults=faults))
-    return run
+            log.begin()
+        bench = Bench(rig, dut, progress_line(), real_time=arguments.real_time, time_limit_s=arguments.time_limit)
+        run = bench.play(scenario, seed)
+        with hold_signals():
+            try:
+                if log is not None:
+                    log.close()
+            except RecordingError as error:
+                faults = (*run.conditions.faults, output.reason(error))
+                run = replace(run, conditions=replace(run.conditions, faults=faults))
+            return _conclude(run.with_identity(identity), output, identity, arguments)
 
 
-def conclude(run: Run, output: OutputFolder, identity: Identity, arguments: argparse.Namespace) -> int:
-    """Judge a run, keep it and its report, show the verdict to whoever listens, and return the exit status.
+def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: argparse.Namespace) -> int:
+    """Judge a run, write it and its report, print the verdict, and return the exit status.
 
     :param identity: of this command.
     """
@@ -98,7 +215,7 @@ def conclude(run: Run, output: OutputFolder, identity: Identity, arguments: argp
         write_report(run, verdict, folder / REPORT_FILE)
 
     try:
-        with working("judging, writing run and report"):
+        with show_work("judging, writing run and report"):
             verdict = judge(run)
             table = _as_json(run, verdict, identity, output)
             output.conclude(write, table)

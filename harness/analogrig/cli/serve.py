@@ -87,9 +87,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 async def _serve(server: Server, arguments: argparse.Namespace, names: dict[str, Any]) -> int:
     """Serve until a signal ends the command or, if there is one, until the client ends. Return the exit status."""
-    from analogrig.signals import awaited
+    from analogrig.signals import signal_future
 
-    ended = awaited()
+    ended = signal_future()
     host, number = await server.listen(arguments.host, arguments.port)
     address = f"[{host}]:{number}" if ":" in host else f"{host}:{number}"
     try:

@@ -45,13 +45,13 @@ _PROGRESS_S = 1.0
 
 def complain(message: str, status: int) -> int:
     """Print one line on standard error; return ``status``."""
-    _print(_coloured(f"analogrig: {one_line(message)}\n", sys.stderr), sys.stderr, 2)
+    _print(_colour(f"analogrig: {one_line(message)}\n", sys.stderr), sys.stderr)
     return status
 
 
 def show(text: str) -> None:
     """Print text for people on standard output."""
-    _show(_coloured(f"{printable(text)}\n", sys.stdout))
+    _show(_colour(f"{printable(text)}\n", sys.stdout))
 
 
 def show_plain(text: str) -> None:
@@ -85,31 +85,31 @@ def _finite(value: Any) -> Any:
 
 def _show(text: str) -> None:
     """Print on standard output. A reader that is gone changes nothing about the command's status."""
-    error = _print(text, sys.stdout, 1)
+    error = _print(text, sys.stdout)
     if error is not None:
-        _print(f"analogrig: standard output: {error.strerror}\n", sys.stderr, 2)
+        _print(f"analogrig: standard output: {error.strerror}\n", sys.stderr)
 
 
-def _print(text: str, stream: TextIO, number: int) -> OSError | None:
+def _print(text: str, stream: TextIO) -> OSError | None:
     """Write text below the progress line, if there is one. Return the error, if any."""
     with ProgressLine.lock:
         if ProgressLine.unfinished is not None:
             ProgressLine.unfinished.end()
-        return _write(text, stream, number)
+        return _write(text, stream)
 
 
-def _write(text: str, stream: TextIO, number: int) -> OSError | None:
+def _write(text: str, stream: TextIO) -> OSError | None:
     """Write text. Return the error, if any: the stream then discards all output, also what it still holds."""
     try:
         stream.write(text)
         stream.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         return error
     return None
 
 
-def _coloured(text: str, stream: TextIO) -> str:
+def _colour(text: str, stream: TextIO) -> str:
     """Colour the verdicts if the stream takes colour."""
     if not _takes_colour(stream):
         return text
@@ -148,7 +148,7 @@ class ProgressLine:
     """
 
     lock: ClassVar[threading.RLock] = threading.RLock()
-    """Held while anything is printed: `working` prints from a thread."""
+    """Held while anything is printed: `show_work` prints from a thread."""
     unfinished: ClassVar[ProgressLine | None] = None
     """The line that the cursor is in."""
 
@@ -169,7 +169,7 @@ class ProgressLine:
             # Before the text is written: Ctrl-C may come at any time, and no message may continue the line.
             ProgressLine.unfinished = self
             width, self._width = self._width, len(text)
-            _write(f"\r{text:<{width}}", sys.stderr, 2)
+            _write(f"\r{text:<{width}}", sys.stderr)
             if is_last:
                 self.end()
 
@@ -177,19 +177,19 @@ class ProgressLine:
         """End the line, if it was shown."""
         with self.lock:
             if ProgressLine.unfinished is self:
-                _write("\n", sys.stderr, 2)
+                _write("\n", sys.stderr)
                 ProgressLine.unfinished = None
             self._width = 0
 
 
-def watched() -> ProgressLine | None:
+def open_progress_line() -> ProgressLine | None:
     """A progress line; None if standard error is no terminal."""
     return ProgressLine() if _is_terminal(sys.stderr) else None
 
 
 def progress_line(of: str = "samples") -> Progress | None:
     """A callback that shows how many of how many, and percent; None if standard error is no terminal."""
-    line = watched()
+    line = open_progress_line()
     if line is None:
         return None
 
@@ -200,9 +200,9 @@ def progress_line(of: str = "samples") -> Progress | None:
 
 
 @contextlib.contextmanager
-def working(on: str) -> Iterator[None]:
+def show_work(on: str) -> Iterator[None]:
     """Show what the command works on and for how long, where there is nothing to count."""
-    line = watched()
+    line = open_progress_line()
     if line is None:
         yield
         return

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from analogrig.cli.options import add_command
-from analogrig.cli.terminal import PASSED, show, show_plain, working
+from analogrig.cli.terminal import PASSED, show, show_plain, show_work
 
 
 def add(commands: Any) -> None:
@@ -36,7 +36,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with OutputFolder(arguments.out, arguments.command_line, arguments.started, holds=FILES, page=PAGE) as output:
         from analogrig_thesis import reproduce
 
-        with working("simulating, playing, estimating"):
+        with show_work("simulating, playing, estimating"):
             reproduction = reproduce()
         verdict = {"outcome": "passed", "valid": True, "reasons": [], "identity": output.identity().as_table()}
         output.conclude(reproduction.write, verdict)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from analogrig.devices.description import EitherDevice
 from analogrig.devices.library import LIBRARY, MemoryWire
 from analogrig.links.wire import Wire
-from analogrig.trust import Thing, placed
+from analogrig.trust import Thing, absolute_path
 
 if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
@@ -55,7 +55,7 @@ class InprocDevice(EitherDevice):
         return (Thing("library", self.library, "the device loads the library"),) if self.library else ()
 
     def placed(self, folder: Path) -> Self:
-        return dataclasses.replace(self, library=placed(self.library, folder))
+        return dataclasses.replace(self, library=absolute_path(self.library, folder))
 
     def wire(self) -> Wire:
         return MemoryWire(boot_nonce=secrets.randbits(32), library=self.program)

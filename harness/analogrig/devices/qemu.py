@@ -17,7 +17,7 @@ from analogrig.devices.child import Child, ChildWire
 from analogrig.devices.description import EitherDevice
 from analogrig.errors import LinkError
 from analogrig.links.wire import DescriptorWire, Wire
-from analogrig.trust import Thing, placed
+from analogrig.trust import Thing, absolute_path
 
 if TYPE_CHECKING:
     from analogrig.links.can_bus import CanBus
@@ -76,7 +76,7 @@ class QemuDevice(EitherDevice):
         return (Thing("firmware", self.firmware, "the device boots the firmware"),) if self.firmware else ()
 
     def placed(self, folder: Path) -> Self:
-        return dataclasses.replace(self, firmware=placed(self.firmware, folder)) if self.firmware else self
+        return dataclasses.replace(self, firmware=absolute_path(self.firmware, folder)) if self.firmware else self
 
     @property
     def program(self) -> Path:

@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 from analogrig.devices.description import ByteDevice
 from analogrig.errors import ConfigurationError
 from analogrig.links.wire import DEFAULT_BAUD, PortWire, Wire
-from analogrig.trust import Thing, placed_port
+from analogrig.trust import Thing, absolute_port
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class SerialDevice(ByteDevice):
         return (Thing("serial port", self.url, "the device opens the serial port"),)
 
     def placed(self, folder: Path) -> Self:
-        return dataclasses.replace(self, url=placed_port(self.url, folder))
+        return dataclasses.replace(self, url=absolute_port(self.url, folder))
 
     @property
     def only_one(self) -> str:

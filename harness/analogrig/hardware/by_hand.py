@@ -11,8 +11,7 @@ from analogrig.hardware.dating.instants import NoInstant, TurnInstants, date_jum
 from analogrig.hardware.dating.two_filter import Signals
 from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import Clock
-from analogrig.plant import AT_REST, Plant, SampledPlant
-from analogrig.run import Segment
+from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
 
 BEFORE_S, AFTER_S = 0.02, 0.05
 """Margins of the search: a record may start late, and a pot may still move after it was reported set."""

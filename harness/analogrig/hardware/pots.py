@@ -26,7 +26,7 @@ import serial
 from analogrig.errors import ConfigurationError, LinkError, RigError
 from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import DEFAULT_BAUD, PortWire
-from analogrig.trust import Thing, placed, placed_port
+from analogrig.trust import Thing, absolute_path, absolute_port
 
 TERMINAL = Path("/dev/tty")
 """Terminal of the operator, also if standard input and output are redirected."""
@@ -133,7 +133,9 @@ class CommandPots(_SteppedPots, Pots):
     def placed(self, folder: Path) -> Self:
         """The same with an absolute program path, where its own is relative to ``folder``."""
         program, *rest = self.arguments
-        return dataclasses.replace(self, arguments=(placed(program, folder) if "/" in program else program, *rest))
+        return dataclasses.replace(
+            self, arguments=(absolute_path(program, folder) if "/" in program else program, *rest)
+        )
 
     def open(self) -> Pots:
         return self
@@ -175,7 +177,7 @@ class SerialPots(_SteppedPots):
 
     def placed(self, folder: Path) -> Self:
         """The same with an absolute port, where its own is relative to ``folder``."""
-        return dataclasses.replace(self, url=placed_port(self.url, folder))
+        return dataclasses.replace(self, url=absolute_port(self.url, folder))
 
     def check(self) -> None:
         """Check that pyserial knows the URL. Even this may open files (``spy://``).

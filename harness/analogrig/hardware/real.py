@@ -25,10 +25,10 @@ from analogrig.hardware.lock import lock_instrument
 from analogrig.hardware.self_test import self_test
 from analogrig.hardware.wiring import RealDescription, check_wiring
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.rigs.emulator import Stream, emulator_errors, settings_of
 from analogrig.rigs.rig import BLOCK_SAMPLES, Block, Hindsight, Performance, Rig
-from analogrig.run import MEASURED, Segment
+from analogrig.run import MEASURED
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation, SuspensionComputer
 

@@ -141,7 +141,7 @@ def predicted_bounds(
     ramps_n = {segment.start: segment.ramp_n for segment in segments}
     period_s = scales.time / rate_hz
     return [
-        first_reaching(_information(change, period_s), math.log(arl0))
+        first_at_level(_information(change, period_s), math.log(arl0))
         for change in _changes_between(stretches, ramps_n, force_n, weight, period_s)
     ]
 
@@ -170,8 +170,8 @@ def isolation_bounds(run: Run) -> list[int | None]:
         for name in PARAMETERS:
             if changed != (name,):
                 apart = (_rival_displacements(change, name, period_s) - course) ** 2 * change.weight[: len(course)]
-                least = np.minimum(least, _interpolated_minimum(np.cumsum(apart, axis=1)))
-        out.append(first_reaching(least, ISOLATION_INFORMATION))
+                least = np.minimum(least, _interpolate_minimum(np.cumsum(apart, axis=1)))
+        out.append(first_at_level(least, ISOLATION_INFORMATION))
     return out
 
 
@@ -221,7 +221,7 @@ def _ramp_plants(before: Plant, after: Plant, ramp_n: int, samples: int, period_
     )
 
 
-def first_reaching(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
+def first_at_level(information: Sequence[float] | NDArray[np.float64], level: float) -> int | None:
     """Smallest n with I(n) >= level, or None."""
     reached = np.flatnonzero(np.asarray(information) >= level)
     return int(reached[0]) + 1 if len(reached) else None
@@ -241,7 +241,7 @@ def _rival_displacements(change: _Change, name: str, period_s: float) -> NDArray
     return out
 
 
-def _interpolated_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate_minimum(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Minimum over evenly spaced f of (f, n), interpolated by a parabola through three points: (n,)."""
     at = np.clip(information.argmin(axis=0), 1, len(information) - 2)
     low, mid, high = (information[at + i, np.arange(information.shape[1])] for i in (-1, 0, 1))

@@ -10,6 +10,7 @@ False alarms are counted as events among samples. The estimator restarts after e
 
 from __future__ import annotations
 
+import bisect
 import enum
 import math
 from collections.abc import Sequence
@@ -124,16 +125,13 @@ class Design:
     @property
     def trials(self) -> int:
         """Fewest trials that prove the claim: the upper bound with ``allowed`` events is at most ``rate``."""
-        low, high = self.allowed + 1, self.allowed + 2
-        while upper_rate(self.allowed, high, self.confidence) > self.rate:
-            low, high = high, 2 * high
-        while high - low > 1:
-            middle = (low + high) // 2
-            if upper_rate(self.allowed, middle, self.confidence) > self.rate:
-                low = middle
-            else:
-                high = middle
-        return high
+        least = high = self.allowed + 2
+        while not self._proves(high):
+            high *= 2
+        return bisect.bisect_left(range(high), 1, lo=max(least, high // 2), key=self._proves)
+
+    def _proves(self, trials: int) -> bool:
+        return upper_rate(self.allowed, trials, self.confidence) <= self.rate
 
 
 def mean_interval(values: ArrayLike, confidence: float) -> tuple[float, float, float]:

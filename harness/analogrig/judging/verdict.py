@@ -25,8 +25,8 @@ from analogrig import config
 from analogrig.catalogue import Change, SteppedFlag
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
-from analogrig.plant import PARAMETERS, physical_parameters
-from analogrig.run import LOST, Run, Segment
+from analogrig.plant import PARAMETERS, Segment, physical_parameters
+from analogrig.run import LOST, Run
 from analogrig.scenario import MISSING, Expectations
 from analogrig.wording import number_of
 
@@ -99,6 +99,15 @@ class ChangeVerdict:
         """Smallest and largest possible latency; None: no alarm is attributed to the change."""
         known = [each.latency_n for each in self.hypotheses if each.latency_n is not None]
         return (min(known), max(known)) if known else None
+
+    @property
+    def latency_text(self) -> str:
+        """Latency: ``4``, ``1-9`` if the instant is an interval, ``missed``, ``unknown``, or ``-``."""
+        if self.result in {"missed", "not judged"}:
+            return {"missed": "missed", "not judged": "unknown"}[self.result]
+        if self.latencies_n is None:
+            return "-"
+        return "-".join(map(str, dict.fromkeys(self.latencies_n)))
 
     @property
     def result(self) -> Result:
@@ -354,7 +363,7 @@ def _attribute_alarms(
         detection = in_segment[0] if in_segment else None
         detected |= _alarms_of_change(in_segment, start + by_start[start].ramp_n)
         changed = before.changes_to(after)
-        late = information.first_reaching(gathered, expect.late_information_ratio * level)
+        late = information.first_at_level(gathered, expect.late_information_ratio * level)
         tweaks.append(
             ChangeVerdict(
                 unseen=by_start[start].unseen,
@@ -363,7 +372,7 @@ def _attribute_alarms(
                 before={name: old for name, (old, _) in changed.items()},
                 after={name: new for name, (_, new) in changed.items()},
                 latency_n=None if detection is None else detection - start,
-                bound_n=information.first_reaching(gathered, level),
+                bound_n=information.first_at_level(gathered, level),
                 deadline_n=None if late is None else late + expect.late_slack_n,
                 diagnosis=None
                 if detection is None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 from analogrig_emulator.effects import SAMPLES, Effect, measure_effects
 
 EffectsBySet = Mapping[str, Sequence[Effect]]
@@ -79,7 +79,7 @@ def write_picture(table: EffectsBySet, path: Path) -> None:
         y = top_px + row_px * k
         parts.append(f'<text x="240" y="{y + row_px / 2:.1f}" text-anchor="end">{escape(name)}</text>')
         parts += [_bar(rows[k], y + 10 * i, _COLOURS[i]) for i, rows in enumerate(table.values())]
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write("\n".join([*parts, "</svg>", ""]).encode())
 
 

@@ -16,7 +16,7 @@ from analogrig.rigs.emulator import SetUp, is_emulated
 from analogrig.rigs.rig import Block, Rig
 from analogrig.run import CHANNELS
 from analogrig.scenario import Scenario
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 from analogrig_emulator import SOURCE, TICKS_PER_SAMPLE, Deck, PotTurn
 
 
@@ -41,7 +41,7 @@ def write_signals(
     volts, codes, clipped = (
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("volts", "codes", "clipped")
     )
-    with replacing(path) as file:
+    with replace_file(path) as file:
         if path.suffix == ".csv":
             _write_csv(volts, codes, clipped, file)
         else:

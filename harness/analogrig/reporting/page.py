@@ -13,7 +13,7 @@ from analogrig.judging.verdict import Verdict
 from analogrig.reporting import tables
 from analogrig.reporting.payload import as_script, payload
 from analogrig.run import Run
-from analogrig.storage import replacing
+from analogrig.storage import replace_file
 
 FOLDER = Path(__file__).parent
 STYLES = (FOLDER / "uPlot.min.css", FOLDER / "page.css")
@@ -30,7 +30,7 @@ def write_report(run: Run, verdict: Verdict, path: Path) -> None:
     :raises RecordingError: the page cannot be written, or uPlot is not installed by the build.
     """
     page = render(run, verdict)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(page.encode("utf-8", "replace"))
 
 

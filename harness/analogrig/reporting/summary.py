@@ -9,7 +9,7 @@ from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEs
 from analogrig.plant import UNITS
 from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.run import Run
-from analogrig.wording import number_named, number_of
+from analogrig.wording import counter_text, number_of
 
 SHOWN_ALARMS = 10
 
@@ -53,7 +53,7 @@ def summary(run: Run, verdict: Verdict) -> str:
 
 def traffic_text(link_counters: Mapping[str, int]) -> str:
     """Other traffic on the line: ``12 frames foreign, 1 error frame``."""
-    return ", ".join(number_named(n, name) for name, n in link_counters.items() if n)
+    return ", ".join(counter_text(n, name) for name, n in link_counters.items() if n)
 
 
 def lamps_text(overloads: Mapping[str, int]) -> str:
@@ -82,20 +82,11 @@ def _false_alarms(verdict: Verdict) -> str:
 def _change_lines(tweak: ChangeVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
     change = _change(tweak.before, tweak.after)
-    out = [f"  {tweak.sample:6}  {change:43}  {latency_text(tweak):>7}  {bound:>5}"]
+    out = [f"  {tweak.sample:6}  {change:43}  {tweak.latency_text:>7}  {bound:>5}"]
     low, high = tweak.between
     if low < high:
         out += [f"          between {low} and {high} (the likeliest instant is shown): {tweak.result}"]
     return out
-
-
-def latency_text(tweak: ChangeVerdict) -> str:
-    """Latency as text: ``4``, ``1-9`` if the instant is an interval, ``missed``, ``unknown``, or ``-``."""
-    if tweak.result in {"missed", "not judged"}:
-        return {"missed": "missed", "not judged": "unknown"}[tweak.result]
-    if tweak.latencies_n is None:
-        return "-"
-    return "-".join(map(str, dict.fromkeys(tweak.latencies_n)))
 
 
 def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:

@@ -12,7 +12,7 @@ from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
-from analogrig.reporting.summary import lamps_text, latency_text, load_text
+from analogrig.reporting.summary import lamps_text, load_text
 from analogrig.run import Run
 from analogrig.wording import number_of
 
@@ -202,7 +202,7 @@ def _change_row(tweak: ChangeVerdict) -> str:
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
-    latency = "–" if tweak.latencies_n is None else latency_text(tweak).replace("-", "–")
+    latency = "–" if tweak.latencies_n is None else tweak.latency_text.replace("-", "–")
     cells = [instant, cell(change), cell(latency, "number"), number(tweak.bound_n)]
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.errors import AnalogrigError, ConfigurationError, RigError
-from analogrig.plant import Plant
+from analogrig.plant import Plant, Segment
 from analogrig.rigs.rig import BLOCK_SAMPLES, CHANNEL_UNITS, Block, Hindsight, Performance, Rig, RigDescription
-from analogrig.run import CHANNELS, Channel, Segment
+from analogrig.run import CHANNELS, Channel
 from analogrig.scenario import Scenario
 from analogrig_emulator import (
     CARDS,
@@ -214,7 +214,7 @@ class CardDescription:
         :raises ConfigurationError: one is of another type.
         """
         hints = typing.get_type_hints(Card)
-        return {name: config.converted(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
+        return {name: config.convert(hints[name], value, f"faults: {name}") for name, value in self.faults.items()}
 
     def _noises_lsb(self) -> tuple[float, ...] | None:
         """Noise of each channel in LSB; None if not given."""

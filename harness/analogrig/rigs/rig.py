@@ -16,7 +16,8 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.run import Channel, Segment
+from analogrig.plant import Segment
+from analogrig.run import Channel
 from analogrig.scenario import Scenario
 from analogrig.trust import Thing
 

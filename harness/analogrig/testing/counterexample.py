@@ -5,19 +5,21 @@ A counterexample holds the scenario, rig and device, the recording, and the comm
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shlex
 import shutil
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from analogrig import config
 from analogrig.devices.registry import describe, recorded
+from analogrig.errors import AnalogrigError
 from analogrig.rigs import description as rigs
 from analogrig.run import Run
-from analogrig.scenario import Statement
+from analogrig.scenario import Scenario, Statement
 from analogrig.trust import Thing
 
 SCENARIO_FILE, RIG_FILE, DEVICE_FILE = "scenario.toml", "rig.toml", "dut.toml"
@@ -46,13 +48,17 @@ class Counterexample:
             words += ["--seed", str(self.run.conditions.seed)]
         device = self._device()
         words += ["--dut", device or str(scenario.with_name(DEVICE_FILE))]
-        of_device = () if device else recorded(self.run.conditions.dut).things
-        return shlex.join([*words, *_allowed("--allow", (*of_device, *_rig_things(self.run)))])
+        return shlex.join([*words, *self._options("--allow", with_device=not device)])
 
     def suite_command(self, folder: Path) -> str:
         """Command that judges the play again as a test, and allows the things that the files name."""
-        things = (*recorded(self.run.conditions.dut).things, *_rig_things(self.run))
-        return shlex.join(["pytest", str(folder), "--hil-scenario-dir", str(folder), *_allowed("--hil-allow", things)])
+        options = self._options("--hil-allow", with_device=True)
+        return shlex.join(["pytest", str(folder), "--hil-scenario-dir", str(folder), *options])
+
+    def _options(self, allow: str, *, with_device: bool) -> list[str]:
+        """Options that allow the things which the files of the counterexample name."""
+        device = recorded(self.run.conditions.dut).things if with_device else ()
+        return [word for thing in (*device, *_rig_things(self.run)) for word in (allow, thing.display_name())]
 
     def write(self, folder: Path, *, page: bool = True) -> None:
         """Write the counterexample into ``folder``, all or nothing: the old content stays until the new one is
@@ -65,18 +71,21 @@ class Counterexample:
         :param page: with the report, which takes longer than all the rest.
         :raises RecordingError: the recording cannot be written. OSError: the folder or a file cannot.
         """
-        new = folder.with_name(f".{folder.name}.new")
+        new, old = (folder.with_name(f".{folder.name}.{each}") for each in ("new", "old"))
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)
         try:
             self._write(new, page=page)
-            _take_the_place(new, folder)
+            if folder.exists():  # a process that is killed here leaves it under the name ``old``
+                shutil.rmtree(old, ignore_errors=True)
+                folder.rename(old)
+            new.rename(folder)
+            shutil.rmtree(old, ignore_errors=True)
         finally:
             shutil.rmtree(new, ignore_errors=True)
 
     def _write(self, folder: Path, *, page: bool) -> None:
-        tables = self._tables()
-        for name, table in tables.items():
+        for name, table in self._tables().items():
             (folder / name).write_text(config.to_toml(table), encoding="utf-8")
         self.run.save(folder / RUN_FILE)
         if page:
@@ -90,7 +99,7 @@ class Counterexample:
         conditions, device = self.run.conditions, self._device()
         scenario = {key: value for key, value in conditions.scenario.items() if key not in ("name", "rig", "statement")}
         scenario["seed"] = conditions.seed if self.seed is None else self.seed
-        is_name = bool(device) and all(Path(each).is_absolute() for each in _named_paths(device))
+        is_name = bool(device) and not _names_relative_path(device)
         scenario["dut"] = device if is_name else DEVICE_FILE
         tables = {SCENARIO_FILE: scenario}
         if not is_name:
@@ -111,10 +120,10 @@ class Counterexample:
         return next((each for each in names if each and not each.endswith(".toml") and _is_device(each, self.run)), "")
 
 
-def _named_paths(device: str) -> list[str]:
-    """Paths in the name of a device, as written there."""
-    where = device.partition(":")[2].partition("?")[0]
-    return [where] if any(thing.is_path for thing in describe(device).things) else []
+def _names_relative_path(device: str) -> bool:
+    """True if the name of a device holds a path that is relative to the working directory."""
+    path = device.partition(":")[2].partition("?")[0]
+    return any(thing.is_path for thing in describe(device).things) and not Path(path).is_absolute()
 
 
 def _rig_things(run: Run) -> tuple[Thing, ...]:
@@ -124,21 +133,6 @@ def _rig_things(run: Run) -> tuple[Thing, ...]:
         return ()
     plain = tomllib.loads(config.to_toml(table))  # as a file has it: lists for tuples, and nothing that is None
     return rigs.from_table(plain, "the recorded rig").things
-
-
-def _allowed(option: str, things: Iterable[Thing]) -> list[str]:
-    return [word for thing in things for word in (option, thing.shown())]
-
-
-def _take_the_place(new: Path, folder: Path) -> None:
-    """Replace ``folder`` by ``new``. A process killed between the two renames leaves the old folder under another
-    name."""
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    new.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> str:
@@ -161,32 +155,21 @@ def command_of(run: Run, scenario: str = "", rig: str = "", dut: str = "") -> st
 
 def _is_scenario(name: str, run: Run) -> bool:
     """True if the named scenario is the one that the run played."""
-    from analogrig.errors import AnalogrigError
-    from analogrig.scenario import Scenario
-
-    try:
+    with contextlib.suppress(AnalogrigError):
         return dict(Scenario.load(name).as_table()) == dict(run.conditions.scenario)
-    except AnalogrigError:
-        return False
+    return False
 
 
 def _is_rig(name: str, run: Run) -> bool:
-    from analogrig.errors import AnalogrigError
-
-    try:
+    with contextlib.suppress(AnalogrigError):
         return dict(rigs.describe(name).as_table()) == dict(run.conditions.rig)
-    except AnalogrigError:
-        return False
+    return False
 
 
 def _is_device(name: str, run: Run) -> bool:
-    from analogrig.errors import AnalogrigError
-
-    try:
-        described = describe(name).as_table()
-    except AnalogrigError:
-        return False
-    return _settings(described) == _settings(run.conditions.dut)
+    with contextlib.suppress(AnalogrigError):
+        return _settings(describe(name).as_table()) == _settings(run.conditions.dut)
+    return False
 
 
 def _settings(dut: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Concatenate, ParamSpec
+from typing import Concatenate
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,40 +20,33 @@ from numpy.typing import ArrayLike
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import Design, upper_rate
 from analogrig.judging.verdict import ChangeVerdict, Verdict, judge
-from analogrig.reporting.summary import latency_text
 from analogrig.run import Run
 from analogrig.scenario import Statement
-from analogrig.testing.statement import Finding, make_known, said
+from analogrig.testing.statement import Arguments, Finding, register, statement_of
 from analogrig.wording import number_of
 
-Arguments = ParamSpec("Arguments")
 
-
-def _of_a_valid_play(
-    statement: Callable[Concatenate[Played, Arguments], Finding],
+def _statement(
+    judge: Callable[Concatenate[Played, Arguments], Finding],
 ) -> Callable[Concatenate[Played, Arguments], Finding]:
-    """Make a statement fail for a play that is not valid, and note every finding."""
+    """Declare a statement about a play. It does not hold for a play that is not valid."""
 
-    @functools.wraps(statement)
-    def checked(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
+    @functools.wraps(judge)
+    def judge_and_note(played: Played, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Finding:
         for limit in (*args, *kwargs.values()):
             if isinstance(limit, float) and not math.isfinite(limit):
-                raise ValueError(f"{statement.__name__}: a limit must be a finite number, not {limit}")
+                raise ValueError(f"{judge.__name__}: a limit must be a finite number, not {limit}")
         if played.verdict.valid:
-            finding = statement(played, *args, **kwargs)
+            finding = judge(played, *args, **kwargs)
         else:
             finding = Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}")
-        stated = said(checked, played, *args, **kwargs)
-        finding = dataclasses.replace(finding, statement=stated, run=played.run)
+        statement = statement_of(judge_and_note, played, *args, **kwargs)
+        finding = dataclasses.replace(finding, statement=statement, run=played.run)
         played.note(finding)
         return finding
 
-    make_known(checked, is_experiment=False)
-    return checked
-
-
-def _to_nobody(_: Finding) -> None:
-    """Ignore a finding: outside the plugin no test needs its reason."""
+    register(judge_and_note, is_experiment=False)
+    return judge_and_note
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,7 +60,7 @@ class Played:
     run: Run
     repeat: str = ""
     """Command that repeats the play; empty if no names or files describe what was played."""
-    note: Callable[[Finding], None] = field(default=_to_nobody, compare=False)
+    note: Callable[[Finding], None] = field(default=lambda _: None, compare=False)
     """Callback that receives every finding about the play."""
 
     def __repr__(self) -> str:
@@ -82,12 +75,12 @@ class Played:
     def verdict(self) -> Verdict:
         return judge(self.run)
 
-    @_of_a_valid_play
+    @_statement
     def passes(self) -> Finding:
         """Finding: the scenario's ``[expect]`` is met: no change missed or late, no false alarm."""
         return Finding(self.verdict.outcome == "passed", "; ".join(self.verdict.reasons) or "all that is expected")
 
-    @_of_a_valid_play
+    @_statement
     def detects(self, within: float | None = None) -> Finding:
         """Finding: every detectable change raised an alarm before the next change.
 
@@ -99,11 +92,11 @@ class Played:
         seeable = [tweak for tweak in self.verdict.tweaks if tweak.bound_n is not None and not tweak.unseen]
         if not seeable:
             return Finding(holds=False, why="no change could be seen: none carried enough information before the next")
-        wrong = [why for tweak in seeable if (why := _not_detected(tweak, within))]
-        latencies = ", ".join(f"{tweak.what} after {latency_text(tweak)} (bound {tweak.bound_n})" for tweak in seeable)
+        wrong = [why for tweak in seeable if (why := _detection_failure(tweak, within))]
+        latencies = ", ".join(f"{tweak.what} after {tweak.latency_text} (bound {tweak.bound_n})" for tweak in seeable)
         return Finding(not wrong, "; ".join(wrong) or latencies)
 
-    @_of_a_valid_play
+    @_statement
     def stays_quiet(self) -> Finding:
         """Finding: no alarm except one for each change."""
         alarms, doubtful = self.verdict.false_alarms, self.verdict.doubtful_alarms
@@ -113,7 +106,7 @@ class Played:
         of = number_of(self.run.samples, "sample")
         return Finding(not alarms, f"{number_of(len(alarms), 'false alarm')} in {of}: {where}".rstrip(": "))
 
-    @_of_a_valid_play
+    @_statement
     def isolates(self) -> Finding:
         """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
         judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
@@ -124,7 +117,7 @@ class Played:
             not wrong, "; ".join(wrong) or f"{len(said)} of {len(self.verdict.tweaks)} changes named, rightly"
         )
 
-    @_of_a_valid_play
+    @_statement
     def estimates(self, within: float) -> Finding:
         """Finding: M, B and K at the end of every stretch have a relative error of at most ``within``."""
         off = []
@@ -138,7 +131,7 @@ class Played:
             ]
         return Finding(not off, "; ".join(off) or f"{len(self.verdict.estimates)} stretches within {within:.2%}")
 
-    @_of_a_valid_play
+    @_statement
     def follows(self, reference: ArrayLike, tolerance: ArrayLike, time_tolerance: int = 0) -> Finding:
         """Finding: the estimate stays in a tube around a reference estimate.
 
@@ -168,16 +161,16 @@ class Played:
 _UNKNOWN = "it depends on when the change came, which is not known better"
 
 
-def _not_detected(tweak: ChangeVerdict, within: float | None) -> str:
+def _detection_failure(tweak: ChangeVerdict, within: float | None) -> str:
     """Reason why a detectable change was not detected in time under any hypothesis of its instant; empty if it was."""
-    reasons = [_too_late(each, within) for each in tweak.hypotheses]
+    reasons = [_failure_at_instant(each, within) for each in tweak.hypotheses]
     if all(reasons):
-        return _too_late(tweak, within)
+        return _failure_at_instant(tweak, within)
     low, high = tweak.between
     return f"INCONCLUSIVE: {tweak.what} between {low} and {high}: {_UNKNOWN}" if any(reasons) else ""
 
 
-def _too_late(tweak: ChangeVerdict, within: float | None) -> str:
+def _failure_at_instant(tweak: ChangeVerdict, within: float | None) -> str:
     """Reason why a change at a known instant was missed or late; empty if it was detected in time."""
     if tweak.latency_n is None and tweak.bound_n is None:
         return ""

@@ -93,26 +93,21 @@ def suspensions() -> st.SearchStrategy[PlantChoice]:
 def random_suspensions(count: int, seed: int) -> list[PlantChoice]:
     """Random suspensions, drawn evenly: for statistics over plants, where hypothesis would look for the extreme."""
     rng = np.random.default_rng(seed)
-    mass, stiffness, ratio = (
-        rng.uniform(*ends, count) for ends in (*(REACH[name] for name in ("M", "K")), DAMPING_RATIO)
-    )
-    return [
-        _suspension(_rounded(float(m)), _rounded(float(k)), float(zeta))
-        for m, k, zeta in zip(mass, stiffness, ratio, strict=True)
-    ]
+    drawn = (rng.uniform(*ends, count).tolist() for ends in (REACH["M"], REACH["K"], DAMPING_RATIO))
+    return [_suspension(_round(m), _round(k), zeta) for m, k, zeta in zip(*drawn, strict=True)]
 
 
 def _suspension(mass_kg: float, stiffness_n_per_m: float, damping_ratio: float | None) -> PlantChoice:
     """Suspension with these parameters; without a damping ratio, that of the front suspension."""
     front = PLANTS["front"]
     critical = 2.0 * math.sqrt(mass_kg * stiffness_n_per_m)
-    damping = front.damping_n_s_per_m if damping_ratio is None else _rounded(damping_ratio * critical)
+    damping = front.damping_n_s_per_m if damping_ratio is None else _round(damping_ratio * critical)
     if not DAMPING_RATIO[0] <= damping / critical <= DAMPING_RATIO[1]:
-        damping = _rounded(0.8 * critical)
+        damping = _round(0.8 * critical)
     return PlantChoice("front", mass_kg, damping, stiffness_n_per_m)
 
 
-def _rounded(value: float) -> float:
+def _round(value: float) -> float:
     return float(f"{value:.5g}")
 
 
@@ -128,7 +123,9 @@ def _damping_ratio(plant: Plant) -> float:
     return plant.damping_n_s_per_m / (2.0 * math.sqrt(plant.stiffness_n_per_m * plant.mass_kg))
 
 
+@st.composite
 def changes(
+    draw: st.DrawFn,
     plant: PlantChoice | None = None,
     *,
     parameters: Sequence[str] = ("K", "B", "M"),
@@ -136,32 +133,18 @@ def changes(
     at: st.SearchStrategy[int] | None = None,
     together: int = 1,
     longest_ramp_n: int = 0,
-) -> st.SearchStrategy[PotChange]:
+) -> PotChange:
     """Changes of the pots during a play.
 
     :param plant: the plant that changes; None: the front suspension.
     :param sizes: the least and the largest relative change, up or down as the pots allow.
-    :param at: the sample.
+    :param at: the sample; None: the first after the warm-up.
     :param together: so many parameters may change at once.
     :param longest_ramp_n: 0: only jumps.
     """
-    truth = (plant or PlantChoice()).plant()
-    return _changes(truth, tuple(parameters), sizes, st.just(WARM_UP_N) if at is None else at, together, longest_ramp_n)
-
-
-@st.composite
-def _changes(
-    draw: st.DrawFn,
-    truth: Plant,
-    parameters: tuple[str, ...],
-    sizes: tuple[float, float],
-    at: st.SearchStrategy[int],
-    together: int,
-    longest_ramp_n: int,
-) -> PotChange:
+    changed = (plant or PlantChoice()).plant()
     count = draw(st.integers(1, together))
     names = draw(st.lists(st.sampled_from(parameters), min_size=count, max_size=count, unique=True))
-    changed = truth
     for name in names:
         size = draw(_number(sizes[0], sizes[1], 2))
         ways = [changed.scaled(name, factor) for factor in (1.0 - size, 1.0 + size)]
@@ -169,8 +152,9 @@ def _changes(
         assume(able)
         changed = draw(st.sampled_from(able))
     values = changed.parameters()
-    turned = {FIELDS[name]: _rounded(values[name]) for name in names}
-    return PotChange(sample=draw(at), ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
+    turned = {FIELDS[name]: _round(values[name]) for name in names}
+    sample = WARM_UP_N if at is None else draw(at)
+    return PotChange(sample=sample, ramp_n=draw(st.integers(0, longest_ramp_n)), **turned)
 
 
 def excitations(*, free: bool = False) -> st.SearchStrategy[Excitation]:

@@ -19,25 +19,25 @@ import pytest
 
 from analogrig.rigs import CAPABILITIES
 from analogrig.testing import profiles
-from analogrig.testing.plugin import devices, options, playing, provenance, scenarios, trusting
-from analogrig.testing.plugin.options import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, Option, time_limit_s
+from analogrig.testing.plugin import devices, junit, player, scenarios, settings
+from analogrig.testing.plugin.settings import DUT, HIL_PROFILE, RIG, RUNS_DIR, SCENARIO_DIR, time_limit_s
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
     from analogrig.devices.dut import Dut
     from analogrig.rigs.rig import Rig
-    from analogrig.testing.experiment import Play
+    from analogrig.testing.statement import Play
 
 # -------------------------------------------------------------------------------------------------------------- session
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    options.add(parser)
+    settings.add_options(parser)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    trusting.check(early_config, early_config.known_args_namespace.hil_allow)
+    settings.check_allow(early_config, early_config.known_args_namespace.hil_allow)
 
 
 _PROFILE = pytest.StashKey[Callable[[], str]]()
@@ -47,39 +47,39 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"hil_needs(*capabilities): skip where the rig cannot do that: {', '.join(CAPABILITIES)}"
     )
-    options.check_command_line(config)
-    provenance.begin(config)
-    profile: Callable[[], str] = functools.partial(_value_while_collecting, HIL_PROFILE, config)
+    settings.check_command_line(config)
+    junit.begin(config)
+    profile: Callable[[], str] = functools.partial(_collection_profile, config)
     config.stash[_PROFILE] = profile
     profiles.begin_session(profile)
-    config.stash[scenarios.DEVICES] = devices.Devices()
-    devices.keep_with_owner(config)
+    config.stash[devices.DEVICES] = devices.Devices()
+    devices.assign_owner(config)
     scenarios.add_folder(config)
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    if (opened := config.stash.get(scenarios.DEVICES, None)) is not None:
-        opened.close()
+    if (open_devices := config.stash.get(devices.DEVICES, None)) is not None:
+        open_devices.close()
     if (profile := config.stash.get(_PROFILE, None)) is not None:
         profiles.end_session(profile)
 
 
-def _value_while_collecting(option: Option, config: pytest.Config) -> str:
+def _collection_profile(config: pytest.Config) -> str:
     """:raises pytest.Collector.CollectError: the value is wrong; the test file that asks is not collected."""
-    said = option.said(config)
-    if complaint := option.complaint(said.value):
-        raise pytest.Collector.CollectError(f"{said.by}: {complaint}")
-    return said.value
+    setting = HIL_PROFILE.of_session(config)
+    if complaint := HIL_PROFILE.complaint(setting.value):
+        raise pytest.Collector.CollectError(f"{setting.by}: {complaint}")
+    return setting.value
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    return scenarios.collected(file_path, parent)
+    return scenarios.collect_file(file_path, parent)
 
 
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
     _check_needs(items)
     scenarios.add_complaint(session, items)
-    devices.tell_owned(config, items)
+    devices.list_owned_tests(config, items)
 
 
 def _check_needs(items: list[pytest.Item]) -> None:
@@ -99,20 +99,20 @@ def _check_needs(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def hil_scenario_dir(request: pytest.FixtureRequest) -> Path | None:
     """The folder of --hil-scenario-dir."""
-    value = SCENARIO_DIR.asked(request).value
+    value = SCENARIO_DIR.of_fixture(request).value
     return Path(value) if value else None
 
 
 @pytest.fixture
 def hil_runs_dir(request: pytest.FixtureRequest) -> Path:
     """The folder of --hil-runs-dir."""
-    return Path(RUNS_DIR.asked(request).value)
+    return Path(RUNS_DIR.of_fixture(request).value)
 
 
 @pytest.fixture
 def hil_profile(request: pytest.FixtureRequest) -> str:
     """``ci``, ``nightly`` or ``soak``."""
-    return HIL_PROFILE.asked(request).value
+    return HIL_PROFILE.of_fixture(request).value
 
 
 @pytest.fixture
@@ -121,12 +121,12 @@ def hil_rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     from analogrig.rigs.description import open_rig
 
     devices.check_owner(request.node)
-    said = RIG.asked(request)
-    with playing.in_one_line(said.by):
-        opened = open_rig(said.value, allow=options.trust_of(request.config))
-    with opened:
-        _skip_unless_able(request.node, opened, said.value)
-        yield opened
+    setting = RIG.of_fixture(request)
+    with player.in_one_line(setting.by):
+        rig = open_rig(setting.value, allow=settings.trust_of(request.config))
+    with rig:
+        _skip_unless_able(request.node, rig, setting.value)
+        yield rig
 
 
 def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
@@ -141,9 +141,9 @@ def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
 def hil_dut(request: pytest.FixtureRequest) -> Dut:
     """The device of --hil-dut, reset and configured as described."""
     devices.check_owner(request.node)
-    said = DUT.asked(request)
-    with playing.in_one_line(said.by):
-        return request.config.stash[scenarios.DEVICES].lease(said.value, options.trust_of(request.config))
+    setting = DUT.of_fixture(request)
+    with player.in_one_line(setting.by):
+        return request.config.stash[devices.DEVICES].lease(setting.value, settings.trust_of(request.config))
 
 
 @pytest.fixture
@@ -160,15 +160,15 @@ def hil_play(request: pytest.FixtureRequest, hil_bench: Bench) -> Play:
 
     A play that is INCONCLUSIVE fails the test with its reason; ``allow_inconclusive=True`` hands it on.
     """
-    return playing.Player(request.node, hil_bench, is_sessions=True)
+    return player.Player(request.node, hil_bench, is_default=True)
 
 
-# ---------------------------------------------------------------------------------------------------- what has failed
+# -------------------------------------------------------------------------------------------------------------- results
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
-    with playing.examples_kept(item):
+    with player.keep_examples(item):
         yield
 
 
@@ -176,9 +176,11 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    if call.when == "call" and playing.has_played(item):
-        item.user_properties.extend(playing.properties(item))
+    record = player.record_of(item)
+    if call.when == "call":
+        item.user_properties += [each for played in record.plays for each in junit.play_properties(played)]
+        item.user_properties += [("found", f"{record.found[0]!r}"[1:-1])] if record.found else []
     report = yield
-    if report.when == "call" and report.failed and playing.has_played(item) and (left := playing.left_by(item)):
-        report.sections.append(("analogrig", left))
+    if report.when == "call" and report.failed and (text := player.write_counterexample(item)):
+        report.sections.append(("analogrig", text))
     return report

@@ -10,37 +10,30 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.testing.plugin.options import DUT, RIG, Source
+from analogrig.testing.plugin.settings import DUT, RIG
 
 if TYPE_CHECKING:
     from analogrig.devices.dut import Dut
+    from analogrig.estimator_config import EstimatorConfig
     from analogrig.trust import Trust
 
-_TOLD = "analogrig_owned"
+_FOLDER = "analogrig_owned"
 """Key of a worker's input: the folder that lists the tests which need a single rig or device."""
 
 _SPREADING = ("load", "worksteal")
 """Values of --dist with which pytest-xdist gives any test to any worker."""
 
 
-@runtime_checkable
-class Equipped(Protocol):
-    """An item that names its own rig and device; other plugins' items have no such method."""
-
-    def hil_equipment(self) -> tuple[str, str]:
-        """Names of rig and device; empty if unknown."""
-
-
 @dataclass
 class Devices:
     """Devices of a session. They stay open until the session ends, and are reopened after a test has hung them."""
 
-    _open: dict[str, Dut] = field(default_factory=dict)
-    _described: dict[str, Any] = field(default_factory=dict)
+    _open: dict[str, tuple[Dut, EstimatorConfig]] = field(default_factory=dict)
+    """Each with the settings of its description."""
 
     def lease(self, name: str, trust: Trust) -> Dut:
         """Device that is reachable, reset and configured as described, in whatever state the last test left it.
@@ -48,40 +41,36 @@ class Devices:
         :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
         from analogrig.devices.dut import open_dut
-        from analogrig.devices.registry import trusted
+        from analogrig.devices.registry import describe, trusted
         from analogrig.errors import AnalogrigError
 
         only_one = trusted(name, trust).only_one
-        dut = self._open.pop(name, None)
-        if dut is not None:
+        if name in self._open:
+            dut, settings = self._open[name]
             try:
                 dut.handshake()
-                dut.configure(self._described[name])
+                dut.configure(settings)
             except AnalogrigError:
-                dut.close()
-                dut = None
-        if dut is None:
-            self._let_go(only_one)
+                self.release(name)
+        if name not in self._open:
+            for other in [each for each in self._open if only_one and describe(each).only_one == only_one]:
+                self.release(other)
             dut = open_dut(name, allow=trust)
-            self._described[name] = dut.estimator
-        self._open[name] = dut
-        return dut
+            self._open[name] = dut, dut.estimator
+        return self._open[name][0]
 
     def release(self, name: str) -> None:
         """Close the device ``name``, if it is open."""
-        if (dut := self._open.pop(name, None)) is not None:
-            dut.close()
-
-    def _let_go(self, only_one: str) -> None:
-        """Close the devices open under another name that cannot be opened twice."""
-        from analogrig.devices.registry import describe
-
-        for name in [name for name in self._open if only_one and describe(name).only_one == only_one]:
-            self.release(name)
+        if name in self._open:
+            self._open.pop(name)[0].close()
 
     def close(self) -> None:
         for name in list(self._open):
             self.release(name)
+
+
+DEVICES = pytest.StashKey[Devices]()
+"""Devices of the session."""
 
 
 class OneOwner:
@@ -95,7 +84,7 @@ class OneOwner:
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_configure_node(self, node: Any) -> None:
-        node.workerinput[_TOLD] = str(self._folder)
+        node.workerinput[_FOLDER] = str(self._folder)
 
     @pytest.hookimpl(optionalhook=True, tryfirst=True)
     def pytest_xdist_make_scheduler(self, config: pytest.Config, log: Any) -> Any:
@@ -104,7 +93,7 @@ class OneOwner:
         folder = self._folder
 
         def scope(_: Any, nodeid: str) -> str:
-            return _TOLD if nodeid in _owned(folder) else nodeid
+            return _FOLDER if nodeid in _owned_tests(folder) else nodeid
 
         return type("OneOwnerScheduling", (LoadScopeScheduling,), {"_split_scope": scope})(config, log)
 
@@ -113,14 +102,14 @@ class OneOwner:
 
 
 @functools.cache
-def _owned(folder: Path) -> frozenset[str]:
-    """Node ids of the tests that one worker owns. Call it after all workers have collected: each records the same
+def _owned_tests(folder: Path) -> frozenset[str]:
+    """Node ids of the tests that one worker owns. Call it after all workers have collected: each writes the same
     list."""
-    told = sorted(folder.iterdir())
-    return frozenset(json.loads(told[0].read_text(encoding="utf-8")) if told else ())
+    lists = sorted(folder.iterdir())
+    return frozenset(json.loads(lists[0].read_text(encoding="utf-8")) if lists else ())
 
 
-def keep_with_owner(config: pytest.Config) -> None:
+def assign_owner(config: pytest.Config) -> None:
     """Have one worker of pytest-xdist run all tests of the session's rig and device, if there is only one of either.
 
     A name in the environment does not change how a session distributes its tests; see ``check_owner``.
@@ -130,50 +119,50 @@ def keep_with_owner(config: pytest.Config) -> None:
     dist, workers = config.getoption("dist", "no"), config.getoption("tx", None) or []
     if dist == "no" or len(workers) < 2:
         return
-    said = [option.said(config) for option in (RIG, DUT)]
+    settings = [option.of_session(config) for option in (RIG, DUT)]
 
-    def single(*sources: Source) -> str:
-        return _single(*(each.value if each.source in sources else "" for each in said))
+    def single(*sources: str) -> str:
+        return _single_equipment(*(each.value if each.source in sources else "" for each in settings))
 
     if dist not in _SPREADING:
-        if refused := single("command line"):
-            raise pytest.UsageError(f"{refused}, and --dist {dist} may not: use --dist load, or leave out -n")
+        if text := single("command line"):
+            raise pytest.UsageError(f"{text}, and --dist {dist} may not: use --dist load, or leave out -n")
     elif single("command line", "ini file"):
         config.pluginmanager.register(OneOwner(Path(tempfile.mkdtemp(prefix="analogrig-"))))
 
 
-def tell_owned(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
-    """In a worker: record which tests belong together."""
-    told = getattr(config, "workerinput", {})
-    if _TOLD in told:
-        owned = [item.nodeid for item in items if single_of(item)]
-        path = Path(told[_TOLD]) / f"{told['workerid']}.json"
+def list_owned_tests(config: pytest.Config, items: Sequence[pytest.Item]) -> None:
+    """In a worker: write down which tests belong together."""
+    inputs = getattr(config, "workerinput", {})
+    if _FOLDER in inputs:
+        owned = [item.nodeid for item in items if single_equipment(item)]
+        path = Path(inputs[_FOLDER]) / f"{inputs['workerid']}.json"
         try:
             path.write_text(json.dumps(owned), encoding="utf-8")
         except OSError:  # the folder of another machine
-            del told[_TOLD]
+            del inputs[_FOLDER]
 
 
 def check_owner(item: pytest.Item) -> None:
     """Fail a test whose rig or device another worker may have."""
-    told = getattr(item.config, "workerinput", {})
-    if told.get("workercount", 1) > 1 and _TOLD not in told and (single := single_of(item)):
+    inputs = getattr(item.config, "workerinput", {})
+    if inputs.get("workercount", 1) > 1 and _FOLDER not in inputs and (single := single_equipment(item)):
         pytest.fail(
             f"{single}: leave out -n, or use --dist load and name it for all tests with --hil-rig or --hil-dut",
             pytrace=False,
         )
 
 
-def single_of(item: pytest.Item) -> str:
+def single_equipment(item: pytest.Item) -> str:
     """Description of the single rig or device that a test needs and one worker owns; empty if the test needs none."""
-    if isinstance(item, Equipped):
-        return _single(*item.hil_equipment())
+    if (equipment := getattr(item, "hil_equipment", None)) is not None:  # a scenario file
+        return _single_equipment(*equipment())
     wanted = getattr(item, "fixturenames", ())
-    rig, dut = (option.of(item) if option.name in wanted else "" for option in (RIG, DUT))
-    return _single(rig, dut)
+    rig, dut = (option.of(item).value if option.name in wanted else "" for option in (RIG, DUT))
+    return _single_equipment(rig, dut)
 
 
-def _single(rig: str, dut: str) -> str:
+def _single_equipment(rig: str, dut: str) -> str:
     """Description of the single one of a rig and a device; empty if neither is single.
 
     The code that opens them reports names that do not exist.

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from analogrig.testing.plugin.devices import Devices, check_owner
-from analogrig.testing.plugin.options import DUT, RIG, SCENARIO_DIR, time_limit_s, trust_of
-from analogrig.testing.plugin.playing import Player
+from analogrig.testing.plugin.devices import DEVICES, check_owner
+from analogrig.testing.plugin.player import Player
+from analogrig.testing.plugin.settings import DUT, RIG, SCENARIO_DIR, Option, time_limit_s, trust_of
 
 if TYPE_CHECKING:
-    from analogrig.scenario import Scenario
     from analogrig.testing.statement import Finding
 
 RIG_KINDS = ("emulator", "real")
@@ -26,9 +25,6 @@ _FOLDER = pytest.StashKey[Path]()
 _COMPLAINT = pytest.StashKey[str]()
 """Reason why the folder of the ini file cannot be collected."""
 
-DEVICES = pytest.StashKey[Devices]()
-"""Devices of the session."""
-
 
 def add_folder(config: pytest.Config) -> None:
     """Collect the scenarios on top of all tests; on top of tests that are named only if the command line asks for both.
@@ -37,14 +33,14 @@ def add_folder(config: pytest.Config) -> None:
 
     :raises pytest.UsageError: the folder of the command line cannot be collected.
     """
-    folder = SCENARIO_DIR.said(config)
+    folder = SCENARIO_DIR.of_session(config)
     if not folder.value:
         return
     config.stash[_FOLDER] = path = Path(folder.value).resolve()
     named = config.args_source is pytest.Config.ArgsSource.ARGS
     if named and folder.source != "command line":
         return
-    complaint = SCENARIO_DIR.complaint(folder.value) or ("" if named else _passed_over(folder.value, config))
+    complaint = SCENARIO_DIR.complaint(folder.value) or ("" if named else _recursion_complaint(folder.value, config))
     if complaint and folder.source == "command line":
         raise pytest.UsageError(f"{folder.by}: {complaint}")
     if complaint:
@@ -53,7 +49,7 @@ def add_folder(config: pytest.Config) -> None:
         config.args.append(folder.value)
 
 
-def _passed_over(folder: str, config: pytest.Config) -> str:
+def _recursion_complaint(folder: str, config: pytest.Config) -> str:
     """Reason why pytest does not enter a folder that is not named; empty if pytest enters it."""
     patterns = config.getini("norecursedirs")
     parts = _below(Path(folder).resolve(), config)
@@ -67,7 +63,7 @@ def _below(path: Path, config: pytest.Config) -> tuple[str, ...]:
     return path.relative_to(root).parts if path.is_relative_to(root) else ()
 
 
-def collected(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+def collect_file(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     folder = parent.config.stash.get(_FOLDER, None)
     if folder is None or path.suffix != ".toml" or not path.is_relative_to(folder):
         return None
@@ -111,41 +107,46 @@ class ScenarioFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         from analogrig.testing.counterexample import SCENARIO_FILE
 
-        is_left = self.path.name == SCENARIO_FILE  # by a test, after which its folder is called
-        yield ScenarioItem.from_parent(self, name=self.path.parent.name if is_left else self.path.stem)
+        is_counterexample = self.path.name == SCENARIO_FILE  # its folder is named after the test
+        yield ScenarioItem.from_parent(self, name=self.path.parent.name if is_counterexample else self.path.stem)
 
 
 class ScenarioItem(pytest.Item):
     """One scenario: what a test asserted of it holds, or what it expects of the device."""
 
     def runtest(self) -> None:
-        from analogrig.bench import Bench
-        from analogrig.rigs.description import open_rig
-        from analogrig.scenario import Scenario
+        from analogrig.errors import AnalogrigError
+        from analogrig.testing.statement import Finding
+        from analogrig_emulator import EmulatorError
 
         check_owner(self)
+        try:
+            finding = self._judge()
+        except (AnalogrigError, EmulatorError) as error:
+            finding = Finding(holds=False, why=str(error).removeprefix(f"{self.path}: "))
+        if not finding:
+            pytest.fail(f"{self.path}: {finding.why}", pytrace=False)
+
+    def _judge(self) -> Finding:
+        import analogrig.testing.played
+        import analogrig.testing.properties.experiments  # noqa: F401 - each registers what a file can state
+        from analogrig.bench import Bench
+        from analogrig.rigs.description import open_rig
+        from analogrig.scenario import DEFAULT_SEED, Scenario
+        from analogrig.testing.statement import judge_statement
+
         scenario = Scenario.load(str(self.path))
-        devices, name, trust = self.config.stash[DEVICES], self._device(scenario), trust_of(self.config)
-        with open_rig(self._rig(scenario), allow=trust) as rig:
+        seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
+        devices, name, trust = self.config.stash[DEVICES], self._name(DUT, scenario.dut), trust_of(self.config)
+        with open_rig(self._name(RIG, scenario.rig), allow=trust) as rig:
             try:
-                bench = Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config))
-                finding = self._found(Player(self, bench), scenario)
+                play = Player(self, Bench(rig, devices.lease(name, trust), time_limit_s=time_limit_s(self.config)))
+                if scenario.statement is None:
+                    return play(scenario).passes()
+                return judge_statement(scenario.statement, play, scenario, seed, str(self.path))
             finally:
                 if name == scenario.dut:
                     devices.release(name)
-        if not finding:
-            raise ScenarioFailed(finding.why)
-
-    def _found(self, play: Player, scenario: Scenario) -> Finding:
-        import analogrig.testing.played
-        import analogrig.testing.properties.experiments  # noqa: F401 - each makes known what a file can state
-        from analogrig.scenario import DEFAULT_SEED
-        from analogrig.testing.experiment import judged
-
-        if scenario.statement is None:
-            return play(scenario).passes()
-        seed = DEFAULT_SEED if scenario.seed is None else scenario.seed
-        return judged(scenario.statement, play, scenario, seed, str(self.path))
 
     def hil_equipment(self) -> tuple[str, str]:
         """Names of rig and device; empty where the file cannot be read."""
@@ -154,28 +155,13 @@ class ScenarioItem(pytest.Item):
 
         with contextlib.suppress(AnalogrigError):
             scenario = Scenario.load(str(self.path))
-            return self._rig(scenario), self._device(scenario)
+            return self._name(RIG, scenario.rig), self._name(DUT, scenario.dut)
         return "", ""
 
-    def _rig(self, scenario: Scenario) -> str:
-        given = RIG.given(self.config)
-        return given.value if given else scenario.rig or RIG.otherwise(self.config).value
-
-    def _device(self, scenario: Scenario) -> str:
-        given = DUT.given(self.config)
-        return given.value if given else scenario.dut or DUT.otherwise(self.config).value
-
-    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        from analogrig.errors import AnalogrigError
-        from analogrig_emulator import EmulatorError
-
-        if isinstance(excinfo.value, ScenarioFailed | AnalogrigError | EmulatorError):
-            return f"{self.path}: {str(excinfo.value).removeprefix(f'{self.path}: ')}"
-        return super().repr_failure(excinfo, style)
+    def _name(self, option: Option, own: str) -> str:
+        """Name of rig or device: explicit, else the scenario's ``own``, else that of the session."""
+        setting = option.of_session(self.config)
+        return setting.value if setting.is_explicit else own or setting.value
 
     def reportinfo(self) -> tuple[Path, int, str]:
         return self.path, 0, f"scenario {self.name}"
-
-
-class ScenarioFailed(Exception):  # noqa: N818 - a verdict, not an error
-    """The device did not do what the scenario asks."""

@@ -23,16 +23,16 @@ from analogrig.campaigns.trials import Trials, are_possible
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.dut import Dut, connect
 from analogrig.devices.registry import recorded
-from analogrig.errors import AnalogrigError
+from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
 from analogrig.judging.verdict import judge
 from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.recording import RecordingRig
+from analogrig.rigs.rig import Rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
-from analogrig.testing.experiment import Play, experiment
 from analogrig.testing.played import Played, rate_below
-from analogrig.testing.statement import Finding
+from analogrig.testing.statement import Finding, Inconclusive, Play, experiment
 
 LONGEST_TIMEOUT_S = 0.5
 """Longest time-out of a line on which faults are tried: some faults cost one time-out, or a few."""
@@ -50,21 +50,36 @@ _EVER = 1e9
 """Multiple of the information bound that allows any latency: an alarm before the next change suffices."""
 
 
-def described(dut: Dut) -> DeviceDescription:
+def device_description(dut: Dut) -> DeviceDescription:
     """Description of the device in its present configuration."""
     return recorded(dut.description())
 
 
-def _played(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
+def is_playable(rig: Rig, scenario: Scenario) -> bool:
+    """True if the rig has the waveform and the pots. A rig that has next to none fails hypothesis's health check."""
+    try:
+        rig.perform(scenario, 0)
+    except ConfigurationError:
+        return False
+    return True
+
+
+def _play_all(play: Play, scenario: Scenario, seed: int, plays: int) -> list[Played]:
     return [play(scenario, seed + number, allow_inconclusive=True) for number in range(plays)]
 
 
-def _invalid(*plays: Played) -> Finding | None:
-    """Finding that does not hold, for the first play that is not valid; None if all are valid."""
+def _play_valid(play: Play, scenario: Scenario, seed: int) -> Played:
+    """:raises Inconclusive: the play is not valid."""
+    played = play(scenario, seed, allow_inconclusive=True)
+    _check_valid(played)
+    return played
+
+
+def _check_valid(*plays: Played) -> None:
+    """:raises Inconclusive: a play is not valid."""
     for played in plays:
         if not played.verdict.valid:
-            return Finding(holds=False, why=f"INCONCLUSIVE: {played.verdict.reasons[0]}", run=played.run)
-    return None
+            raise Inconclusive(played.verdict.reasons[0], played.run)
 
 
 # --------------------------------------------------------------------------------------------------------- false alarms
@@ -75,7 +90,7 @@ def rate_of_plays_below(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, plays: int
 ) -> Finding:
     """Finding of ``analogrig.testing.played.rate_below`` for a given number of plays."""
-    return rate_below(rate, _played(play, scenario, seed, plays), confidence=confidence)
+    return rate_below(rate, _play_all(play, scenario, seed, plays), confidence=confidence)
 
 
 @experiment
@@ -99,13 +114,13 @@ def false_alarms_at_most(
                 watched.exposure.lack_of_evidence
                 or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
             )
-            return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
+            raise Inconclusive(why)
     count = sum(map(len, alarms))
     why = f"{count} false alarms in {armed} samples, allowed {allowed}"
     if count <= allowed:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
-    return _witnessed(play, scenario, seed + most, alarms[most], why)
+    return _witness(play, scenario, seed + most, alarms[most], why)
 
 
 @experiment
@@ -120,18 +135,17 @@ def false_alarms_of_plants_rarer(
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
     played = [trials.watched(each, seed) for each in drawn]
     if nothing := next((each.exposure.lack_of_evidence for each in played if each.exposure.lack_of_evidence), ""):
-        return Finding(holds=False, why=f"INCONCLUSIVE: {nothing}")
+        raise Inconclusive(nothing)
     alarms = [each.alarms for each in played]
     count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
     low = lower_rate(count, samples, confidence)
     why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
     if _MOST_UNARMED * samples < plants * samples_each:
-        why = f"the trigger was armed in {samples} of {plants * samples_each} samples"
-        return Finding(holds=False, why=f"INCONCLUSIVE: {why}")
+        raise Inconclusive(f"the trigger was armed in {samples} of {plants * samples_each} samples")
     if low <= rate:
         return Finding(holds=True, why=why)
     most = _with_most(alarms)
-    return _witnessed(play, drawn[most], seed, alarms[most], why)
+    return _witness(play, drawn[most], seed, alarms[most], why)
 
 
 @experiment
@@ -139,8 +153,6 @@ def rare_false_alarms_rarer(
     play: Play, scenario: Scenario, seed: int, rate: float, confidence: float, estimates: int, branches: int
 ) -> Finding:
     """Finding: the lower confidence limit of a false-alarm rate too low to count is at most ``rate``.
-
-    ``analogrig.campaigns.rare`` estimates the rate.
 
     ``analogrig.campaigns.rare`` estimates the rate.
     """
@@ -152,7 +164,7 @@ def rare_false_alarms_rarer(
     why = f"{np.mean(rates):.2g} false alarms a sample, {low:.2g} to {high:.2g}, allowed {rate:g}"
     if low <= rate:
         return Finding(holds=True, why=why)
-    return _witnessed(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
+    return _witness(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
 
 
 def _trials(play: Play, otherwise: str) -> Trials:
@@ -161,7 +173,7 @@ def _trials(play: Play, otherwise: str) -> Trials:
 
 def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
     """Rig and device, if trials without a line equal those on the bench; else the test is skipped."""
-    rig, device = play.bench.rig, described(play.bench.dut)
+    rig, device = play.bench.rig, device_description(play.bench.dut)
     if not is_emulated(rig) or not are_possible(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
     return rig, device
@@ -171,7 +183,7 @@ def _with_most(alarms: list[NDArray[np.int64]]) -> int:
     return int(np.argmax([len(each) for each in alarms]))
 
 
-def _witnessed(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
+def _witness(play: Play, scenario: Scenario, seed: int, alarms: NDArray[np.int64], why: str) -> Finding:
     """Failed finding with a play that leaves a recording."""
     samples = max(_WITNESS_N, int(alarms[0]) + _AFTER_N if len(alarms) else 0)
     witness = dataclasses.replace(scenario, samples=min(samples, scenario.samples))
@@ -199,14 +211,14 @@ def changes_are_noticed_soon_and_rightly_named(
 
     A ratio up to ``doubtful_latency`` after ``plays`` plays is decided by ``most_plays`` plays.
     """
-    every = _played(play, scenario, seed, plays)
+    every = _play_all(play, scenario, seed, plays)
     if latency < _latency_over_bound(every) <= doubtful_latency:
-        every += _played(play, scenario, seed + plays, most_plays - plays)
+        every += _play_all(play, scenario, seed + plays, most_plays - plays)
+    _check_valid(*every)
     for failed in (
-        _invalid(*every),
-        _missed(every),
-        _late(every, latency),
-        _too_often_misnamed(every, right, confidence),
+        _check_detection(every),
+        _check_latency(every, latency),
+        _check_diagnoses(every, right, confidence),
     ):
         if failed is not None:
             return failed
@@ -219,7 +231,7 @@ def _latency_over_bound(plays: Sequence[Played]) -> float:
     return sum(tweak.latency_n or 0 for tweak in tweaks) / bounds_n if bounds_n else math.inf
 
 
-def _missed(plays: Sequence[Played]) -> Finding | None:
+def _check_detection(plays: Sequence[Played]) -> Finding | None:
     missed = [finding for played in plays if not (finding := played.detects(_EVER))]
     if not missed:
         return None
@@ -227,7 +239,7 @@ def _missed(plays: Sequence[Played]) -> Finding | None:
     return Finding(holds=False, why=why, run=missed[0].run)
 
 
-def _late(plays: Sequence[Played], latency: float) -> Finding | None:
+def _check_latency(plays: Sequence[Played], latency: float) -> Finding | None:
     ratio = _latency_over_bound(plays)
     if ratio <= latency:
         return None
@@ -236,17 +248,17 @@ def _late(plays: Sequence[Played], latency: float) -> Finding | None:
     return Finding(holds=False, why=why, run=slowest.run)
 
 
-def _too_often_misnamed(plays: Sequence[Played], right: float, confidence: float) -> Finding | None:
-    said = [tweak.diagnosis.right for each in plays for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
-    wrong_n = said.count(False)
-    if not said or lower_rate(wrong_n, len(said), confidence) <= 1.0 - right:
+def _check_diagnoses(plays: Sequence[Played], right: float, confidence: float) -> Finding | None:
+    diagnoses = [tweak.diagnosis for each in plays for tweak in each.verdict.tweaks if tweak.diagnosis is not None]
+    wrong_n = sum(not diagnosis.right for diagnosis in diagnoses)
+    if not diagnoses or lower_rate(wrong_n, len(diagnoses), confidence) <= 1.0 - right:
         return None
-    first = _wrongly_named(plays)
-    why = f"{wrong_n} of {len(said)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
+    first = _first_wrong_diagnosis(plays)
+    why = f"{wrong_n} of {len(diagnoses)} changes were called wrongly, allowed {1.0 - right:.0%}: {first.why}"
     return Finding(holds=False, why=why, run=first.run)
 
 
-def _wrongly_named(plays: Sequence[Played]) -> Finding:
+def _first_wrong_diagnosis(plays: Sequence[Played]) -> Finding:
     """Finding of the first play with a wrong diagnosis; the caller knows that there is one."""
     return next(finding for played in plays if not (finding := played.isolates()))
 
@@ -270,9 +282,7 @@ def single_changes_are_rightly_named(
     test = SequentialTest(expected, refuted, miss=miss, false_alarm=false_failure)
     every: list[Played] = []
     for number in range(most_plays):
-        played = play(scenario, seed + number, allow_inconclusive=True)
-        if (invalid := _invalid(played)) is not None:
-            return invalid
+        played = _play_valid(play, scenario, seed + number)
         right = [tweak.diagnosis.right for tweak in played.verdict.tweaks if tweak.diagnosis is not None]
         every.append(played)
         test.add(len(right), right.count(False))
@@ -281,7 +291,7 @@ def single_changes_are_rightly_named(
     why = f"{test.events} of {test.trials} single changes were called wrongly"
     if test.decision is Decision.BELOW or not test.trials:
         return Finding(holds=True, why=why)
-    first = _wrongly_named(every)
+    first = _first_wrong_diagnosis(every)
     why = f"{why}, where {expected:.0%} are expected and {refuted:.0%} too many: {first.why}"
     return Finding(holds=False, why=why, run=first.run)
 
@@ -312,9 +322,7 @@ def pause_does_no_harm(play: Play, scenario: Scenario, seed: int, until: int) ->
     """Finding: while the force has no edge, up to sample ``until``, the device raises no alarm and its estimate stays
     finite."""
     _configure(play, stuck_n=0)  # a displacement that does not move is a measurement then
-    played = play(scenario, seed, allow_inconclusive=True)
-    if (invalid := _invalid(played)) is not None:
-        return invalid
+    played = _play_valid(play, scenario, seed)
     run, wrong = played.run, []
     early = run.alarm_index[run.alarm_index < until].tolist()
     wrong += [f"alarms in the pause, at {', '.join(map(str, early[:5]))}"] if early else []
@@ -329,9 +337,7 @@ def alarms_keep_hold_off_and_warm_up(
     """Finding: a device set to raise alarms as often as possible keeps the hold-off and the warm-up."""
     restless = {"trigger": "prediction-error", "ceiling": 0.5, "arl0": None, "isolation": False}
     _configure(play, hold_off_n=hold_off_n, warm_up_n=warm_up_n, **restless)
-    played = play(scenario, seed, allow_inconclusive=True)
-    if (invalid := _invalid(played)) is not None:
-        return invalid
+    played = _play_valid(play, scenario, seed)
     run, index = played.run, played.run.alarm_index
     if len(index) < at_least:
         return Finding(holds=False, why=f"{len(index)} alarms, where at least {at_least} were due", run=run)
@@ -349,19 +355,22 @@ def _configure(play: Play, **settings: Any) -> None:
     dut.configure(dataclasses.replace(dut.estimator, **settings))
 
 
+def _fast_device(play: Play) -> DeviceDescription:
+    """Description of the device, if faults on its line cost little time; else the test is skipped."""
+    device = device_description(play.bench.dut)
+    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
+        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
+    return device
+
+
 @experiment
 def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
     """Finding: line faults leave the estimate unchanged, or the run is INCONCLUSIVE, or refused with the cause."""
-    bench, device = play.bench, described(play.bench.dut)
-    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
-        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
+    bench, device = play.bench, _fast_device(play)
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
             play = play.on(bench.rig, stack.enter_context(connect(dataclasses.replace(device, wire_faults=""))))
-        without = play(scenario, seed, allow_inconclusive=True)
-        if (invalid := _invalid(without)) is not None:
-            return invalid
-        clean = without.run
+        clean = _play_valid(play, scenario, seed).run
         again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
         try:
             spoiled = stack.enter_context(connect(dataclasses.replace(device, wire_faults=faults)))
@@ -382,33 +391,29 @@ def faults_among_the_samples_cost_no_more_than_samples(
 
     The result equals, to the bit, a run in which the lost samples were declared missing. ``each`` faults of each
     passing kind are tried. ``least_valid`` of the kinds must leave a valid run.
-
-    The result equals, to the bit, a run in which the lost samples were declared missing. ``each`` faults of each
-    passing kind are tried. At least so many of the kinds must have left a valid run.
     """
-    device = dataclasses.replace(described(play.bench.dut), wire_faults="")
-    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
-        pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
+    device = dataclasses.replace(_fast_device(play), wire_faults="")
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()
     with connect(device) as alone:
-        play = play.on(play.bench.rig, alone)
-        without = play(scenario, seed, allow_inconclusive=True)
-        if (invalid := _invalid(without)) is not None:
-            return invalid
-        for kind, faults in _cases(kinds, alone, without.run, each):
-            run = _spoiled(without.run, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples))
+        without = _play_valid(play.on(play.bench.rig, alone), scenario, seed).run
+        for kind, faults in _cases(kinds, alone, without, each):
+            run = _play_with_faults(
+                without, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples)
+            )
             if not judge(run).valid or not _took_effect(run):
                 continue
             valid.add(kind)
-            if harm := _harm(run, Bench(_missing(without.run, run.lost), alone).play(_replayed(without.run), seed)):
+            if harm := _harm(
+                run, Bench(_rig_with_gaps(without, run.lost), alone).play(_replay_scenario(without), seed)
+            ):
                 return Finding(holds=False, why=f"with {faults} on the line {harm}", run=run)
     if "repeat" in kinds and _START not in valid:
         return Finding(holds=False, why=f"{_START} is never passed over: no run with one is valid", run=run)
     valid.discard(_START)
     why = f"{len(valid)} of {len(kinds)} kinds of faults left a valid run and took effect ({', '.join(sorted(valid))})"
     if len(valid) < min(least_valid, len(kinds)):
-        return Finding(holds=False, why=f"INCONCLUSIVE: {why}, at least {least_valid} are needed")
+        raise Inconclusive(f"{why}, at least {least_valid} are needed")
     return Finding(holds=True, why=why)
 
 
@@ -435,17 +440,19 @@ def _cases(kinds: Sequence[str], dut: Dut, run: Run, each: int) -> Iterator[tupl
         yield from ((_START, f"repeat@to:{first - 1},seed={seed}") for seed in range(_LATE_STARTS))
 
 
-def _replayed(run: Run) -> Scenario:
+def _replay_scenario(run: Run) -> Scenario:
     return RecordingRig.of(run, Path("without")).scenario()
 
 
-def _spoiled(without: Run, device: DeviceDescription) -> Run:
+def _play_with_faults(without: Run, device: DeviceDescription) -> Run:
     """Play the same samples, which a real rig would not take twice, over a line with faults."""
     with connect(device) as dut:
-        return Bench(RecordingRig.of(without, Path("without")), dut).play(_replayed(without), without.conditions.seed)
+        return Bench(RecordingRig.of(without, Path("without")), dut).play(
+            _replay_scenario(without), without.conditions.seed
+        )
 
 
-def _missing(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
+def _rig_with_gaps(run: Run, lost: NDArray[np.bool_]) -> RecordingRig:
     """Rig that replays the samples of a run, some of them declared missing."""
     return RecordingRig.of(dataclasses.replace(run, clipped=run.clipped | lost[:, np.newaxis]), Path("missing"))
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from analogrig.judging.statistics import Design
 from analogrig.scenario import PlantChoice, Scenario
 from analogrig.testing.played import Played
-from analogrig.testing.properties import Play, with_some_seed
 from analogrig.testing.properties.experiments import (
-    described,
+    device_description,
     false_alarms_at_most,
     false_alarms_of_plants_rarer,
     faults_among_the_samples_cost_no_more_than_samples,
@@ -21,6 +20,7 @@ from analogrig.testing.properties.experiments import (
     rare_false_alarms_rarer,
 )
 from analogrig.testing.properties.test_detection import SURELY
+from analogrig.testing.statement import Play, with_some_seed
 from analogrig.testing.strategies import link_faults, profile, seeds
 from analogrig_emulator import Excitation
 
@@ -42,16 +42,14 @@ that is not taken from this plant, of a damping ratio of 0.4, leaves them colour
 def test_edges_that_drift_past_the_samples_are_no_change(hil_play: Play, drift_ppm: float, seed: int) -> None:
     phase = 2e-4 if drift_ppm < 0.0 else 1.0 - 2e-4  # they come to a sample's instant after a thousand samples
     excitation = Excitation(low_v=0.1, high_v=9.9, phase=phase, clock="free", drift_ppm=drift_ppm)
-    found = with_some_seed(hil_play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
-    assert found
+    assert with_some_seed(hil_play, Scenario(2000, excitation, name="drifting"), seed, Played.stays_quiet)
 
 
 @pytest.mark.parametrize("hil_rig", ["emulator-0-10v"], indirect=True)
 @profile()
 @given(seed=seeds())
 def test_samples_that_are_missing_are_no_change(hil_play: Play, seed: int) -> None:
-    found = with_some_seed(hil_play, "thesis", seed, Played.passes)
-    assert found
+    assert with_some_seed(hil_play, "thesis", seed, Played.passes)
 
 
 @profile()
@@ -59,21 +57,19 @@ def test_samples_that_are_missing_are_no_change(hil_play: Play, seed: int) -> No
 def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
     hil_play: Play, drawn: st.DataObject, seed: int
 ) -> None:
-    faults = drawn.draw(link_faults(sorted(described(hil_play.bench.dut).fault_kinds())), "faults of the line")
-    found = faults_of_the_line_do_no_harm(hil_play, SHORT, seed, faults)
-    assert found
+    faults = drawn.draw(link_faults(sorted(device_description(hil_play.bench.dut).fault_kinds())), "faults of the line")
+    assert faults_of_the_line_do_no_harm(hil_play, SHORT, seed, faults)
 
 
 def test_faults_of_the_line_among_the_samples_cost_no_more_than_those_samples(hil_play: Play) -> None:
-    found = faults_among_the_samples_cost_no_more_than_samples(
+    assert faults_among_the_samples_cost_no_more_than_samples(
         hil_play, SHORT, 1, each=FAULTS_EACH, least_valid=LEAST_VALID_KINDS
     )
-    assert found
 
 
 @pytest.mark.hil_needs("excite")
 def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(hil_play: Play) -> None:
-    found = false_alarms_at_most(
+    assert false_alarms_at_most(
         hil_play,
         Scenario.load("healthy"),
         0,
@@ -81,12 +77,11 @@ def test_false_alarms_are_rarer_than_one_in_a_hundred_thousand_samples(hil_play:
         samples=CERTIFIED.trials,
         samples_each=CERTIFIED_RUN_N,
     )
-    assert found
 
 
 @pytest.mark.hil_needs("excite")
 def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(hil_play: Play) -> None:
-    found = false_alarms_of_plants_rarer(
+    assert false_alarms_of_plants_rarer(
         hil_play,
         Scenario.load("healthy"),
         1,
@@ -95,14 +90,13 @@ def test_plants_of_all_kinds_raise_no_more_false_alarms_than_promised(hil_play: 
         plants=PLANTS_N,
         samples_each=CERTIFIED_RUN_N,
     )
-    assert found
 
 
 @pytest.mark.hil_needs("excite")
 def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(hil_play: Play) -> None:
     healthy = Scenario.load("healthy")
     excitation = dataclasses.replace(healthy.excitation, high_v=8.0)
-    found = rare_false_alarms_rarer(
+    assert rare_false_alarms_rarer(
         hil_play,
         dataclasses.replace(healthy, plant=HEAVY, excitation=excitation),
         0,
@@ -111,4 +105,3 @@ def test_false_alarms_stay_rare_on_a_plant_that_the_prefilter_has_to_follow(hil_
         estimates=HEAVY_ESTIMATES_N,
         branches=HEAVY_BRANCHES_N,
     )
-    assert found

@@ -15,11 +15,12 @@ from analogrig.judging.information import detectable
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Expectations, PotChange, Scenario
 from analogrig.testing.played import Played
-from analogrig.testing.properties import Play, is_playable, with_some_seed
 from analogrig.testing.properties.experiments import (
     changes_are_noticed_soon_and_rightly_named,
+    is_playable,
     single_changes_are_rightly_named,
 )
+from analogrig.testing.statement import Play, with_some_seed
 from analogrig.testing.strategies import WARM_UP_N, profile, scenarios, seeds
 from analogrig_emulator import Excitation
 
@@ -69,8 +70,7 @@ def test_every_change_that_can_be_seen_is_found_once(
 ) -> None:
     assume(is_playable(hil_rig, scenario))
     assume(detectable(scenario, ARL0**MOST_INFORMATION))
-    found = with_some_seed(hil_play, scenario, seed, Played.passes)
-    assert found
+    assert with_some_seed(hil_play, scenario, seed, Played.passes)
 
 
 @pytest.mark.hil_needs("excite")
@@ -80,13 +80,12 @@ def test_a_plant_that_does_not_change_raises_no_alarm(
     hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int
 ) -> None:
     assume(is_playable(hil_rig, scenario))
-    found = with_some_seed(hil_play, scenario, seed, Played.stays_quiet)
-    assert found
+    assert with_some_seed(hil_play, scenario, seed, Played.stays_quiet)
 
 
 @pytest.mark.hil_needs("tweak", "excite")
 def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
-    found = changes_are_noticed_soon_and_rightly_named(
+    assert changes_are_noticed_soon_and_rightly_named(
         hil_play,
         Scenario.load("thesis"),
         0,
@@ -97,12 +96,11 @@ def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
         right=LEAST_RIGHT,
         confidence=SURELY,
     )
-    assert found
 
 
 @pytest.mark.hil_needs("tweak", "excite")
 def test_a_single_change_is_rightly_named(hil_play: Play) -> None:
-    found = single_changes_are_rightly_named(
+    assert single_changes_are_rightly_named(
         hil_play,
         SINGLY,
         0,
@@ -113,4 +111,3 @@ def test_a_single_change_is_rightly_named(hil_play: Play) -> None:
         most_plays=MOST_SINGLE_PLAYS_N,
         silent=SILENT_N,
     )
-    assert found

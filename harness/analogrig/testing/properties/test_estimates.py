@@ -9,13 +9,13 @@ from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
 from analogrig.testing.played import Played
-from analogrig.testing.properties import Play, is_playable, with_some_seed
 from analogrig.testing.properties.experiments import (
     alarms_keep_hold_off_and_warm_up,
     answers_with_numbers,
+    is_playable,
     pause_does_no_harm,
 )
-from analogrig.testing.statement import Finding
+from analogrig.testing.statement import Finding, Play, with_some_seed
 from analogrig.testing.strategies import profile, rigs, scenarios, seeds
 from analogrig_emulator import Excitation
 
@@ -43,8 +43,7 @@ def estimates(played: Played) -> Finding:
 @given(scenario=scenarios(most_changes=0), seed=seeds())
 def test_estimates_come_to_the_truth(hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int) -> None:
     assume(is_playable(hil_rig, scenario))
-    found = with_some_seed(hil_play, scenario, seed, estimates)
-    assert found
+    assert with_some_seed(hil_play, scenario, seed, estimates)
 
 
 @profile()
@@ -52,19 +51,16 @@ def test_estimates_come_to_the_truth(hil_rig: Rig, hil_play: Play, scenario: Sce
 def test_whatever_comes_the_device_answers_with_numbers(
     hil_play: Play, drawn: EmulatorDescription, scenario: Scenario, seed: int
 ) -> None:
-    found = answers_with_numbers(hil_play.on(EmulatorRig(drawn), hil_play.bench.dut), scenario, seed)
-    assert found
+    assert answers_with_numbers(hil_play.on(EmulatorRig(drawn), hil_play.bench.dut), scenario, seed)
 
 
 @pytest.mark.parametrize("hil_rig", ["emulator-ideal"], indirect=True)
 def test_a_pause_of_the_excitation_does_no_harm(hil_play: Play) -> None:
-    found = pause_does_no_harm(hil_play, PAUSED, 1, until=PAUSE_END_N)
-    assert found
+    assert pause_does_no_harm(hil_play, PAUSED, 1, until=PAUSE_END_N)
 
 
 @pytest.mark.hil_needs("excite")
 def test_alarms_keep_the_hold_off_and_the_warm_up(hil_play: Play) -> None:
-    found = alarms_keep_hold_off_and_warm_up(
+    assert alarms_keep_hold_off_and_warm_up(
         hil_play, STEADY, 1, hold_off_n=HOLD_OFF_N, warm_up_n=WARM_UP_N, at_least=AT_LEAST
     )
-    assert found
