@@ -738,7 +738,7 @@ def test_every_kind_of_device_and_pots_states_its_things() -> None:
     assert {kind for kind, cls in KINDS.items() if "things" not in vars_of(cls)} == harmless
     pots = {cls.__name__ for cls in get_args(PotsDescription) if not isinstance(cls.__dict__.get("things"), property)}
     assert pots == {"OperatorPots", "NoPots", "InstrumentPots"}
-    inputs = {"force": Input(1, "HV"), "displacement": Input(2, "HV")}
+    inputs = {"force": Input(input=1, range="HV"), "displacement": Input(input=2, range="HV")}
     things = {"redpitaya://bench": "bench:5000", "nidaqmx://Dev1": "nidaqmx://Dev1"}
     assert {url.partition(":")[0] for url in things} == set(DRIVERS)
     for url, name in things.items():
@@ -748,17 +748,3 @@ def test_every_kind_of_device_and_pots_states_its_things() -> None:
 def vars_of(cls: type) -> set[str]:
     """Names that the class or one between it and DeviceDescription defines."""
     return {name for each in cls.__mro__ if each.__name__ != "DeviceDescription" for name in vars(each)}
-
-
-def pots_classes() -> list[type]:
-    from typing import get_args
-
-    return list(get_args(PotsDescription))
-
-
-def thing_of(url: str) -> str:
-    from analogrig.hardware.wiring import Input
-
-    inputs = {"force": Input(input=1, range="HV"), "displacement": Input(input=2, range="HV")}
-    description = RealDescription("real", url, inputs, InstrumentPots("instrument"))
-    return description.things[0].name

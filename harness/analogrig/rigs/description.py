@@ -61,7 +61,7 @@ def from_table(table: Mapping[str, Any], where: str) -> RigDescription:
 
     :raises ConfigurationError: they describe no rig.
     """
-    kind = config.converted(Literal[tuple(KINDS)], table.get("kind", "emulator"), f"{where}: kind")
+    kind = config.convert(Literal[tuple(KINDS)], table.get("kind", "emulator"), f"{where}: kind")
     described: type[RigDescription] = pkgutil.resolve_name(KINDS[kind])
     return config.build(described, table, where)
 
