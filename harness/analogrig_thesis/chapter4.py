@@ -379,7 +379,7 @@ def _second_alarms(rate: int, ceiling: float) -> dict[str, int | None]:
 
     M falls to 30 kg at sample 200 and is back after so many samples; ``rate`` is the sample rate over 100 Hz.
     """
-    n, at, light, period_n = 300 * rate, 200 * rate, PROFILE[-1].plant, 100 * rate
+    n, at, light, period_n = 250 * rate, 200 * rate, PROFILE[-1].plant, 100 * rate
     u = square(n, FRONT_FORCE_N, period_n)
     config = _scheme(MEAN, ceiling, warm_up_n=WARM_UP_N * rate)
     out: dict[str, int | None] = {}

@@ -110,12 +110,8 @@ EARLY = 0.2
 
 CEILINGS_LSB = np.geomspace(0.1, 100.0, 61)
 
-TRIGGERS = {
-    "prediction error": (ERROR, False),
-    "signed mean": (MEAN, False),
-    "mean of magnitudes": (MEAN, True),
-}
-"""Key of the scheme, and True for magnitudes, by name of the trigger."""
+TRIGGERS = {f"{ERROR} e": (ERROR, False), f"{MEAN} e": (MEAN, False), f"{MEAN} |e|": (MEAN, True)}
+"""Key of the scheme, and True for the mean of magnitudes, by name of the trigger."""
 
 Sweep = list[tuple[int, int]]
 """Missed changes and extra alarms at each of CEILINGS_LSB."""
@@ -270,10 +266,10 @@ def reproduce_chapter(circuit: CircuitRuns) -> Chapter:
         "conditioned": _sweep(filter_off_line(noisy.run), noisy.segments, PLAIN, noisy.codes.m_per_unit * UNITS_PER_M),
     }
     measured = {**_measure_identification(circuit), **_measure_tracking(circuit, sweeps)}
-    return load_chapter(5, _facts(circuit, sweeps, measured), _drawings(circuit, sweeps), measured)
+    return load_chapter(5, _facts(circuit, measured), _drawings(circuit, sweeps), measured)
 
 
-def _facts(circuit: CircuitRuns, sweeps: Sweeps, measured: Mapping[str, Facts]) -> dict[str, Any]:
+def _facts(circuit: CircuitRuns, measured: Mapping[str, Facts]) -> dict[str, Any]:
     """Values for the texts beside those behind the claims."""
     conditions, estimate = circuit.identification.conditions, _identify(circuit.identification)
     unskewed, variances = Arx.of(INFERRED), measured["5.4-variance"]["variances"]
@@ -293,7 +289,6 @@ def _facts(circuit: CircuitRuns, sweeps: Sweeps, measured: Mapping[str, Facts]) 
         "moved_by_deviations": abs(estimate.b0 - unskewed.b0) * 1e5 / np.sqrt(variances[2]),
         "ceiling_lsb": MEAN_CEILING / UNITS_PER_M / circuit.noisy.codes.m_per_unit,
         "mean_alarms": len(circuit.noisy.tracks[MEAN].alarms),
-        "best": {data: {name: _best(each) for name, each in by_name.items()} for data, by_name in sweeps.items()},
         "walk_over_forgetting": spread["random-walk"] / spread["forgetting"],
     }
 
@@ -525,9 +520,7 @@ def _alarms_and_convergence(circuit: CircuitRuns, sweeps: Sweeps) -> Facts:
         "filtered_and_detrended_off_line": off_line,
         "theta_reconverged_n": {key: _theta_reconverged(noisy, key) for key in ("forgetting", MEAN)},
         "best_ceilings": {
-            f"{data} {key} {'|e|' if absolute else 'e'}": _best(by_trigger[name])
-            for data, by_trigger in sweeps.items()
-            for name, (key, absolute) in TRIGGERS.items()
+            f"{data} {name}": _best(sweep) for data, by_name in sweeps.items() for name, sweep in by_name.items()
         },
     }
 

@@ -355,7 +355,7 @@ def _noise_alarms(m: Claims, o: Oracle, kind: str) -> bool:
 
 def _second_alarms(rate: int, ceiling: float) -> list[int | None]:
     """Samples from the first alarm to the second, if the mass is lower for 1 to 12 samples."""
-    n, at = 300 * rate, 200 * rate
+    n, at = 250 * rate, 200 * rate
     u = np.where(np.arange(n) % (100 * rate) < 50 * rate, 2940.0, -2940.0)
     out: list[int | None] = []
     for apart in range(1, 13):

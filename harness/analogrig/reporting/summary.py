@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from analogrig.judging.advice import advice
 from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
@@ -32,19 +32,17 @@ def summary(run: Run, verdict: Verdict) -> str:
             "  sample  named    right  extent   error       delay  bound   onset error  (samples)",
             *diagnoses,
         ]
-    lines += ["", f"  false alarms: {_false_alarms(verdict)} in {number_of(run.samples, 'sample')}"]
-    if verdict.doubtful_alarms:
-        at = ", ".join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))
-        lines += [f"  false or not, depending on the instants of the changes: alarms at {at}"]
-    if verdict.missing_n:
-        lines += [f"  {missing_text(run)}: {number_of(verdict.missing_n, 'sample')}"]
-    if verdict.overloads:
-        lines += [f"  overload lamps: {lamps_text(verdict.overloads)}"]
-    if seen := traffic_text(conditions.link_counters):
-        lines += [f"  on the line: {seen}"]
     load = load_of(run)
-    if load is not None:
-        lines += [f"  bus: {load_text(load)}"]
+    facts = {
+        "false alarms": f"{_alarms(verdict.false_alarms)} in {number_of(run.samples, 'sample')}",
+        "false or not, depending on the instants of the changes": verdict.doubtful_alarms
+        and f"alarms at {', '.join(map(str, verdict.doubtful_alarms[:SHOWN_ALARMS]))}",
+        missing_text(run): verdict.missing_n and number_of(verdict.missing_n, "sample"),
+        "overload lamps": verdict.overloads and lamps_text(verdict.overloads),
+        "on the line": traffic_text(conditions.link_counters),
+        "bus": load and load_text(load),
+    }
+    lines += ["", *(f"  {name}: {text}" for name, text in facts.items() if text)]
     lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
     lines += [_segment_line(segment) for segment in verdict.estimates]
     lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
@@ -71,22 +69,25 @@ def load_text(load: BusLoad) -> str:
     return f"{load.bitrate} bit/s{faster}: {used} in real time{late}; at most {load.most_samples_per_s:.5g} samples/s"
 
 
-def _false_alarms(verdict: Verdict) -> str:
-    alarms = verdict.false_alarms
-    if not alarms:
+def _alarms(samples: Sequence[int]) -> str:
+    if not samples:
         return "none"
-    first = ", ".join(map(str, alarms[:SHOWN_ALARMS]))
-    return f"{len(alarms)} (at {first}{', ...' if len(alarms) > SHOWN_ALARMS else ''})"
+    more = ", ..." if len(samples) > SHOWN_ALARMS else ""
+    return f"{len(samples)} (at {', '.join(map(str, samples[:SHOWN_ALARMS]))}{more})"
 
 
 def _change_lines(tweak: ChangeVerdict) -> list[str]:
     bound = "none" if tweak.bound_n is None else str(tweak.bound_n)
-    change = _change(tweak.before, tweak.after)
-    out = [f"  {tweak.sample:6}  {change:43}  {tweak.latency_text:>7}  {bound:>5}"]
+    out = [f"  {tweak.sample:6}  {change_text(tweak):43}  {tweak.latency_text:>7}  {bound:>5}"]
     low, high = tweak.between
     if low < high:
         out += [f"          between {low} and {high} (the likeliest instant is shown): {tweak.result}"]
     return out
+
+
+def change_text(tweak: ChangeVerdict) -> str:
+    """Parameters before and after a change: ``K 24500 -> 18000 N/m``."""
+    return ", ".join(f"{name} {old:g} -> {tweak.after[name]:g} {UNITS[name]}" for name, old in tweak.before.items())
 
 
 def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
@@ -98,10 +99,6 @@ def _diagnosis_line(sample: int, diagnosis: DiagnosisVerdict) -> str:
         f"  {sample:6}  {diagnosis.named:7}  {right:>5}  {extent:>6}  {error:>6}"
         f"  {diagnosis.delay_n:10}  {bound:>5}  {diagnosis.onset_error_n:+12}"
     )
-
-
-def _change(before: Mapping[str, float], after: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {before[name]:g} -> {after[name]:g} {UNITS[name]}" for name in before)
 
 
 def _segment_line(segment: SegmentEstimate) -> str:

@@ -12,7 +12,7 @@ from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
 from analogrig.reporting.payload import is_thinned, marked_alarms
-from analogrig.reporting.summary import lamps_text, load_text
+from analogrig.reporting.summary import change_text, lamps_text, load_text
 from analogrig.run import Run
 from analogrig.wording import number_of
 
@@ -194,16 +194,13 @@ def _samples(run: Run, verdict: Verdict) -> str:
 
 
 def _change_row(tweak: ChangeVerdict) -> str:
-    change = ", ".join(
-        f"{name} {before:.6g} → {tweak.after[name]:.6g} {UNITS[name]}" for name, before in tweak.before.items()
-    )
     exact = not tweak.alternatives and tweak.latency_n is not None and tweak.bound_n
     ratio = (tweak.latency_n or 0) / (tweak.bound_n or 1) if exact else None
     word, kind = _result(tweak)
     low, high = tweak.between
     instant = _zoom(tweak.sample) if low == high else _zoom(low, high)
     latency = "–" if tweak.latencies_n is None else tweak.latency_text.replace("-", "–")
-    cells = [instant, cell(change), cell(latency, "number"), number(tweak.bound_n)]
+    cells = [instant, cell(change_text(tweak).replace("->", "→")), cell(latency, "number"), number(tweak.bound_n)]
     return row([*cells, number(ratio, ".2f"), cell(word, f"text {kind}")])
 
 
