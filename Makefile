@@ -134,16 +134,16 @@ faults: $(PRODUCTS) ## every fault of the line at every step, and FAULTS_N runs 
 hostile: $(PRODUCTS) ## 5,000 mutated recordings, 2,000 descriptions, 500 logs and every key at absurd values; ARGS="--seed 7" goes to tests.mutated
 	@$(BIN)/python -m tests.mutated $(ARGS)
 
-defects: $(PRODUCTS) ## whether the shipped properties find each defect that is planted in the device; the table of tests/properties/README.md
+defects: $(PRODUCTS) ## plant defects in the device, each of which a shipped property must find; the table of tests/properties/README.md
 	@$(BIN)/python -m tests.properties.planted
 
-coverage: $(PRODUCTS) ## which lines and branches of core and isolation their tests go through
+coverage: $(PRODUCTS) ## lines and branches of core and isolation that their tests reach
 	@$(BIN)/python -m estimator_c.evidence.coverage
 
-cost: $(PRODUCTS) ## what the estimator costs on a Cortex-M: one table, and build/cost.json
+cost: $(PRODUCTS) ## cost of the estimator on a Cortex-M: one table, and build/cost.json
 	@$(BIN)/python -m estimator_c.evidence.cost
 
-bit-exact: $(PRODUCTS) ## whether the estimates are the same bits with every compiler and on every target
+bit-exact: $(PRODUCTS) ## compare the bits of the estimates of every compiler and every target
 	@$(BIN)/python -m estimator_c.evidence.bit_exact
 
 analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer, cppcheck with MISRA, clang-tidy
@@ -152,7 +152,7 @@ analyze: $(PRODUCTS) ## static checkers over the C of the device: gcc -fanalyzer
 eva: $(PRODUCTS) ## Frama-C over the core, all orders of the model: nothing undefined can happen; 4 minutes; ARGS="--jobs 1" takes one processor
 	@$(BIN)/python -m estimator_c.evidence.eva $(ARGS)
 
-mutate: $(PRODUCTS) ## whether the tests notice a core that is wrong; ARGS="--sample 60" takes so many mutants; build/mutation.json
+mutate: $(PRODUCTS) ## alter the core, which the tests must notice; ARGS="--sample 60" takes so many mutants; build/mutation.json
 	@$(BIN)/python -m estimator_c.evidence.mutate $(ARGS)
 
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
