@@ -45,7 +45,7 @@ from analogrig_emulator.errors import (
 )
 from analogrig_emulator.machine.machine import LAMP_DELAY_S, REFERENCE_V, AnalogComputer, Mode
 from analogrig_emulator.machine.noise import CircuitNoise, NoisySuspension
-from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.machine.program import CHANNELS, SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 from analogrig_emulator.machine.quarter_car import BUMP_STOP, FRONT, SHOCK, BumpStop, SuspensionParts, SuspensionProgram
 from analogrig_emulator.machine.repeated import Repeat, RepeatedPlay, is_repeatable
 from analogrig_emulator.machine.suspension import PROGRAMS, SuspensionComputer, drawn_offsets_v
@@ -103,12 +103,12 @@ __all__ = [
     "PotModel",
     "PotTurn",
     "Program",
-    "Quantity",
     "Repeat",
     "RepeatedPlay",
     "Resistor",
     "Sampler",
     "SamplerError",
+    "Scale",
     "Scales",
     "SuspensionComputer",
     "SuspensionParts",

@@ -27,7 +27,7 @@ SOURCE = "F"
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Scale:
     """Row of the scaling table: node, sign there, and full scale (10 V) in N, m or m/s."""
 
     node: str
@@ -40,7 +40,7 @@ class Scales:
     """Scaling table by quantity. time: speed of the machine relative to the plant."""
 
     time: float
-    quantities: Mapping[str, Quantity]
+    quantities: Mapping[str, Scale]
 
     def full(self, quantity: str) -> float:
         """Full scale of a quantity: value of 10 V in N, m or m/s."""

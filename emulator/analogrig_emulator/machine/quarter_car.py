@@ -30,7 +30,7 @@ from analogrig_emulator.circuit.circuit import (
 )
 from analogrig_emulator.circuit.opamp import OpAmpModel
 from analogrig_emulator.errors import CircuitError
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -107,11 +107,11 @@ class SuspensionProgram(Program):
         return Scales(
             self.time,
             {
-                "force": Quantity("in", 1.0, self.force_n),
-                "displacement": Quantity("u5", 1.0, displacement_m),
-                "velocity": Quantity("u2", 1.0, self.velocity_m_per_s),
+                "force": Scale("in", 1.0, self.force_n),
+                "displacement": Scale("u5", 1.0, displacement_m),
+                "velocity": Scale("u2", 1.0, self.velocity_m_per_s),
                 # U1 puts out -e_N: the card's differential input for the net force is wired the other way round.
-                "net_force": Quantity("u1", -1.0, self.force_n),
+                "net_force": Scale("u1", -1.0, self.force_n),
             },
         )
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from analogrig_emulator.circuit.circuit import GROUND, Capacitor, Element, OpAmp, Pot, Resistor, VoltageSource
 from analogrig_emulator.circuit.opamp import OpAmpModel
-from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Quantity, Scales
+from analogrig_emulator.machine.program import SOURCE, ForceLaw, Mass, Parameter, Program, Scale, Scales
 
 
 @dataclass(frozen=True)
@@ -94,16 +94,16 @@ class TwoMassProgram(Program):
         return Scales(
             self.time,
             {
-                "force": Quantity("in", 1.0, force_n),
-                "displacement": Quantity("u11", -1.0, compression_m * parts.r_out_d_ohm / fb_ohm),
-                "velocity": Quantity("u2", 1.0, velocity_m_per_s),
-                "net_force": Quantity("u1", -1.0, force_n * parts.r_force_ohm / fb_ohm),
-                "suspension_force": Quantity("u6", -1.0, suspension_n),
-                "compression": Quantity("u5", 1.0, compression_m),
-                "compression_rate": Quantity("u3", -1.0, velocity_m_per_s * parts.r_w_v2_ohm / fb_ohm),
-                "tyre_net_force": Quantity("u7", 1.0, suspension_n * parts.r_wheel_ohm / fb_ohm),
-                "tyre_velocity": Quantity("u8", -1.0, wheel_m_per_s),
-                "tyre_displacement": Quantity("u9", 1.0, wheel_m),
+                "force": Scale("in", 1.0, force_n),
+                "displacement": Scale("u11", -1.0, compression_m * parts.r_out_d_ohm / fb_ohm),
+                "velocity": Scale("u2", 1.0, velocity_m_per_s),
+                "net_force": Scale("u1", -1.0, force_n * parts.r_force_ohm / fb_ohm),
+                "suspension_force": Scale("u6", -1.0, suspension_n),
+                "compression": Scale("u5", 1.0, compression_m),
+                "compression_rate": Scale("u3", -1.0, velocity_m_per_s * parts.r_w_v2_ohm / fb_ohm),
+                "tyre_net_force": Scale("u7", 1.0, suspension_n * parts.r_wheel_ohm / fb_ohm),
+                "tyre_velocity": Scale("u8", -1.0, wheel_m_per_s),
+                "tyre_displacement": Scale("u9", 1.0, wheel_m),
             },
         )
 
