@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from analogrig.errors import AnalogrigError, ConfigurationError, RecordingError
 from analogrig.identity import Identity
-from analogrig.signals import hold_signals
+from analogrig.signals import hold_signals, interruption
 
 VERDICT_FILE, RUN_FILE, REPORT_FILE, CAN_LOG = "verdict.json", "run.npz", "report.html", "can"
 
@@ -139,8 +139,8 @@ class OutputFolder:
 
         if error is None:
             return "the command ended without a result"
-        if isinstance(error, KeyboardInterrupt):
-            return f"interrupted by {str(error) or 'SIGINT'}"
+        if (signalled := interruption(error)) is not None:
+            return f"interrupted by {str(signalled) or 'SIGINT'}"
         if isinstance(error, OSError):
             return f"{self.path}: cannot be written: {error.strerror or error}"
         text = " ".join(str(error).split()).replace(str(self.parts), str(self.path))

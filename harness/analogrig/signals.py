@@ -90,6 +90,16 @@ def raise_signals() -> Iterator[None]:
         _handlers.remove(handler)
 
 
+def interruption(error: BaseException | None) -> KeyboardInterrupt | None:
+    """Interruption that is or caused ``error``; None if there is none.
+
+    A module in C that is interrupted while it is imported raises an ImportError, caused by the interruption.
+    """
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error
+
+
 @contextlib.contextmanager
 def hold_signals() -> Iterator[None]:
     """Delay a first signal until the block ends, so that a file being written is written in full."""

@@ -99,12 +99,20 @@ def test_wrong_option_leaves_no_older_verdict(out: Path, words: list[str], reaso
     check_inconclusive(out, reason)
 
 
+def interrupted_import() -> ImportError:
+    """The error of a module in C that was interrupted while it was imported, as pybind11 raises it."""
+    error = ImportError("initialization failed")
+    error.__cause__ = KeyboardInterrupt("SIGTERM")
+    return error
+
+
 @pytest.mark.parametrize(
     ("raised", "status", "reason"),
     [
         (RigClosed("the instrument is gone"), 2, "the instrument is gone"),
         (ZeroDivisionError("by zero"), 3, "a fault of analogrig itself: ZeroDivisionError: by zero"),
         (KeyboardInterrupt("SIGTERM"), 130, "interrupted by SIGTERM"),
+        (interrupted_import(), 130, "interrupted by SIGTERM"),
         (KeyboardInterrupt(), 130, "interrupted by SIGINT"),
     ],
 )

@@ -27,7 +27,7 @@ from analogrig.cli import (
     thesis,
 )
 from analogrig.cli.terminal import INCONCLUSIVE, INTERRUPTED, USAGE, complain, open_standard_streams, show
-from analogrig.signals import raise_signals
+from analogrig.signals import interruption, raise_signals
 
 _COMMANDS = (
     playing.add_run,
@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             return complain("interrupted", INTERRUPTED)
         except Exception as error:  # noqa: BLE001 - whatever it is, a user gets one line
-            return _explain(error)
+            return complain("interrupted", INTERRUPTED) if interruption(error) else _explain(error)
 
 
 def _explain(error: Exception) -> int:
