@@ -86,12 +86,12 @@ def rejection(signals: Signals, after: Plant | None, search: range) -> str:
 
 @pytest.mark.parametrize("clock", ["card", "free"])
 def test_interval_holds_the_instant_on_machines_of_real_components(clock: str) -> None:
-    """At a coverage of 95 %, more than 3 misses in 12 have a probability of 1 in 450."""
-    trials = [Trial.jump(seed, clock) for seed in range(12)]  # type: ignore[arg-type]
+    """At a coverage of 95 %, more than 4 misses in 20 have a probability of 1 in 400."""
+    trials = [Trial.jump(seed, clock) for seed in range(20)]  # type: ignore[arg-type]
     every = [trial.date_jump() for trial in trials]
     held = [isinstance(each, Instant) and each.low <= trial.sample <= each.high for trial, each in
             zip(trials, every, strict=True)]  # fmt: skip
-    assert held.count(False) <= 3
+    assert held.count(False) <= 4
     widths = [each.high - each.low + 1 for each in every if isinstance(each, Instant)]
     assert np.mean(widths) <= 2.25 * np.mean([trial.width_bound() for trial in trials])
 

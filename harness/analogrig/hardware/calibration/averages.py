@@ -31,25 +31,23 @@ FORCE, DISPLACEMENT = range(2)
 
 _COLUMNS = [CHANNELS.index(name) for name in MEASURED]
 
-_PLAYS: tuple[tuple[Mapping[Program, tuple[float, float, float]], tuple[float, float, int]], ...] = tuple(
-    ({"front": front, "shock": shock}, wave)
-    for front, shock, wave in (
-        ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.1, 9.9, 50)),
-        ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.6, 9.5, 10)),
-        ((115.0, 3021.0, 18000.0), (2.0, 900.0, 9000.0), (0.2, 8.0, 25)),
-        ((115.0, 2123.0, 20000.0), (2.0, 632.0, 10000.0), (1.0, 9.0, 20)),
-        ((60.0, 3021.0, 24500.0), (1.6, 900.0, 12250.0), (0.3, 9.7, 8)),
-        ((60.0, 4000.0, 28000.0), (1.6, 1200.0, 14000.0), (0.4, 9.2, 16)),
-        ((35.0, 2600.0, 19000.0), (2.6, 780.0, 9500.0), (0.7, 7.5, 20)),
-        ((230.0, 4200.0, 15000.0), (5.5, 1250.0, 7500.0), (0.5, 6.0, 32)),
-        ((160.0, 1600.0, 28000.0), (3.5, 600.0, 14000.0), (3.0, 9.0, 40)),
-        ((31.0, 2500.0, 26500.0), (1.55, 750.0, 13250.0), (0.8, 8.8, 5)),
-        ((80.0, 3600.0, 21500.0), (2.3, 1070.0, 10750.0), (0.1, 8.5, 10)),
-        ((45.0, 2800.0, 16500.0), (4.0, 835.0, 8250.0), (1.2, 6.9, 25)),
-        ((95.0, 2700.0, 22500.0), (1.8, 980.0, 11000.0), (2.0, 8.2, 64)),
-    )
+_Plant = tuple[float, float, float]
+_PLAYS: tuple[tuple[_Plant, _Plant, tuple[float, float, int]], ...] = (
+    ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.1, 9.9, 50)),
+    ((115.0, 3021.0, 24500.0), (2.0, 900.0, 12250.0), (0.6, 9.5, 10)),
+    ((115.0, 3021.0, 18000.0), (2.0, 900.0, 9000.0), (0.2, 8.0, 25)),
+    ((115.0, 2123.0, 20000.0), (2.0, 632.0, 10000.0), (1.0, 9.0, 20)),
+    ((60.0, 3021.0, 24500.0), (1.6, 900.0, 12250.0), (0.3, 9.7, 8)),
+    ((60.0, 4000.0, 28000.0), (1.6, 1200.0, 14000.0), (0.4, 9.2, 16)),
+    ((35.0, 2600.0, 19000.0), (2.6, 780.0, 9500.0), (0.7, 7.5, 20)),
+    ((230.0, 4200.0, 15000.0), (5.5, 1250.0, 7500.0), (0.5, 6.0, 32)),
+    ((160.0, 1600.0, 28000.0), (3.5, 600.0, 14000.0), (3.0, 9.0, 40)),
+    ((31.0, 2500.0, 26500.0), (1.55, 750.0, 13250.0), (0.8, 8.8, 5)),
+    ((80.0, 3600.0, 21500.0), (2.3, 1070.0, 10750.0), (0.1, 8.5, 10)),
+    ((45.0, 2800.0, 16500.0), (4.0, 835.0, 8250.0), (1.2, 6.9, 25)),
+    ((95.0, 2700.0, 22500.0), (1.8, 980.0, 11000.0), (2.0, 8.2, 64)),
 )
-"""M (kg), B (N s/m), K (N/m) of each program, which cover the ranges of the pots; low and high level (V), half period
+"""M (kg), B (N s/m), K (N/m) of front and shock, which cover the ranges of the pots; low, high level (V), half period
 (samples). No amplifier is overloaded, and the displacement stays within -1..9 V. The last play is the check."""
 
 
@@ -64,9 +62,10 @@ def check_scenario(program: Program) -> Scenario:
 
 
 def _scenario(program: Program, play: int, name: str) -> Scenario:
-    plants, (low_v, high_v, half_n) = _PLAYS[play]
+    front, shock, (low_v, high_v, half_n) = _PLAYS[play]
+    plant = PlantChoice(program, *(front if program == "front" else shock))
     excitation = Excitation(low_v=low_v, high_v=high_v, frequency_hz=RATE_HZ / (2 * half_n))
-    return Scenario(samples=SAMPLES, excitation=excitation, plant=PlantChoice(program, *plants[program]), name=name)
+    return Scenario(samples=SAMPLES, excitation=excitation, plant=plant, name=name)
 
 
 @dataclass(frozen=True, eq=False)

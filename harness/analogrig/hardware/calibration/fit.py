@@ -45,7 +45,7 @@ from analogrig.rigs.emulator import (
 )
 from analogrig.run import CHANNELS, MEASURED
 from analogrig.scenario import PlantChoice, Scenario
-from analogrig_emulator import OP_AMP_GRADES, TICKS_PER_SAMPLE, Edges, Excitation, Sampler, SuspensionComputer
+from analogrig_emulator import OP_AMP_GRADES, Excitation, Sampler, SuspensionComputer
 
 Stock = Literal["nominal", "polyester", "polypropylene"]
 Pots = Literal["coefficient", "dial"]
@@ -383,24 +383,14 @@ def _settings(plant: PlantChoice) -> Mapping[tuple[int, float], float]:
     }
 
 
-@dataclass(frozen=True)
-class _LateExcitation(Excitation):
-    """Excitation whose edges are ``ticks`` later."""
-
-    ticks: int = 0
-
-    def edges(self, start_tick: int, stop_tick: int, sample_rate_hz: float) -> Edges:
-        early = super().edges(start_tick - self.ticks, stop_tick - self.ticks, sample_rate_hz)
-        return Edges(early.ticks + self.ticks, early.levels_v)
-
-
 def _late_displacement(computer: SuspensionComputer, wave: Excitation, samples: int, late_n: float) -> Vector:
     """(samples,) displacement ``late_n`` samples after each sample, V.
 
     The force moves instead of the samples, by one sample less ``late_n``: the emulator then needs no finer grid.
     """
-    late = _LateExcitation(**dataclasses.asdict(wave), ticks=round((1.0 - late_n) * TICKS_PER_SAMPLE))
-    volts = np.concatenate(list(computer.play(late, samples + 1)))
+    by = (1.0 - late_n) * wave.frequency_hz / computer.sample_rate_hz
+    later = dataclasses.replace(wave, clock="free", phase=(wave.phase - by) % 1.0)
+    volts = np.concatenate(list(computer.play(later, samples + 1)))
     return np.asarray(volts[1:, CHANNELS.index("displacement")])
 
 

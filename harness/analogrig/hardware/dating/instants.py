@@ -363,10 +363,9 @@ class _Problem:
 
     def motions(self, guess: _Guess, signals: Signals | None = None) -> tuple[Motion, Motion]:
         """Motions of the plants before and after; ``signals``: others than those of the window."""
+        signals, offset = self.signals if signals is None else signals, float(guess.unknowns[0])
         before, after = (
-            Motion.of(
-                _deviate(plant, own), guess.edges, signals or self.signals, (float(guess.unknowns[0]), float(own[0]))
-            )
+            Motion.of(_deviate(plant, own), guess.edges, signals, (offset, float(own[0])))
             for plant, own in zip(self.plants, guess.own, strict=True)
         )
         return before, after

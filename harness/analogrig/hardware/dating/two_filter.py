@@ -137,6 +137,7 @@ class Motion:
 
     @classmethod
     def of(cls, plant: Plant, edges: EdgePlace, signals: Signals, offsets: tuple[float, float] = (0.0, 0.0)) -> Self:
+        """Motion of ``plant`` by the force of ``signals``."""
         step = _PLACE_STEP if edges.mean < 0.5 else -_PLACE_STEP
         model, *moved = PlantModel.of(
             [plant, *(plant.scaled(name, 1.0 + _STEP) for name in PARAMETERS)], edges, signals
