@@ -18,6 +18,19 @@ from tests.harness.processes import LONG_S
 
 ROOT = Path(__file__).parents[2]
 
+RIG = """\
+[rig.bench]
+kind = "real"
+instrument = "redpitaya://{address}"
+timeout_s = 60.0
+generator.gain = 10.0
+inputs.force = {{ input = 1, range = "HV" }}
+inputs.displacement = {{ input = 2, range = "HV" }}
+pots.kind = "instrument"
+self_test = {self_test}
+"""
+"""Rigs file with a rig on the served instrument, correctly wired."""
+
 
 @dataclass(frozen=True)
 class Served:
@@ -30,6 +43,16 @@ class Served:
     @property
     def port(self) -> int:
         return int(self.said["port"])
+
+    @property
+    def address(self) -> str:
+        return str(self.said["address"])
+
+    def rigs_file(self, folder: Path, *, self_test: bool = False) -> Path:
+        """Rigs file with the rig ``bench``: this instrument, correctly wired."""
+        path = folder / "rigs.toml"
+        path.write_text(RIG.format(address=self.address, self_test=str(self_test).lower()))
+        return path
 
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=LONG_S)
