@@ -1,4 +1,4 @@
-"""Real rig, tested on the emulator served as the instrument in another process."""
+"""Real rig, tested on the emulator served as the instrument in another process; with defects, in a thread."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from analogrig.signals import ENDING
 from analogrig_emulator import Excitation
 from tests.harness.allowed import open_allowed
 from tests.harness.processes import LONG_S
-from tests.served.serving import RIG, ROOT, Served, serving
+from tests.served.serving import RIG, ROOT, Served, serving, serving_in_thread
 
 THESIS = Scenario.load("thesis")
 SHORT = dataclasses.replace(THESIS, samples=300, tweaks=())
@@ -130,7 +130,7 @@ def test_stages_between_instrument_and_computer_are_compensated(tmp_path: Path) 
     defects = [
         part
         for name, (gain, offset_v) in stages.items()
-        for part in ("--defect", f"wiring.{name}.gain={gain}", "--defect", f"wiring.{name}.offset_v={offset_v}")
+        for part in (f"wiring.{name}.gain={gain}", f"wiring.{name}.offset_v={offset_v}")
     ]
     wired = """
 [rig.other]
@@ -142,7 +142,7 @@ inputs.displacement = {{ input = 2, range = "HV", gain = -1.0, offset_v = 0.25 }
 pots.kind = "instrument"
 self_test = false
 """
-    with serving("--rig", "emulator-ideal", *defects) as instrument:
+    with serving_in_thread(*defects, rig="emulator-ideal") as instrument:
         file = tmp_path / "rigs.toml"
         file.write_text(wired.format(address=instrument.address))
         with open_allowed(f"{file}:other") as real, open_rig("emulator-ideal") as emulated:
@@ -175,8 +175,7 @@ def test_instrument_in_use_is_locked(bench: str) -> None:
 
 
 def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
-    second = ("--defect", "acquisition.drop_out_record=2")
-    with serving("--defect", 'acquisition.drop_out="zeros"', *second) as instrument:
+    with serving_in_thread('acquisition.drop_out="zeros"', "acquisition.drop_out_record=2") as instrument:
         file = instrument.rigs_file(tmp_path)
         with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
             bench = Bench(rig, dut)
@@ -186,9 +185,8 @@ def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
 
 def test_stale_record_of_an_earlier_play_is_detected(tmp_path: Path) -> None:
     """The fourth record of the instrument is stale; a record of rest precedes each one that counts."""
-    fourth = ("--defect", "acquisition.stale_n=2", "--defect", "acquisition.drop_out_record=4")
     with (
-        serving(*fourth) as instrument,
+        serving_in_thread("acquisition.stale_n=2", "acquisition.drop_out_record=4") as instrument,
         open_allowed(str(instrument.rigs_file(tmp_path))) as rig,
         open_dut("inproc") as dut,
     ):
@@ -234,8 +232,8 @@ def test_displaced_changes_of_the_instrument_are_detected(late_s: float, said: s
 def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclusive(
     defect: str, tmp_path: Path
 ) -> None:
-    second = ("--defect", "acquisition.drop_out_record=2")  # the first one is taken while the computer comes to rest
-    with serving("--defect", defect, *second) as instrument:
+    second = "acquisition.drop_out_record=2"  # the first one is taken while the computer comes to rest
+    with serving_in_thread(defect, second) as instrument:
         file = instrument.rigs_file(tmp_path)
         if FAILURES[defect] is RigTimeout:
             file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 2.0"))
@@ -254,9 +252,9 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
     [
         pytest.param(b"", b"", RigTimeout, "no answer within 0.2 s", id="says nothing"),
         pytest.param(b"", b"x", RigTimeout, "no (whole )?answer within 0.2 s", id="drips"),
-        pytest.param(b"", None, RigClosed, "", id="hangs up"),
-        pytest.param(b"nonsense" * 300_000, None, RigError, "", id="an answer without end"),
-        pytest.param(b"\n\n#9\n\xff\xff\n" * 50, None, RigError, "", id="nonsense"),
+        pytest.param(b"", None, RigClosed, "connection", id="hangs up"),
+        pytest.param(b"nonsense" * 300_000, None, RigError, "instrument 127", id="an answer without end"),
+        pytest.param(b"\n\n#9\n\xff\xff\n" * 50, None, RigError, "instrument 127", id="nonsense"),
     ],
 )
 def test_other_servers_are_a_named_error(
@@ -442,20 +440,20 @@ SICK = {
 
 @pytest.mark.parametrize("defect", SICK)
 def test_run_on_a_faulty_rig_is_inconclusive_with_the_reason(defect: str, tmp_path: Path) -> None:
-    with serving("--defect", defect) as instrument:
+    with serving_in_thread(defect) as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
 
 
 def test_noise_is_measured_by_the_self_test(tmp_path: Path) -> None:
-    with serving("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.0042]") as instrument:
+    with serving_in_thread("inputs.noise_v=[0.0, 0.0042]", rig="emulator-ideal") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert run.conditions.channels["displacement"].noise_lsb == pytest.approx(0.0042 * (1 << 14) / 40.0, rel=0.05)
 
 
 def test_rig_with_drawn_components_is_judged_after_a_good_self_test(tmp_path: Path) -> None:
-    with serving("--rig", "emulator-real") as instrument:
+    with serving_in_thread(rig="emulator-real") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert judge(run).outcome == "passed", judge(run).reasons
 
@@ -495,7 +493,7 @@ def test_rig_with_fixed_pots_refuses_changes_beforehand(tmp_path: Path) -> None:
 
 
 def test_run_is_inconclusive_if_the_self_test_could_not_measure_everything(tmp_path: Path) -> None:
-    with serving("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.009]") as instrument:
+    with serving_in_thread("inputs.noise_v=[0.0, 0.009]", rig="emulator-ideal") as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith("the rig's self-test: ")
