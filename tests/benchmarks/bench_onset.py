@@ -23,7 +23,7 @@ from analogrig.judging.statistics import lower_rate
 from analogrig.rigs.rig import Rig
 from tests.harness.allowed import open_allowed
 from tests.harness.dating_trials import Clock, Several, Trial, still
-from tests.harness.served import served
+from tests.served.serving import serving
 
 from .figure import Figure
 
@@ -110,7 +110,7 @@ def several(records: int = SEVERAL_N) -> Iterator[Figure]:
 @contextlib.contextmanager
 def _served() -> Iterator[Rig]:
     with (
-        served() as instrument,
+        serving() as instrument,
         tempfile.TemporaryDirectory() as folder,
         open_allowed(str(instrument.rigs_file(Path(folder)))) as rig,
     ):

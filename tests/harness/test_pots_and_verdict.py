@@ -25,7 +25,7 @@ from analogrig.scenario import PotChange as Asked
 from analogrig.scenario import Scenario
 from analogrig_emulator import COMPONENTS, Excitation, SuspensionComputer
 from tests.harness.allowed import open_allowed
-from tests.harness.served import served
+from tests.served.serving import serving
 
 SAMPLES, ASKED_AT = 10_000, 3000
 INSTANTS = (3215, 3311)
@@ -172,7 +172,7 @@ def test_instants_of_a_users_command_are_dated_in_real_time(tmp_path: Path) -> N
     scenario = dataclasses.replace(Scenario.load("thesis"), samples=16_000, tweaks=tweaks)
     script = tmp_path / "turn.py"
     script.write_text(PROGRAM)
-    with served("--rig", "emulator-real", "--real-time") as instrument:
+    with serving("--rig", "emulator-real", "--real-time") as instrument:
         file = instrument.rigs_file(tmp_path)
         arguments = [sys.executable, str(script), instrument.address, "{pot}", "{dial}"]
         pots = f'pots.kind = "command"\npots.arguments = {arguments}'

@@ -1,4 +1,4 @@
-"""Real rig, tested on the emulator served as the instrument in another process."""
+"""Real rig, tested on the emulator served as the instrument in another process; with defects, in a thread."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from analogrig.signals import ENDING
 from analogrig_emulator import Excitation
 from tests.harness.allowed import open_allowed
 from tests.harness.processes import LONG_S
-from tests.harness.served import RIG, ROOT, Served, served
+from tests.served.serving import RIG, ROOT, Served, serving, serving_in_thread
 
 THESIS = Scenario.load("thesis")
 SHORT = dataclasses.replace(THESIS, samples=300, tweaks=())
@@ -40,7 +40,7 @@ SHORT = dataclasses.replace(THESIS, samples=300, tweaks=())
 
 @pytest.fixture(scope="module")
 def ideal() -> Iterator[Served]:
-    with served("--rig", "emulator-ideal") as instrument:
+    with serving("--rig", "emulator-ideal") as instrument:
         yield instrument
 
 
@@ -130,7 +130,7 @@ def test_stages_between_instrument_and_computer_are_compensated(tmp_path: Path) 
     defects = [
         part
         for name, (gain, offset_v) in stages.items()
-        for part in ("--defect", f"wiring.{name}.gain={gain}", "--defect", f"wiring.{name}.offset_v={offset_v}")
+        for part in (f"wiring.{name}.gain={gain}", f"wiring.{name}.offset_v={offset_v}")
     ]
     wired = """
 [rig.other]
@@ -142,7 +142,7 @@ inputs.displacement = {{ input = 2, range = "HV", gain = -1.0, offset_v = 0.25 }
 pots.kind = "instrument"
 self_test = false
 """
-    with served("--rig", "emulator-ideal", *defects) as instrument:
+    with serving_in_thread(*defects, rig="emulator-ideal") as instrument:
         file = tmp_path / "rigs.toml"
         file.write_text(wired.format(address=instrument.address))
         with open_allowed(f"{file}:other") as real, open_rig("emulator-ideal") as emulated:
@@ -165,26 +165,6 @@ FAILURES = {
 }
 
 
-def test_slow_answer_is_a_time_out(tmp_path: Path) -> None:
-    def drips(listening: socket.socket) -> None:
-        connection, _ = listening.accept()
-        with connection, contextlib.suppress(OSError):
-            while not done.wait(0.1):
-                connection.sendall(b"x")
-
-    done = threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        thread = threading.Thread(target=drips, args=(listening,), daemon=True)
-        thread.start()
-        file = tmp_path / "rigs.toml"
-        address = f"127.0.0.1:{listening.getsockname()[1]}"
-        file.write_text(RIG.format(address=address, self_test="false").replace("60.0", "0.5"))
-        with open_allowed(str(file)) as rig, pytest.raises(RigTimeout, match=r"no (whole )?answer within 0.5 s"):
-            next(rig.perform(SHORT, 1).blocks)
-        done.set()
-        thread.join(LONG_S)
-
-
 def test_instrument_in_use_is_locked(bench: str) -> None:
     with open_allowed(bench) as first, open_allowed(bench) as second:
         next(first.perform(SHORT, 1).blocks)
@@ -195,8 +175,7 @@ def test_instrument_in_use_is_locked(bench: str) -> None:
 
 
 def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
-    second = ("--defect", "acquisition.drop_out_record=2")
-    with served("--defect", 'acquisition.drop_out="zeros"', *second) as instrument:
+    with serving_in_thread('acquisition.drop_out="zeros"', "acquisition.drop_out_record=2") as instrument:
         file = instrument.rigs_file(tmp_path)
         with open_allowed(str(file)) as rig, open_dut("inproc") as dut:
             bench = Bench(rig, dut)
@@ -206,9 +185,8 @@ def test_run_after_a_failed_one_passes(tmp_path: Path) -> None:
 
 def test_stale_record_of_an_earlier_play_is_detected(tmp_path: Path) -> None:
     """The fourth record of the instrument is stale; a record of rest precedes each one that counts."""
-    fourth = ("--defect", "acquisition.stale_n=2", "--defect", "acquisition.drop_out_record=4")
     with (
-        served(*fourth) as instrument,
+        serving_in_thread("acquisition.stale_n=2", "acquisition.drop_out_record=4") as instrument,
         open_allowed(str(instrument.rigs_file(tmp_path))) as rig,
         open_dut("inproc") as dut,
     ):
@@ -254,8 +232,8 @@ def test_displaced_changes_of_the_instrument_are_detected(late_s: float, said: s
 def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclusive(
     defect: str, tmp_path: Path
 ) -> None:
-    second = ("--defect", "acquisition.drop_out_record=2")  # the first one is taken while the computer comes to rest
-    with served("--defect", defect, *second) as instrument:
+    second = "acquisition.drop_out_record=2"  # the first one is taken while the computer comes to rest
+    with serving_in_thread(defect, second) as instrument:
         file = instrument.rigs_file(tmp_path)
         if FAILURES[defect] is RigTimeout:
             file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 2.0"))
@@ -270,27 +248,35 @@ def test_instrument_that_fails_in_a_record_is_a_named_error_and_the_run_inconclu
 
 
 @pytest.mark.parametrize(
-    ("answer", "error"),
-    [(None, RigTimeout), (b"", RigClosed), (b"nonsense" * 300_000, RigError), (b"\n\n#9\n\xff\xff\n" * 50, RigError)],
-    ids=["says nothing", "hangs up", "an answer without end", "nonsense"],
+    ("answer", "then", "error", "said"),
+    [
+        pytest.param(b"", b"", RigTimeout, "no answer within 0.2 s", id="says nothing"),
+        pytest.param(b"", b"x", RigTimeout, "no (whole )?answer within 0.2 s", id="drips"),
+        pytest.param(b"", None, RigClosed, "connection", id="hangs up"),
+        pytest.param(b"nonsense" * 300_000, None, RigError, "instrument 127", id="an answer without end"),
+        pytest.param(b"\n\n#9\n\xff\xff\n" * 50, None, RigError, "instrument 127", id="nonsense"),
+    ],
 )
-def test_other_servers_are_a_named_error(answer: bytes | None, error: type[RigError], tmp_path: Path) -> None:
+def test_other_servers_are_a_named_error(
+    answer: bytes, then: bytes | None, error: type[RigError], said: str, tmp_path: Path
+) -> None:
+    """They send ``answer``, and ``then`` every 50 ms; or close the connection."""
+
     def answers(listening: socket.socket) -> None:
         connection, _ = listening.accept()
-        with connection:
-            if answer is None:
-                done.wait(LONG_S)
-            connection.sendall(answer or b"")
+        with connection, contextlib.suppress(OSError):
+            connection.sendall(answer)
+            while then is not None and not done.wait(0.05):
+                connection.sendall(then)
 
     done = threading.Event()
     with socket.create_server(("127.0.0.1", 0)) as listening:
         thread = threading.Thread(target=answers, args=(listening,), daemon=True)
         thread.start()
         file = tmp_path / "rigs.toml"
-        file.write_text(
-            RIG.format(address=f"127.0.0.1:{listening.getsockname()[1]}", self_test="false").replace("60.0", "0.2")
-        )
-        with open_allowed(str(file)) as rig, pytest.raises(error):
+        address = f"127.0.0.1:{listening.getsockname()[1]}"
+        file.write_text(RIG.format(address=address, self_test="false").replace("60.0", "0.2"))
+        with open_allowed(str(file)) as rig, pytest.raises(error, match=said):
             next(rig.perform(SHORT, 1).blocks)
         done.set()
         thread.join(LONG_S)
@@ -324,7 +310,7 @@ def test_generator_is_off_while_the_device_works_and_afterwards(bench: str, idea
 @pytest.mark.parametrize("number", ENDING)
 def test_interrupted_run_leaves_the_generator_off(number: signal.Signals, tmp_path: Path) -> None:
     silent = ("--defect", 'acquisition.drop_out="silence"', "--defect", "acquisition.drop_out_record=2")
-    with served(*silent) as instrument:
+    with serving(*silent) as instrument:
         file = instrument.rigs_file(tmp_path)
         file.write_text(file.read_text().replace("timeout_s = 60.0", "timeout_s = 10.0"))
         command = [sys.executable, "-m", "analogrig.cli", "run", "--dut", "inproc", "--out", str(tmp_path / "out")]
@@ -454,20 +440,20 @@ SICK = {
 
 @pytest.mark.parametrize("defect", SICK)
 def test_run_on_a_faulty_rig_is_inconclusive_with_the_reason(defect: str, tmp_path: Path) -> None:
-    with served("--defect", defect) as instrument:
+    with serving_in_thread(defect) as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith(f"the rig's self-test: {SICK[defect]}")
 
 
 def test_noise_is_measured_by_the_self_test(tmp_path: Path) -> None:
-    with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.0042]") as instrument:
+    with serving_in_thread("inputs.noise_v=[0.0, 0.0042]", rig="emulator-ideal") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert run.conditions.channels["displacement"].noise_lsb == pytest.approx(0.0042 * (1 << 14) / 40.0, rel=0.05)
 
 
 def test_rig_with_drawn_components_is_judged_after_a_good_self_test(tmp_path: Path) -> None:
-    with served("--rig", "emulator-real") as instrument:
+    with serving_in_thread(rig="emulator-real") as instrument:
         run = played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1)
     assert judge(run).outcome == "passed", judge(run).reasons
 
@@ -476,7 +462,7 @@ def test_rig_with_drawn_components_is_judged_after_a_good_self_test(tmp_path: Pa
 
 
 def test_shipped_properties_pass_on_the_real_rig(tmp_path: Path) -> None:
-    with served() as instrument:
+    with serving() as instrument:
         outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}  # no worker's
         environment = {**outside, "ANALOGRIG_RIGS": str(instrument.rigs_file(tmp_path))}
         result = subprocess.run(
@@ -507,7 +493,7 @@ def test_rig_with_fixed_pots_refuses_changes_beforehand(tmp_path: Path) -> None:
 
 
 def test_run_is_inconclusive_if_the_self_test_could_not_measure_everything(tmp_path: Path) -> None:
-    with served("--rig", "emulator-ideal", "--defect", "inputs.noise_v=[0.0, 0.009]") as instrument:
+    with serving_in_thread("inputs.noise_v=[0.0, 0.009]", rig="emulator-ideal") as instrument:
         verdict = judge(played(str(instrument.rigs_file(tmp_path, self_test=True)), THESIS, 1))
     assert verdict.outcome == "inconclusive"
     assert verdict.reasons[0].startswith("the rig's self-test: ")

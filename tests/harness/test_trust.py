@@ -45,7 +45,7 @@ from analogrig.run import Run
 from analogrig.scenario import Scenario
 from analogrig.testing.counterexample import Counterexample
 from analogrig.trust import FiledName, Thing, Trust, resolve_name
-from tests.harness.served import served
+from tests.served.serving import serving
 
 pytestmark = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io:pytest.PytestUnraisableExceptionWarning")
 """The spy:// of pyserial does not close its file."""
@@ -159,7 +159,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def instrument() -> Iterator[str]:
     """The address of an instrument that answers."""
-    with served("--port", "0") as running:
+    with serving("--port", "0") as running:
         yield running.address
 
 

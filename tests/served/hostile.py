@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from tests.harness.processes import LONG_S
-from tests.served.serving import Served, ended, serving
+from tests.served.serving import ServedByProcess, ended, serving
 from tests.served.talk import SEQUENCE
 
 IDENTITY = "analogrig,emulated STEMlab 125-14,0,0"
@@ -84,11 +84,11 @@ def line(draw: random.Random) -> bytes:
 
 
 Stop = Callable[[], bool]
-Attack = Callable[[Served, random.Random, Stop], int]
+Attack = Callable[[ServedByProcess, random.Random, Stop], int]
 """Attack at least once, and until the stop. Return the number of attacks."""
 
 
-def talk(served: Served, draw: random.Random, stop: Stop) -> int:
+def talk(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Send random lines, and read most answers."""
     said = 0
     while True:
@@ -104,7 +104,7 @@ def talk(served: Served, draw: random.Random, stop: Stop) -> int:
             return said
 
 
-def talk_at_once(served: Served, draw: random.Random, stop: Stop) -> int:
+def talk_at_once(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Run ``talk`` in several clients at once."""
     said: list[int] = []
     own = [random.Random(draw.random()) for _ in range(6)]
@@ -118,7 +118,7 @@ def talk_at_once(served: Served, draw: random.Random, stop: Stop) -> int:
     return sum(said)
 
 
-def leave_half_open(served: Served, draw: random.Random, stop: Stop) -> int:
+def leave_half_open(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Send half a line, then close one way, reset the connection, or stay silent."""
     left: list[socket.socket] = []
     count = 0
@@ -145,7 +145,7 @@ def leave_half_open(served: Served, draw: random.Random, stop: Stop) -> int:
             return count
 
 
-def read_slowly(served: Served, draw: random.Random, stop: Stop) -> int:
+def read_slowly(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Read answers of 100 kB a kilobyte at a time."""
     count = 0
     with served.connect() as connection, _ignore_disconnection():
@@ -157,7 +157,7 @@ def read_slowly(served: Served, draw: random.Random, stop: Stop) -> int:
     return count
 
 
-def never_read(served: Served, draw: random.Random, stop: Stop) -> int:
+def never_read(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Query large answers until the server reads no more."""
     count = 0
     while True:
@@ -171,7 +171,7 @@ def never_read(served: Served, draw: random.Random, stop: Stop) -> int:
             return count
 
 
-def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
+def never_end_a_line(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Send 10 MB without an end of line, then a valid line."""
     count = 0
     while True:
@@ -188,7 +188,7 @@ def never_end_a_line(served: Served, draw: random.Random, stop: Stop) -> int:
             return count
 
 
-def connect_often(served: Served, draw: random.Random, stop: Stop) -> int:
+def connect_often(served: ServedByProcess, draw: random.Random, stop: Stop) -> int:
     """Connect, and disconnect at once or a little later."""
     count = 0
     kept: list[socket.socket] = []
@@ -232,7 +232,7 @@ class Survival:
     """Longest time until the witness had its answer."""
 
 
-def warm(served: Served) -> None:
+def warm(served: ServedByProcess) -> None:
     """Take and read a record at the highest rate, so that the server has all the memory that it needs."""
     client = served.client()
     client.say(*SEQUENCE, "ACQ:DEC 125", "ACQ:START", "ACQ:TRig NOW")
@@ -242,7 +242,7 @@ def warm(served: Served) -> None:
     client.close()
 
 
-def survive(served: Served, attack: Attack, seed: int, seconds: float) -> Survival:
+def survive(served: ServedByProcess, attack: Attack, seed: int, seconds: float) -> Survival:
     """Attack a server that is warm.
 
     :raises AssertionError: the witness gets no answer, or the memory grows too much.
@@ -265,7 +265,7 @@ def survive(served: Served, attack: Attack, seed: int, seconds: float) -> Surviv
     return survival
 
 
-def _watch(served: Served, done: threading.Event, slowest_s: list[float], failures: list[str]) -> None:
+def _watch(served: ServedByProcess, done: threading.Event, slowest_s: list[float], failures: list[str]) -> None:
     """Query repeatedly, and once more at the end."""
     over = False
     while not over and not failures:
@@ -283,7 +283,7 @@ def _watch(served: Served, done: threading.Event, slowest_s: list[float], failur
             )
 
 
-def _query(served: Served) -> str:
+def _query(served: ServedByProcess) -> str:
     """Query the identity; retry while all places are taken."""
     deadline_s = time.monotonic() + LONG_S
     while True:

@@ -1,29 +1,46 @@
-"""`analogrig serve` in another process, and clients of it."""
+"""`analogrig serve` in another process, its server in a thread, and clients of it."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from analogrig.hardware.simulator.served import ServedDescription
+from analogrig.hardware.simulator.server import Server
+from analogrig.scenario import DEFAULT_SEED
 from tests.harness.processes import LONG_S
 
 ROOT = Path(__file__).parents[2]
+
+RIG = """\
+[rig.bench]
+kind = "real"
+instrument = "redpitaya://{address}"
+timeout_s = 60.0
+generator.gain = 10.0
+inputs.force = {{ input = 1, range = "HV" }}
+inputs.displacement = {{ input = 2, range = "HV" }}
+pots.kind = "instrument"
+self_test = {self_test}
+"""
+"""Rigs file with a rig on the served instrument, correctly wired."""
 
 
 @dataclass(frozen=True)
 class Served:
     """Running server."""
 
-    process: subprocess.Popen[str]
     said: dict[str, Any]
     """First line of its output."""
 
@@ -31,11 +48,28 @@ class Served:
     def port(self) -> int:
         return int(self.said["port"])
 
+    @property
+    def address(self) -> str:
+        return str(self.said["address"])
+
+    def rigs_file(self, folder: Path, *, self_test: bool = False) -> Path:
+        """Rigs file with the rig ``bench``: this instrument, correctly wired."""
+        path = folder / "rigs.toml"
+        path.write_text(RIG.format(address=self.address, self_test=str(self_test).lower()))
+        return path
+
     def connect(self) -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), timeout=LONG_S)
 
     def client(self) -> Client:
         return Client(self.connect())
+
+
+@dataclass(frozen=True)
+class ServedByProcess(Served):
+    """Running server in another process."""
+
+    process: subprocess.Popen[str]
 
     @property
     def most_resident_kb(self) -> int:
@@ -74,19 +108,19 @@ class Client:
 
 
 @contextmanager
-def serving(*options: str) -> Iterator[Served]:
+def serving(*options: str) -> Iterator[ServedByProcess]:
     """Serve on a free port until the end of the block."""
     command = [sys.executable, "-m", "analogrig.cli", "serve", "--port", "0", "--json", *options]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             if process.stdout is None:
                 raise RuntimeError("no standard output")
-            yield Served(process, json.loads(process.stdout.readline()))
+            yield ServedByProcess(json.loads(process.stdout.readline()), process)
         finally:
             process.kill()
 
 
-def ended(served: Served, statuses: Sequence[int] = (0,)) -> str:
+def ended(served: ServedByProcess, statuses: Sequence[int] = (0,)) -> str:
     """Await the end of a server. Return its standard error.
 
     :raises AssertionError: another exit status than those expected.
@@ -95,3 +129,21 @@ def ended(served: Served, statuses: Sequence[int] = (0,)) -> str:
     if served.process.returncode not in statuses:
         raise AssertionError(f"ended with {served.process.returncode}: {said}")
     return said
+
+
+@contextmanager
+def serving_in_thread(*defects: str, rig: str = "emulator") -> Iterator[Served]:
+    """Serve a rig with defects in a thread of this process until the end of the block: sooner than another process."""
+    server = Server(ServedDescription.load(rig, defects).set_up("front", DEFAULT_SEED))
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    try:
+        listening = asyncio.run_coroutine_threadsafe(server.listen("127.0.0.1", 0), loop)
+        host, port = listening.result(LONG_S)
+        yield Served({"port": port, "address": f"{host}:{port}"})
+    finally:
+        asyncio.run_coroutine_threadsafe(server.close(), loop).result(LONG_S)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join(LONG_S)
+        loop.close()

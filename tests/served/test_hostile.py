@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from analogrig.hardware.simulator.scpi import MOST_ERRORS
 from tests.harness.processes import LONG_S
 from tests.served.hostile import ATTACKS, IDENTITY, RIGHT, VALUES, WORDS, Attack, survive, warm
-from tests.served.serving import Served, ended, serving
+from tests.served.serving import ServedByProcess, ended, serving
 from tests.served.talk import SEQUENCE, asking, interpreter, record, say
 
 ERROR = re.compile(r'(0|-\d{3}),"[^"]{0,255}"')
@@ -45,7 +45,7 @@ def test_random_input_gets_whole_lines_or_errors_and_the_next_record_is_right(
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
+def served() -> Iterator[ServedByProcess]:
     with serving() as served:
         warm(served)
         yield served
@@ -54,7 +54,7 @@ def served() -> Iterator[Served]:
 
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
-def test_server_survives_with_bounded_memory_and_answers_other_clients(served: Served, attack: Attack) -> None:
+def test_server_survives_with_bounded_memory_and_answers_other_clients(served: ServedByProcess, attack: Attack) -> None:
     assert survive(served, attack, seed=1, seconds=0.5).times > 0
     client = served.client()
     deadline_s = time.monotonic() + LONG_S

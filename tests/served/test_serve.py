@@ -22,21 +22,21 @@ from analogrig.scenario import Scenario
 from analogrig.signals import ENDING
 from analogrig_emulator import Excitation
 from tests.harness.processes import LONG_S
-from tests.served.serving import Served, ended, serving
+from tests.served.serving import ServedByProcess, ended, serving
 from tests.served.talk import POINT_SAMPLES, SEQUENCE, asking, front, record, say
 
 LSB_V = 40.0 / 2**14
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
+def served() -> Iterator[ServedByProcess]:
     """Server of the ideal rig."""
     with serving("--rig", "emulator-ideal") as served:
         yield served
 
 
 @pytest.fixture
-def visa(served: Served) -> Iterator[pyvisa.resources.MessageBasedResource]:
+def visa(served: ServedByProcess) -> Iterator[pyvisa.resources.MessageBasedResource]:
     """PyVISA resource, opened as programs for the real instrument do."""
     manager = pyvisa.ResourceManager("@py")
     address = f"TCPIP::127.0.0.1::{served.port}::SOCKET"
@@ -134,13 +134,13 @@ def test_signal_ends_the_server_and_closes_connections(sign: signal.Signals) -> 
         client.close()
 
 
-def test_json_has_the_same_content(served: Served) -> None:
+def test_json_has_the_same_content(served: ServedByProcess) -> None:
     address = f"127.0.0.1:{served.port}"
     place = {"host": "127.0.0.1", "port": served.port, "address": address}
     assert served.said == {"rig": "emulator-ideal", "plant": "front", "seed": 1995, **place}
 
 
-def test_server_listens_on_the_loopback_interface_only(served: Served) -> None:
+def test_server_listens_on_the_loopback_interface_only(served: ServedByProcess) -> None:
     """/proc/net/tcp: 0100007F is 127.0.0.1, state 0A is listening."""
     rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     assert [row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{served.port:04X}")] == [

@@ -23,6 +23,7 @@ from typing import ClassVar, Literal, Self
 
 import serial
 
+from analogrig.config import check_range
 from analogrig.errors import ConfigurationError, LinkError, RigError
 from analogrig.hardware.instrument import Pots
 from analogrig.links.wire import DEFAULT_BAUD, PortWire
@@ -36,6 +37,7 @@ DECIMALS = 4
 
 _MOST_TIMEOUT_S = 3600.0
 _MOST_STEPS = 1 << 24
+_MOST_BAUD = 100_000_000
 _MOST_SHOWN = 300
 """Characters of a reply that an error message repeats."""
 _MOST_REPLY_BYTES = 4096
@@ -94,8 +96,7 @@ class _SteppedPots(PotsKind):
     timeout_s: float = 5.0
 
     def __post_init__(self) -> None:
-        if not 2 <= self.steps <= _MOST_STEPS:
-            raise ValueError(f"steps must be 2 to {_MOST_STEPS}, not {self.steps}")
+        check_range(self, "steps", 2, _MOST_STEPS)
         if not 0.0 < self.timeout_s <= _MOST_TIMEOUT_S:
             raise ValueError(f"timeout_s must be more than 0 and at most {_MOST_TIMEOUT_S:g}, not {self.timeout_s:g}")
 
@@ -165,8 +166,7 @@ class SerialPots(_SteppedPots):
         super().__post_init__()
         if not self.url:
             raise ValueError("url must name the line of the box: a serial port, or any URL of pyserial")
-        if not 1 <= self.baud <= 100_000_000:
-            raise ValueError(f"baud must be 1 to 100000000, not {self.baud}")
+        check_range(self, "baud", 1, _MOST_BAUD)
         _check_placeholders("line", self.line)
         _check_placeholders("reply", self.reply, needed=False)
 

@@ -165,8 +165,7 @@ class ComputerDescription:
         return NoisySuspension(computer, Stream.NOISE.generator(seed), op_amps=grade, temperature_c=self.temperature_c)
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.offset_v <= MOST_OFFSET_V:
-            raise ValueError(f"offset_v must be 0 to {MOST_OFFSET_V:g}, not {self.offset_v:g}")
+        config.check_range(self, "offset_v", 0.0, MOST_OFFSET_V)
         if self.specimen is not None and self.specimen < 0:
             raise ValueError(f"specimen must be 0 to 2^63 - 1, not {self.specimen}")
         if self.values is not None and (self.offset_v or self.specimen is not None):
@@ -200,8 +199,7 @@ class CardDescription:
                 raise ValueError(
                     f"range_v.{name} must be (low, high) within +-{MOST_VOLTS:g} V, not ({low:g}, {high:g})"
                 )
-        if not 1.0 <= self.rate_hz <= MOST_RATE_HZ:
-            raise ValueError(f"rate_hz must be 1 to {MOST_RATE_HZ:g}, not {self.rate_hz:g}")
+        config.check_range(self, "rate_hz", 1.0, MOST_RATE_HZ)
         if isinstance(self.noise_lsb, Mapping) and set(self.noise_lsb) != set(CHANNELS):
             raise ValueError(f"noise_lsb must give the channels {', '.join(CHANNELS)}, not {', '.join(self.noise_lsb)}")
         for noise_lsb in self._noises_lsb() or ():

@@ -20,7 +20,6 @@ Pots have the numbers of their places in POT:CATalog?:
 from __future__ import annotations
 
 import functools
-import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -373,27 +372,19 @@ class ServedDescription(EmulatorDescription):
 
         :raises ValueError: together they are too large.
         """
-        card, instrument = self.card.card(), self.instrument
-        own = instrument.inputs
-        lsb_v = card.lsb_v
-        gain_error, offset_v, noise_v, skew_s = (
-            [float(values[at]) for at in MEASURED_AT]
-            for values in (
-                card.per_channel("gain_error"),
-                card.per_channel("offset_lsb") * lsb_v,
-                card.per_channel("noise_lsb") * lsb_v,
-                card.per_channel("skew_s"),
-            )
-        )
+        card, own, acquisition = self.card.card(), self.instrument.inputs, self.instrument.acquisition
+        measured = list(MEASURED_AT)
+        gain_error, skew_s = card.per_channel("gain_error")[measured], card.per_channel("skew_s")[measured]
+        offset_v, noise_v = ((card.per_channel(name) * card.lsb_v)[measured] for name in ("offset_lsb", "noise_lsb"))
         inputs = replace(
             own,
-            noise_v=(math.hypot(own.noise_v[0], noise_v[0]), math.hypot(own.noise_v[1], noise_v[1])),
-            gain_error=(own.gain_error[0] + gain_error[0], own.gain_error[1] + gain_error[1]),
-            offset_v=(own.offset_v[0] + offset_v[0], own.offset_v[1] + offset_v[1]),
-            skew_s=own.skew_s + skew_s[1] - skew_s[0],
+            noise_v=_pair(np.hypot(own.noise_v, noise_v)),
+            gain_error=_pair(own.gain_error + gain_error),
+            offset_v=_pair(own.offset_v + offset_v),
+            skew_s=own.skew_s + float(skew_s[1] - skew_s[0]),
         )
-        clock_ppm = instrument.acquisition.clock_ppm + card.clock_drift_ppm
-        return replace(instrument, inputs=inputs, acquisition=replace(instrument.acquisition, clock_ppm=clock_ppm))
+        acquisition = replace(acquisition, clock_ppm=acquisition.clock_ppm + card.clock_drift_ppm)
+        return replace(self.instrument, inputs=inputs, acquisition=acquisition)
 
     @property
     def unsupported(self) -> tuple[str, ...]:
@@ -402,6 +393,10 @@ class ServedDescription(EmulatorDescription):
         others = [each for each in fields(Card) if each.name not in _ON_BOTH | _OF_THE_CARD]
         of_card = tuple(f"card.{each.name}" for each in others if getattr(card, each.name) != each.default)
         return (*of_card, "computer.noise") if self.computer.noise else of_card
+
+
+def _pair(values: NDArray[np.float64]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
 
 
 def _parse(defect: str) -> Keys:
