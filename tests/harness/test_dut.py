@@ -317,8 +317,8 @@ class FaultyLink:
     def reboot(self) -> None:
         self.inner = FramedLink(MemoryWire(boot_nonce=2, clock=self.clock))
 
-    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - no CAN frames
-        return False
+    def listen(self, listener: CanListener) -> None:
+        """Do nothing: there are no CAN frames."""
 
     def send(self, messages: Iterable[Message]) -> None:
         self.inner.send([passed for message in messages for passed in self.to_device(message)])

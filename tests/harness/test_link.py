@@ -132,20 +132,17 @@ def test_port_is_opened_by_one_alone(link: FramedLink, terminal: Terminal) -> No
         at_port(terminal.path)
 
 
-def test_absent_port_is_named() -> None:
-    with pytest.raises(LinkError, match="^cannot open /dev/ttyNOWHERE: No such file or directory$"):
-        at_port("/dev/ttyNOWHERE")
-
-
-def test_file_that_is_no_port_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(LinkError, match=f"cannot open {tmp_path}/file"):
-        at_port(str(tmp_path / "file"))
-
-
-def test_unknown_kind_of_url_is_a_wrong_configuration() -> None:
-    with pytest.raises(ConfigurationError, match="pigeon://coop"):
-        at_port("pigeon://coop")
+@pytest.mark.parametrize(
+    ("url", "error", "said"),
+    [
+        ("/dev/ttyNOWHERE", LinkError, "^cannot open /dev/ttyNOWHERE: No such file or directory$"),
+        (__file__, LinkError, f"cannot open {__file__}"),
+        ("pigeon://coop", ConfigurationError, "pigeon://coop"),
+    ],
+)
+def test_port_that_cannot_be_opened_is_named(url: str, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        at_port(url)
 
 
 def test_link_may_be_closed_twice(link: FramedLink) -> None:

@@ -84,14 +84,6 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
     assert run.alarm_index.tolist() == expected.alarm_index.tolist()
 
 
-def test_firmware_of_the_m0_gives_the_same_bits_on_the_board_of_the_m3() -> None:
-    """QEMU has no board of this kind with an M0, whose instructions are some of an M3's."""
-    scenario = shortened("thesis")
-    run = play(describe(f"qemu-m3:{FOLDER}/analogrig-m0.elf"), scenario)
-    assert run.conditions.faults == ()
-    assert run.theta_hash() == play(InprocDevice(name="bob"), scenario).theta_hash()
-
-
 def test_shortened_scenarios_still_have_alarms() -> None:
     assert len(play(HostDevice(name="bob"), shortened("thesis")).alarm_index) > 0
 

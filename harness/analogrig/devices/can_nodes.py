@@ -77,19 +77,15 @@ class MemoryBus(LibraryDevice):
         self._output = (_Frame * _OUTPUT_N)()
         self._answers: deque[can.Message] = deque()
 
-    def answers(self, frame: can.Message) -> list[can.Message]:
-        """Answers of the device to a frame."""
-        waiting, out = [_to_c(frame)], []
+    def send(self, frame: can.Message) -> None:
+        waiting = [_to_c(frame)]
         while True:
             array = (_Frame * len(waiting))(*waiting)
             progress = self.run(self.state, array, len(waiting), self._output, _OUTPUT_N)
-            out += [_from_c(self._output[i]) for i in range(progress.given)]
+            self._answers.extend(_from_c(self._output[i]) for i in range(progress.given))
             waiting = waiting[progress.taken :]
             if not progress.given and not waiting:
-                return out
-
-    def send(self, frame: can.Message) -> None:
-        self._answers += self.answers(frame)
+                return
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """The next answer. Without any, the clock advances by the whole time-out, since none can follow."""
@@ -141,7 +137,8 @@ class InhabitedBus(PythonCanBus):
             while not self._ends.is_set():
                 frame = self._devices_bus.receive(_POLL_S)
                 if frame is not None and not self._is_echo(frame):
-                    for answer in self._device.answers(frame):
+                    self._device.send(frame)
+                    while (answer := self._device.receive(0.0)) is not None:
                         self._sent[answer.arbitration_id, answer.data[0]] = bytes(answer.data)
                         self._devices_bus.send(answer)
         except Exception as error:  # noqa: BLE001 - ``receive`` reports any end of the thread

@@ -73,9 +73,8 @@ class CanLink:
             problems.append(number_of(foreign, "frame of others", "frames of others"))
         return ", ".join(problems)
 
-    def listen(self, listener: CanListener) -> bool:
+    def listen(self, listener: CanListener) -> None:
         self._listeners.append(listener)
-        return True
 
     def send(self, messages: Iterable[Message]) -> None:
         for message in messages:

@@ -46,8 +46,8 @@ class Link(Connection, Protocol):
     def unread_n(self) -> int | None:
         """Largest number of received messages that the system buffers; None if it is unlimited."""
 
-    def listen(self, listener: CanListener) -> bool:
-        """Report all frames to the listener from now on; False if the link has no CAN frames."""
+    def listen(self, listener: CanListener) -> None:
+        """Report all CAN frames to the listener from now on; a link without any ignores it."""
 
     def send(self, messages: Iterable[Message]) -> None:
         """Send the messages, in one write where the line allows it.
@@ -84,8 +84,8 @@ class FramedLink:
     def counters(self) -> Mapping[str, int]:
         return {"frames_dropped": self._decoder.dropped + self._unknown_n}
 
-    def listen(self, listener: CanListener) -> bool:  # noqa: ARG002 - a wire carries no CAN frames
-        return False
+    def listen(self, listener: CanListener) -> None:
+        """Do nothing: a wire carries no CAN frames."""
 
     def send(self, messages: Iterable[Message]) -> None:
         sent = b"".join([frame.encode(pack(message)) for message in messages])
