@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analogrig.cli import main
 from analogrig.config import locate
 from analogrig.devices.host import HOST_PROGRAM
 from analogrig.plant import Plant
@@ -185,54 +186,81 @@ def test_generator_of_any_period_wants_its_own_setting(tmp_path: Path) -> None:
 def test_faults_of_the_line_are_asked_for_by_name(tmp_path: Path) -> None:
     out = run_json("run", "--dut", "inproc", "--wire-faults", "reset@to:100", cwd=tmp_path, status=3)
     assert "it was reset after the handshake" in out["reasons"][0]
-    assert "'flop@2' is not KIND@to:FRAME" in refusal("run", "--wire-faults", "flop@2", cwd=tmp_path)
 
 
-def test_place_that_cannot_hold_the_results_is_found_before_the_run(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    assert "--out file/run: Not a directory" in refusal("run", "--out", "file/run", cwd=tmp_path)
+def refusal_here(arguments: Sequence[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Error message of a command that this process refuses."""
+    try:
+        status: Any = main(arguments)
+    except SystemExit as ended:
+        status = ended.code
+    out, error = capsys.readouterr()
+    (line,) = error.splitlines()
+    assert (status, out) == (2, "") and line.startswith("analogrig: ")
+    return str(line)
 
 
-def test_wrong_rig_is_named_by_its_file(tmp_path: Path) -> None:
-    text = locate("rigs", "emulator").read_text()
-    (tmp_path / "a.toml").write_text(text.replace('"tl07x"', '"lm358"'))
-    (tmp_path / "b.toml").write_text(text.replace("noise_lsb = 1.0", "noise_lsb = -1.0"))
-    assert "a.toml: " in refusal("run", "--rig", "a.toml", cwd=tmp_path)
-    assert "b.toml: " in refusal("run", "--rig", "b.toml", cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("kind", "old", "new", "words"),
+    [
+        ("rigs", '"tl07x"', '"lm358"', "mine.toml: "),
+        ("rigs", "noise_lsb = 1.0", "noise_lsb = -1.0", "mine.toml: "),
+        ("rigs", "noise_lsb = 1.0", "noise_lsb = 1e308", "mine.toml"),
+        ("rigs", "0.003", "-1.0", "mine.toml"),
+        ("rigs", "[-10.0, 10.0]", "[1e308, -1e308]", "mine.toml"),
+        ("scenarios", "random_phase", "randam_phase", "mine.toml: unknown key 'randam_phase'"),
+        ("scenarios", "mass_kg = 30.0", "mass_kg = 20.0", "pot M: .* 20 "),
+        ("scenarios", "frequency_hz = 200.0", "frequency_hz = 1e-12", "mine.toml"),
+        pytest.param("scenarios", "samples = 1800", f"samples = {10**400}", "mine.toml", id="samples"),
+        ("devices", "forgetting", "forgeting", "mine.toml: estimator: unknown key 'forgeting'"),
+        ("devices", "forgetting = 0.99\n", "forgetting = 0.2\n", "forgetting.* 0.2"),
+        ("devices", "arl0 = 1.0e5", "ceiling = 1.0e12", "mine.toml"),
+        ("devices", 'kind = "host"', f'kind = "serial"\nurl = "loop://"\nbaud = 1{20 * "0"}', "mine.toml"),
+    ],
+)
+def test_wrong_file_is_named_in_one_line(
+    kind: Any,
+    old: str,
+    new: str,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    option, name = {"devices": ("dut", "host"), "rigs": ("rig", "emulator"), "scenarios": ("scenario", "thesis")}[kind]
+    text = locate(kind, name).read_text()
+    assert old in text
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(text.replace(old, new))
+    assert re.search(words, refusal_here(["run", f"--{option}", "mine.toml"], capsys))
 
 
-def test_unknown_key_is_named_with_its_file(tmp_path: Path) -> None:
-    text = locate("scenarios", "thesis").read_text()
-    (tmp_path / "mine.toml").write_text(text.replace("random_phase", "randam_phase"))
-    assert "mine.toml: unknown key 'randam_phase'" in refusal("run", "--scenario", "mine.toml", cwd=tmp_path)
-
-
-def test_unknown_estimator_setting_is_named(tmp_path: Path) -> None:
-    (tmp_path / "dut.toml").write_text(locate("devices", "host").read_text().replace("forgetting", "forgeting"))
-    assert "dut.toml: estimator: unknown key 'forgeting'" in refusal("run", "--dut", "dut.toml", cwd=tmp_path)
-
-
-def test_setting_that_the_device_refuses_is_named(tmp_path: Path) -> None:
-    text = locate("devices", "host").read_text().replace("forgetting = 0.99\n", "forgetting = 0.2\n")
-    (tmp_path / "dut.toml").write_text(text)
-    line = refusal("run", "--dut", "dut.toml", cwd=tmp_path)
-    assert "forgetting" in line
-    assert "0.2" in line
-
-
-def test_missing_files_are_named(tmp_path: Path) -> None:
-    assert "none.toml: no such file" in refusal("run", "--scenario", "none.toml", cwd=tmp_path)
-    assert "none.toml: no such file" in refusal("run", "--rig", "none.toml", cwd=tmp_path)
-    assert "none.toml: no such file" in refusal("run", "--dut", "none.toml", cwd=tmp_path)
-    assert "none.npz" in refusal("replay", "none.npz", cwd=tmp_path)
-
-
-def test_pot_beyond_its_track_is_named(tmp_path: Path) -> None:
-    text = locate("scenarios", "thesis").read_text().replace("mass_kg = 30.0", "mass_kg = 20.0")
-    (tmp_path / "mine.toml").write_text(text)
-    line = refusal("run", "--scenario", "mine.toml", cwd=tmp_path)
-    assert "pot M" in line
-    assert "20" in line
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "COMMAND"),
+        ("fly", "fly"),
+        ("run --sede 3", "--sede"),
+        ("run --seed -1", "--seed"),
+        ("run --seed x", "--seed"),
+        ("run --real-time 0", "--real-time"),
+        ("run --baud 0", "baud must be 1"),
+        ("run --wire-faults flop@2", "'flop@2' is not KIND@to:FRAME"),
+        ("run --out file/run", "--out file/run: Not a directory"),
+        pytest.param(f"run --scenario {300 * 'x'}", "File name too long", id="name"),
+        ("run --dut serial:/dev/ttyNOWHERE", "/dev/ttyNOWHERE"),
+        *(
+            (f"run --dut serial:{url}", url)
+            for url in ("loop://?foo=1", "socket://127.0.0.1:abc", "nonsense://x", "alt://?class=x")
+        ),
+    ],
+)
+def test_wrong_argument_is_one_line(
+    arguments: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert words in refusal_here(arguments.split(), capsys)
 
 
 def test_truncated_recording_is_named(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -250,10 +278,6 @@ def test_dead_device_is_named_within_seconds(tmp_path: Path) -> None:
         os.close(ours)
         os.close(theirs)
     assert "Hello" in line
-
-
-def test_absent_serial_port_is_named(tmp_path: Path) -> None:
-    assert "/dev/ttyNOWHERE" in refusal("run", "--dut", "serial:/dev/ttyNOWHERE", cwd=tmp_path)
 
 
 @contextmanager
@@ -374,31 +398,6 @@ def test_device_at_a_url_is_not_opened_on_the_word_of_a_file(tmp_path: Path) -> 
     assert run_json("replay", out["run"], "--dut", "host", cwd=tmp_path)["theta_hash"] == out["theta_hash"]
 
 
-@pytest.mark.parametrize("url", ["loop://?foo=1", "socket://127.0.0.1:abc", "nonsense://x", "alt://?class=x"])
-def test_url_that_makes_no_sense_is_one_line(tmp_path: Path, url: str) -> None:
-    assert url in refusal("run", "--dut", f"serial:{url}", cwd=tmp_path)
-
-
-def test_absurd_values_are_one_line(tmp_path: Path) -> None:
-    changes = {
-        "devices": [
-            ("arl0 = 1.0e5", "ceiling = 1.0e12"),
-            ('kind = "host"', 'kind = "serial"\nurl = "loop://"\nbaud = 1' + 20 * "0"),
-        ],
-        "rigs": [("noise_lsb = 1.0", "noise_lsb = 1e308"), ("0.003", "-1.0"), ("[-10.0, 10.0]", "[1e308, -1e308]")],
-        "scenarios": [("frequency_hz = 200.0", "frequency_hz = 1e-12"), ("samples = 1800", f"samples = {10**400}")],
-    }
-    option = {"devices": "--dut", "rigs": "--rig", "scenarios": "--scenario"}
-    shipped = {"devices": "host", "rigs": "emulator", "scenarios": "thesis"}
-    for kind, pairs in changes.items():
-        for old, new in pairs:
-            text = locate(kind, shipped[kind]).read_text()  # type: ignore[arg-type]
-            assert old in text
-            (tmp_path / "absurd.toml").write_text(text.replace(old, new))
-            assert "absurd.toml" in refusal("run", option[kind], "absurd.toml", cwd=tmp_path)
-    assert "File name too long" in refusal("run", "--scenario", "x" * 300, cwd=tmp_path)
-
-
 def test_real_time_and_baud_are_options(thesis: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """Slow enough for any machine that tests run on: 1800 samples in 1.8 s."""
     out = run_json("run", "--seed", "3", "--real-time", "20", cwd=tmp_path)
@@ -408,10 +407,3 @@ def test_real_time_and_baud_are_options(thesis: tuple[Path, dict[str, Any]], tmp
     assert timed["line_s"] == pytest.approx(1800 * 144 * 10 / 115_200, rel=0.001)
     line = refusal("run", "--seed", "3", "--baud", "115200", "--real-time", cwd=tmp_path)
     assert "real time does not fit its line" in line
-    assert "--real-time" in refusal("run", "--real-time", "0", cwd=tmp_path)
-    assert "baud must be 1" in refusal("run", "--baud", "0", cwd=tmp_path)
-
-
-def test_wrong_option_is_a_usage_error(tmp_path: Path) -> None:
-    for arguments in (["run", "--sede", "3"], ["run", "--seed", "-1"], ["run", "--seed", "x"], [], ["fly"]):
-        assert refusal(*arguments, cwd=tmp_path)

@@ -30,7 +30,6 @@ SCENARIO, CAMPAIGN, RIG, DUT, FILE = "SCENARIO", "CAMPAIGN", "RIG", "DUT", "FILE
 """Metavars. They say what an option takes, and `completion` completes by them."""
 
 RIG_NAMES = "shipped name, table of your rigs file, FILE.toml or FILE.toml:NAME"
-RIG_HELP = f"{RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)"
 
 
 def add_command(commands: Any, name: str, does: str, *examples: str) -> argparse.ArgumentParser:
@@ -49,7 +48,11 @@ def add_command(commands: Any, name: str, does: str, *examples: str) -> argparse
     return command
 
 
-def add_rig(command: argparse.ArgumentParser, words: str = RIG_HELP, default: str | None = "emulator") -> None:
+def add_rig(
+    command: argparse.ArgumentParser,
+    words: str = f"{RIG_NAMES} (default: $ANALOGRIG_RIG or emulator)",
+    default: str | None = "emulator",
+) -> None:
     """Add --rig; ``default`` applies if the environment names no rig."""
     command.add_argument("--rig", default=os.environ.get("ANALOGRIG_RIG", default), metavar=RIG, help=words)
     add_allow(command)

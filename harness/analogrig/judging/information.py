@@ -37,6 +37,9 @@ ISOLATION_INFORMATION = math.log(20.0)
 ISOLATION_HORIZON_N = 300
 """Samples after a change in which it must be isolated; later counts as never."""
 
+_RATE_HZ = 20e3
+"""Sample rate of predictions: that of the emulated card."""
+
 _RIVAL_FACTORS = np.exp(np.linspace(math.log(0.25), math.log(4.0), 221))
 """Factors on the rival parameter; the most similar one is interpolated."""
 
@@ -120,26 +123,22 @@ def detectable(scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v
 
 
 def predicted_bounds(
-    scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096, rate_hz: float = 20e3
+    scenario: Scenario, arl0: float, *, noise_lsb: float = 1.0, lsb_v: float = 10.0 / 4096
 ) -> list[int | None]:
     """Predicted information bound of each change of a scenario; None: not detectable before the next one or the end.
 
-    Parameters as ``detectable``; ``rate_hz`` is the sample rate.
+    Parameters as ``detectable``.
     """
     scales = PROGRAMS[scenario.plant.set].scales
     lsb_m = lsb_v / scales.volts("displacement")
     weight = np.full(scenario.samples, 1.0 / (2.0 * (noise_lsb**2 + QUANTISATION_VARIANCE_LSB2) * lsb_m**2))
-    volts = _mean_levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, rate_hz), scenario.samples)
+    volts = _mean_levels(scenario.excitation.edges(0, scenario.samples * TICKS_PER_SAMPLE, _RATE_HZ), scenario.samples)
     force_n = volts / scales.volts("force")
     segments = scenario.segments()
-    stretches = [
-        (segment.start, following, segment.plant)
-        for segment, following in zip(
-            segments, [*(segment.start for segment in segments[1:]), scenario.samples], strict=True
-        )
-    ]
+    ends = [*(segment.start for segment in segments[1:]), scenario.samples]
+    stretches = [(segment.start, end, segment.plant) for segment, end in zip(segments, ends, strict=True)]
     ramps_n = {segment.start: segment.ramp_n for segment in segments}
-    period_s = scales.time / rate_hz
+    period_s = scales.time / _RATE_HZ
     return [
         first_at_level(_information(change, period_s), math.log(arl0))
         for change in _changes_between(stretches, ramps_n, force_n, weight, period_s)

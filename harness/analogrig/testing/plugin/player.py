@@ -79,7 +79,7 @@ def record_of(item: pytest.Item) -> Record:
 
 
 class Player:
-    """Plays for one test, and keeps what it has played: ``analogrig.testing.experiment.Play``."""
+    """Play for one test, and record the plays: ``analogrig.testing.statement.Play``."""
 
     def __init__(self, item: pytest.Item, bench: Bench, *, is_default: bool = False) -> None:
         """``is_default``: the rig and the device are those of the session, and no test has chosen them."""
@@ -115,7 +115,7 @@ class Player:
     def _check_equipment(self, scenario: Scenario) -> None:
         """Fail if the scenario names a rig or device other than the session's default, which would play in its stead.
 
-        What the command line, the environment or a parameter names comes before the scenario, as in `analogrig run`.
+        A name from the command line, the environment or a parameter precedes the scenario, as in `analogrig run`.
         """
         if not self._is_default:
             return
