@@ -114,7 +114,7 @@ class Journal:
             if entry is None:
                 break
             try:
-                chunk, rows = _checked(Chunk(entry["chunk"]), list(entry["rows"]), chunks, plan)
+                chunk, rows = _checked(Chunk(*entry["chunk"]), list(entry["rows"]), chunks, plan)
             except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 raise RecordingError(f"{self.path}: a line that no campaign writes ({error}): remove it") from error
             self.rows[chunk] = rows

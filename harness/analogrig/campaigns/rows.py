@@ -138,18 +138,13 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
     ``samples``, ``armed`` (samples in which the trigger was armed), ``false_alarms``, ``visible`` (detectable changes)
     and ``missed`` (of those).
     """
-    sound = valid(rows)
+    sound = list(filter(is_valid, rows))
     visible = [change for each in sound for change in changes(each) if change.bound_n is not None]
     return {
         **{name: sum(each[name] for each in sound) for name in ("samples", "armed", "false_alarms")},
         "visible": len(visible),
         "missed": sum(change.missed for change in visible),
     }
-
-
-def valid(rows: Sequence[Row]) -> list[Row]:
-    """Valid rows."""
-    return list(filter(is_valid, rows))
 
 
 def is_valid(row: Row) -> bool:
