@@ -259,8 +259,8 @@ class Steps:
         )
 
 
-class Bench:
-    """Makes images in a folder, and runs them."""
+class ImageRunner:
+    """Make images in a folder, and run them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -322,7 +322,7 @@ class Bench:
 
 def costs(folder: Path) -> Iterator[Cost]:
     """All costs; images are made in ``folder``."""
-    bench = Bench(folder)
+    bench = ImageRunner(folder)
     yield from instructions(bench)
     yield from soft_float(bench)
     for name, flags, limit in (
@@ -346,7 +346,7 @@ def device(steps: Steps) -> Iterator[Cost]:
     yield Cost(f"{steps.name}, an estimate of its time at {CLOCK_MHZ:g} MHz", round(estimate_us, 1), "us")
 
 
-def isolation(bench: Bench) -> Iterator[Cost]:
+def isolation(bench: ImageRunner) -> Iterator[Cost]:
     """Costs of isolation beside the core, on the M4F."""
     for steps in bench.isolation(M4F, LARGE):
         yield Cost(steps.name, steps.typical, "instructions")
@@ -356,7 +356,7 @@ def isolation(bench: Bench) -> Iterator[Cost]:
     yield Cost("M4F, state: sizeof(est_isolation_t)", bench.state_bytes("isolation", ISOLATES), "B")
 
 
-def instructions(bench: Bench) -> Iterator[Cost]:
+def instructions(bench: ImageRunner) -> Iterator[Cost]:
     """Costs in instructions, on the M4F."""
     rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
     for orders, at_run_time, at_compile_time in ((SMALL, 400, 260), (LARGE, 750, 520), (FREE, 750, 520)):
@@ -371,7 +371,7 @@ def instructions(bench: Bench) -> Iterator[Cost]:
         yield Cost(steps.name, steps.typical, "instructions")
 
 
-def soft_float(bench: Bench) -> Iterator[Cost]:
+def soft_float(bench: ImageRunner) -> Iterator[Cost]:
     """On processors without floating point: libgcc's routines, whose length depends on the numbers."""
     for processor in (M3, M0):
         rivals = [bench.textbook(processor, SMALL.count, factors=factors) for factors in (False, True)]
