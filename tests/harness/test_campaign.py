@@ -743,16 +743,6 @@ def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.
     assert "serial:/dev/absent is one device" in capsys.readouterr().err
 
 
-def test_another_build_of_a_library_is_another_campaign(tmp_path: Path) -> None:
-    library = tmp_path / "own.so"
-    library.write_bytes(LIBRARY.read_bytes())
-    spec = CampaignSpec(devices=(f"inproc:{library}",), trials=1, name="own")
-    before = Plan.of(spec).as_json()
-    assert Plan.of(spec).as_json() == before
-    library.write_bytes(LIBRARY.read_bytes() + b" ")
-    assert Plan.of(spec).as_json() != before
-
-
 @pytest.mark.parametrize("text", ["samples = 0", "samples = 2000000000"])
 def test_samples_that_cannot_be_are_refused_in_one_line(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from analogrig import config
 from analogrig.campaigns.plan import Cell, Plan
-from analogrig.campaigns.rows import RATES, Row, changes, check_row, counts, is_valid
+from analogrig.campaigns.rows import RATES, Row, changes, check_rows, counts, is_valid
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import PARAMETERS
 from analogrig.storage import replace_file
@@ -89,10 +89,7 @@ class Results:
             raise ValueError(f"{number_of(len(self.rows), 'cell')}, where the plan has {self.plan.size}")
         spec = self.plan.spec
         for rows in self.rows:
-            for row in rows:
-                check_row(row)
-            if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
-                raise ValueError("rows of other seeds than the plan has")
+            check_rows(rows, range(spec.first_seed, spec.first_seed + len(rows)))
             if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
                 raise ValueError(f"a cell of {number_of(len(rows), 'trial')}")
 
