@@ -16,7 +16,7 @@ from analogrig.identity import Identity
 from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
 from analogrig.storage import replace_file
-from analogrig.wording import number_of
+from analogrig.wording import counter_text, number_of
 
 _TEMPLATE = FOLDER / "campaign.html"
 
