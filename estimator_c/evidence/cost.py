@@ -259,8 +259,8 @@ class Steps:
         )
 
 
-class Images:
-    """Makes images in a folder, and runs them."""
+class ImageRunner:
+    """Make images in a folder, and run them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -322,20 +322,20 @@ class Images:
 
 def costs(folder: Path) -> Iterator[Cost]:
     """All costs; images are made in ``folder``."""
-    images = Images(folder)
-    yield from instructions(images)
-    yield from soft_float(images)
+    bench = ImageRunner(folder)
+    yield from instructions(bench)
+    yield from soft_float(bench)
     for name, flags, limit in (
         ("code of the core at -Os, everything", EVERYTHING, 4096),
         ("code of the core at -Os, trigger alone", TRIGGER_ALONE, 1536),
     ):
-        text_bytes = images.text_bytes(*flags)
+        text_bytes = bench.text_bytes(*flags)
         yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
-    state_bytes = images.state_bytes("estimator")
+    state_bytes = bench.state_bytes("estimator")
     yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
-    yield from isolation(images)
+    yield from isolation(bench)
     for processor in (M4F, M3):
-        yield from device(images.device(processor))
+        yield from device(bench.device(processor))
 
 
 def device(steps: Steps) -> Iterator[Cost]:
@@ -346,36 +346,36 @@ def device(steps: Steps) -> Iterator[Cost]:
     yield Cost(f"{steps.name}, an estimate of its time at {CLOCK_MHZ:g} MHz", round(estimate_us, 1), "us")
 
 
-def isolation(images: Images) -> Iterator[Cost]:
+def isolation(bench: ImageRunner) -> Iterator[Cost]:
     """Costs of isolation beside the core, on the M4F."""
-    for steps in images.isolation(M4F, LARGE):
+    for steps in bench.isolation(M4F, LARGE):
         yield Cost(steps.name, steps.typical, "instructions")
         yield Cost(f"{steps.name}, worst", max(steps.counts), "instructions")
-    text_bytes = images.text_bytes(*EVERYTHING, ISOLATES) - images.text_bytes(*EVERYTHING)
+    text_bytes = bench.text_bytes(*EVERYTHING, ISOLATES) - bench.text_bytes(*EVERYTHING)
     yield Cost("M4F, code of isolation at -Os, beside the core's", text_bytes, "B")
-    yield Cost("M4F, state: sizeof(est_isolation_t)", images.state_bytes("isolation", ISOLATES), "B")
+    yield Cost("M4F, state: sizeof(est_isolation_t)", bench.state_bytes("isolation", ISOLATES), "B")
 
 
-def instructions(images: Images) -> Iterator[Cost]:
+def instructions(bench: ImageRunner) -> Iterator[Cost]:
     """Costs in instructions, on the M4F."""
-    rivals = {n: [images.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
+    rivals = {n: [bench.textbook(M4F, n, factors=factors) for factors in (False, True)] for n in (4, 6)}
     for orders, at_run_time, at_compile_time in ((SMALL, 400, 260), (LARGE, 750, 520), (FREE, 750, 520)):
         rival = rivals[orders.count][1]
         for fixed, limit in ((False, at_run_time), (True, at_compile_time)):
-            yield from images.estimator(M4F, orders, fixed=fixed).costs(limit, rival)
+            yield from bench.estimator(M4F, orders, fixed=fixed).costs(limit, rival)
             if not orders.may_slip:
-                yield from images.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit, rival)
-    other = images.estimator(M4F, OTHER)
+                yield from bench.estimator(M4F, orders, fixed=fixed, alone=True).costs(limit, rival)
+    other = bench.estimator(M4F, OTHER)
     yield Cost(f"{other.name}, not one of the usual shapes", other.typical, "instructions")
     for steps in (*rivals[4], *rivals[6]):
         yield Cost(steps.name, steps.typical, "instructions")
 
 
-def soft_float(images: Images) -> Iterator[Cost]:
+def soft_float(bench: ImageRunner) -> Iterator[Cost]:
     """On processors without floating point: libgcc's routines, whose length depends on the numbers."""
     for processor in (M3, M0):
-        rivals = [images.textbook(processor, SMALL.count, factors=factors) for factors in (False, True)]
-        yield from images.estimator(processor, SMALL).costs(7000, rivals[1])
+        rivals = [bench.textbook(processor, SMALL.count, factors=factors) for factors in (False, True)]
+        yield from bench.estimator(processor, SMALL).costs(7000, rivals[1])
         for steps in rivals:
             yield Cost(steps.name, steps.typical, "instructions")
 

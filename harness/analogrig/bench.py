@@ -1,4 +1,4 @@
-"""Bench: joins a rig, a link and a device, and plays scenarios."""
+"""Bench: joins a rig and a device, and plays scenarios. The one route from a circuit to a Run."""
 
 from __future__ import annotations
 
@@ -10,24 +10,32 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeGuard
 
 import numpy as np
 
-from analogrig.devices.dut import Dut
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import Device
+from analogrig.devices.direct import DirectDevice
 from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
 from analogrig.links.wire import Clock
 from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis, Stretch
 from analogrig.protocol.pace import Pace
+from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
-from analogrig.run import CHANNELS, Conditions, Run, missing_samples
+from analogrig.run import CHANNELS, Conditions, Run
 from analogrig.scenario import Scenario
 
 Progress = Callable[[int, int], None]
 """Callback after each block, with the number of samples done and of samples asked."""
 
+_RETAINED_BYTES = 30_000_000
+"""Freed memory that the allocator keeps for the next play."""
+
 INTERRUPTED_BY_USER = "interrupted by the user"
 
-_FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
+DIRECT_BLOCK_SAMPLES = 16_384
+"""Block length in samples of a direct bench; such blocks fit in the cache."""
 
 
 class _RunBuilder:
@@ -134,15 +142,15 @@ def _pause_garbage_collection(pace: Pace | None) -> Iterator[None]:
 class Bench:
     """Rig and device, joined to play scenarios.
 
-    The device is configured and its handshake is done, as ``open_dut`` returns it. ``progress`` is called after each
-    block with the samples done and the samples asked. ``real_time`` is the wall-clock time per machine time; None:
-    lock-step, where no sample is late.
+    The device is one behind a link, configured and with its handshake done, as ``open_dut`` returns it; or one without
+    messages (``direct_bench``). ``progress`` is called after each block with the samples done and the samples asked.
+    ``real_time`` is the wall-clock time per machine time; None: lock-step, where no sample is late.
     """
 
     def __init__(
         self,
         rig: Rig,
-        dut: Dut,
+        dut: Device,
         progress: Progress | None = None,
         *,
         real_time: float | None = None,
@@ -160,6 +168,7 @@ class Bench:
         self._real_time = real_time
         self._time_limit_s = math.inf if time_limit_s is None else time_limit_s
         self._clock = clock
+        self._scenario: tuple[Scenario | None, Mapping[str, Any]] = (None, {})
 
     def play(self, scenario: Scenario, seed: int) -> Run:
         """Play ``scenario`` and collect the answers of the device, in lock-step or in real time.
@@ -186,6 +195,8 @@ class Bench:
 
     def _initial_conditions(self, performance: Performance, scenario: Scenario, seed: int) -> Conditions:
         """Conditions known before the first sample."""
+        if self._scenario[0] is not scenario:  # runs share the table, which takes long to write
+            self._scenario = scenario, scenario.as_table()
         return Conditions(
             seed=seed,
             samples_asked=scenario.samples,
@@ -193,7 +204,7 @@ class Bench:
             time_scale=performance.time_scale,
             channels=performance.channels,
             segments=(),
-            scenario=scenario.as_table(),
+            scenario=self._scenario[1],
             rig=self.rig.description(),
             dut=self.dut.description(),
             link=self.dut.link_name,
@@ -252,7 +263,9 @@ class Bench:
         return dataclasses.replace(
             initial,
             channels={
-                name: dataclasses.replace(channel, noise_lsb=known.noise_lsb.get(name, channel.noise_lsb))
+                name: dataclasses.replace(channel, noise_lsb=known.noise_lsb[name])
+                if name in known.noise_lsb
+                else channel
                 for name, channel in initial.channels.items()
             },
             segments=known.segments,
@@ -293,14 +306,32 @@ class Bench:
         def stretches() -> Iterator[Stretch]:
             for block in blocks:
                 sent.append(block)
-                yield (
-                    block.first - start,
-                    block.codes[:, _FORCE],
-                    block.codes[:, _DISPLACEMENT],
-                    missing_samples(block.clipped),
-                )
+                yield (block.first - start, *block.signals())
 
         for reply in self.dut.play(stretches()):
             builder.add(sent.popleft(), reply)
             if self._progress is not None:
                 self._progress(builder.samples, samples)
+
+
+def can_be_direct(rig: Rig, device: DeviceDescription) -> TypeGuard[EmulatorRig]:
+    """True if a direct bench yields the runs of the device over its line.
+
+    The rig must be emulated, and the line must not alter the samples.
+    """
+    return is_emulated(rig) and device.can_run_in_blocks
+
+
+def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> Bench:
+    """Bench with the estimator in this process and whole blocks: the fastest way.
+
+    If ``can_be_direct``, the runs are those over the line to the bit, without what ``DirectDevice`` lacks.
+
+    :param alarms_only: omit the estimates, which take half of the time: theta of the runs has no columns.
+    :raises ConfigurationError: the estimator refuses its configuration.
+    :raises LinkError: the library of the device was not built.
+    """
+    # glibc returns freed memory to the system beyond a threshold that grows with the largest block freed. Without this
+    # line every play would fault its pages in again, which takes a tenth of the time.
+    np.empty(_RETAINED_BYTES, np.uint8)
+    return Bench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), DirectDevice(device, alarms_only=alarms_only))

@@ -153,6 +153,13 @@ def _check_nesting(text: str) -> None:
             raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
 
 
+def plain(value: Any) -> Any:
+    """Plain values, of any depth, without the entries that are None; tuples become lists."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items() if item is not None}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
 def to_toml(table: Mapping[str, Any]) -> str:
     """Plain values as TOML that ``read_toml`` gives back: the scalars first, then the tables. None is left out."""
     return "\n".join(_toml_lines(table, ())) + "\n"

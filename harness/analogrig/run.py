@@ -106,8 +106,8 @@ class Channel:
 
 def missing_samples(clipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n,) bool from (n, 4) bool: samples whose force or displacement was clipped."""
-    used = [CHANNELS.index(name) for name in MEASURED]
-    return np.asarray(clipped[:, used].any(axis=1))
+    force, displacement = (clipped[:, CHANNELS.index(name)] for name in MEASURED)
+    return np.asarray(force | displacement)
 
 
 @dataclass(frozen=True)

@@ -210,7 +210,8 @@ class Scenario:
 
     def as_table(self) -> dict[str, Any]:
         """Plain TOML values, from which ``from_table`` builds an equal scenario."""
-        return _toml_table(dataclasses.asdict(self))
+        table: dict[str, Any] = config.plain(dataclasses.asdict(self))
+        return table
 
     def draw_excitation(self, rng: np.random.Generator) -> Excitation:
         """Excitation of one run, with a random phase if ``random_phase`` is set."""
@@ -252,14 +253,3 @@ def _check_parameters(change: PlantChoice | PotChange) -> None:
             limit = f"less than {MOST_PARAMETER:g}" if value > LEAST_PARAMETER else f"more than {LEAST_PARAMETER:g}"
             limit = limit if value > 0.0 else "more than 0"
             raise ValueError(f"{name} must be {limit}, not {value:g}")
-
-
-def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain TOML values of ``table``: tuples become lists, None values are left out."""
-    return {key: _toml_value(value) for key, value in table.items() if value is not None}
-
-
-def _toml_value(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return _toml_table(value)
-    return [_toml_value(item) for item in value] if isinstance(value, list | tuple) else value

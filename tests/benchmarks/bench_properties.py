@@ -14,7 +14,7 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from numpy.typing import NDArray
 
-from analogrig.campaigns.trials import Trials
+from analogrig.bench import Bench, direct_bench
 from analogrig.devices.registry import describe
 from analogrig.judging.information import detectable
 from analogrig.judging.statistics import upper_rate
@@ -45,22 +45,22 @@ EXAMPLES = profile("ci").max_examples
 def figures() -> Iterator[Figure]:
     """Probabilities of a false failure in a run of all tests."""
     yield from _latency()
-    clipped = _trials("emulator-0-10v")
+    clipped = _bench("emulator-0-10v")
     thesis = Scenario.load("thesis")
-    failed = sum(not Played(clipped.run(thesis, seed)).passes() for seed in range(10_000, 10_000 + PLAYS))
+    failed = sum(not Played(clipped.play(thesis, seed)).passes() for seed in range(10_000, 10_000 + PLAYS))
     yield _of_some_seed("missing samples", failed, PLAYS)
-    trials = _trials("emulator")
+    bench = _bench("emulator")
     patient = scenarios(expect=PATIENT)
-    found = _failures(patient, trials, Played.passes, lambda each: detectable(each, ARL0**MOST_INFORMATION))
+    found = _failures(patient, bench, Played.passes, lambda each: detectable(each, ARL0**MOST_INFORMATION))
     yield _of_some_seed("changes are found", *found)
     healthy = scenarios(most_changes=0)
-    yield _of_some_seed("estimates", *_failures(healthy, trials, lambda each: each.estimates(WITHIN), lambda _: True))
+    yield _of_some_seed("estimates", *_failures(healthy, bench, lambda each: each.estimates(WITHIN), lambda _: True))
 
 
-def _trials(name: str) -> Trials:
+def _bench(name: str) -> Bench:
     rig = open_rig(name)
     assert isinstance(rig, EmulatorRig)
-    return Trials(rig, describe("inproc"))
+    return direct_bench(rig, describe("inproc"))
 
 
 def _of_some_seed(name: str, failed: int, plays: int) -> Figure:
@@ -71,7 +71,7 @@ def _of_some_seed(name: str, failed: int, plays: int) -> Figure:
 
 def _failures(
     drawn: hypothesis.strategies.SearchStrategy[Scenario],
-    trials: Trials,
+    bench: Bench,
     statement: Callable[[Played], object],
     is_meant: Callable[[Scenario], bool],
 ) -> tuple[int, int]:
@@ -90,7 +90,7 @@ def _failures(
     @given(scenario=drawn, seed=seeds())
     def play(scenario: Scenario, seed: int) -> None:
         if is_playable(rig, scenario) and is_meant(scenario):
-            held.append(bool(statement(Played(trials.run(scenario, seed)))))
+            held.append(bool(statement(Played(bench.play(scenario, seed)))))
 
     play()
     return held.count(False), len(held)
@@ -98,8 +98,8 @@ def _failures(
 
 def _latency() -> Iterator[Figure]:
     """Ratio of latency to bound, and the probability to fail a sound device: Chernoff's bound, as the tail is long."""
-    trials, thesis = _trials("emulator"), Scenario.load("thesis")
-    latency_n, bound_n = np.array([_sums(Played(trials.run(thesis, 1000 + seed))) for seed in range(PLAYS)]).T
+    bench, thesis = _bench("emulator"), Scenario.load("thesis")
+    latency_n, bound_n = np.array([_sums(Played(bench.play(thesis, 1000 + seed))) for seed in range(PLAYS)]).T
     ratio = latency_n.sum() / bound_n.sum()
     error = np.std(latency_n - ratio * bound_n) / bound_n.mean() / np.sqrt(PLAYS_N)
     yield Figure(f"mean latency over mean bound, thesis, {PLAYS} plays", ratio, "")

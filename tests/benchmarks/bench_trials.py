@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
-from analogrig.campaigns.trials import Trials
+from analogrig.bench import direct_bench
 from analogrig.devices.registry import describe
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
@@ -39,9 +39,9 @@ def figures() -> Iterator[Figure]:
     """Rates in samples per second; seconds of the strictest certificate."""
     rig = open_rig("emulator")
     assert isinstance(rig, EmulatorRig)
-    trials = Trials(rig, describe("inproc"))
     for name, scenario, count in _cases():
-        for what, play in (("alarms alone", trials.alarms), ("whole run", trials.run)):
+        for what, alarms_only in (("alarms alone", True), ("whole run", False)):
+            play = direct_bench(rig, describe("inproc"), alarms_only=alarms_only).play
             yield Figure(f"trials, {name}: {what}", _rate(play, scenario, count), "samples/s of CPU time")
     alone, together = _processes(1), _processes(2)
     yield Figure("trials: two processes", together, "samples/s of CPU time", "one process", ratio=together / alone)
@@ -79,7 +79,7 @@ def rate_of_this_process() -> float:
     rig = open_rig("emulator")
     assert isinstance(rig, EmulatorRig)
     _, scenario, count = next(_cases())
-    return _rate(Trials(rig, describe("inproc")).alarms, scenario, count)
+    return _rate(direct_bench(rig, describe("inproc"), alarms_only=True).play, scenario, count)
 
 
 def _processes(count: int) -> float:

@@ -18,14 +18,14 @@ from pathlib import Path
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.campaigns import players
+from analogrig.campaigns import plays
 from analogrig.campaigns.conduct import Tally, conduct, journal_of
 from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Chunk, Plan, one_worker_only, rig_table
-from analogrig.campaigns.results import Results, Summary, text
+from analogrig.campaigns.plays import close_devices, play_chunk
+from analogrig.campaigns.results import Results, Summary
 from analogrig.campaigns.rows import row
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.campaigns.trial import close_devices, play_chunk
 from analogrig.campaigns.workers import MOST_DEATHS, Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.description import DeviceDescription
@@ -35,6 +35,7 @@ from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
 from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import judge
+from analogrig.reporting.campaign import text
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.run import Run
@@ -177,14 +178,14 @@ def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, refere
 
 def test_journal_goes_on_after_a_line_that_was_cut_off(tmp_path: Path) -> None:
     path, plan = tmp_path / "out.json.journal", planned(tmp_path)
-    rows = {chunk: play_chunk(plan.as_json(), chunk) for chunk in (Chunk((0, 0)), Chunk((0, 1)), Chunk((1, 0)))}
+    rows = {chunk: play_chunk(plan.as_json(), chunk) for chunk in (Chunk(0, 0), Chunk(0, 1), Chunk(1, 0))}
     with Journal(path, plan) as journal:
-        journal.add(Chunk((0, 0)), rows[Chunk((0, 0))])
-        journal.add(Chunk((0, 1)), rows[Chunk((0, 1))])
+        journal.add(Chunk(0, 0), rows[Chunk(0, 0)])
+        journal.add(Chunk(0, 1), rows[Chunk(0, 1)])
     path.write_bytes(path.read_bytes()[:-3])
     with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0)]
-        journal.add(Chunk((1, 0)), rows[Chunk((1, 0))])
+        journal.add(Chunk(1, 0), rows[Chunk(1, 0)])
     with Journal(path, plan) as journal:
         assert list(journal.rows) == [(0, 0), (1, 0)]
 
@@ -371,7 +372,7 @@ def test_cell_ends_when_it_is_certain_whatever_the_order(tmp_path: Path) -> None
     assert quick.missed == 0
     assert quick.miss_rate[1] < 0.5
     assert quick.trials < 20
-    tally = Tally(plan, 2)
+    tally = Tally(plan)
     for chunk in reversed(list(plan.chunks())):
         tally.add(chunk, play_chunk(plan.as_json(), chunk))
     assert tuple(map(tuple, tally.counted)) == results.rows
@@ -575,7 +576,7 @@ def test_device_of_several_cells_is_opened_once(tmp_path: Path, monkeypatch: pyt
         opened.append(description.name)
         return connect(description)
 
-    monkeypatch.setattr(players, "connect", connected)
+    monkeypatch.setattr(plays, "connect", connected)
     spec = "trials = 1\nsamples = 300\ndevices = ['host?exchange=block']\n[grid]\nnoise_lsb = [0.5, 1.0]\n"
     plan = planned(tmp_path, spec)
     for cell in range(2):
@@ -605,7 +606,7 @@ def test_campaign_does_not_go_on_with_another_build_of_its_device(
     spec = f"trials = 2\nsamples = 300\ndevices = ['inproc:{library}']\n"
     plan = planned(tmp_path, spec, [str(library)])
     with Journal(journal_of(out), plan) as journal:
-        journal.add(Chunk((0, 0)), play_chunk(plan.as_json(), (0, 0)))
+        journal.add(Chunk(0, 0), play_chunk(plan.as_json(), (0, 0)))
     kept = journal_of(out).read_bytes()
     library.unlink()  # as a linker does: it is still loaded
     library.write_bytes(LIBRARY.read_bytes())
@@ -740,16 +741,6 @@ def test_one_device_is_not_shared_by_two_workers(tmp_path: Path, capsys: pytest.
     options = ["--workers", "2", "--out", str(tmp_path / "out.json"), "--allow", "/dev/absent"]
     assert main(["campaign", str(tmp_path / "spec.toml"), *options]) == 2
     assert "serial:/dev/absent is one device" in capsys.readouterr().err
-
-
-def test_another_build_of_a_library_is_another_campaign(tmp_path: Path) -> None:
-    library = tmp_path / "own.so"
-    library.write_bytes(LIBRARY.read_bytes())
-    spec = CampaignSpec(devices=(f"inproc:{library}",), trials=1, name="own")
-    before = Plan.of(spec).as_json()
-    assert Plan.of(spec).as_json() == before
-    library.write_bytes(LIBRARY.read_bytes() + b" ")
-    assert Plan.of(spec).as_json() != before
 
 
 @pytest.mark.parametrize("text", ["samples = 0", "samples = 2000000000"])

@@ -10,10 +10,10 @@ import pytest
 from playwright.sync_api import Browser
 
 from analogrig.campaigns.plan import Plan
-from analogrig.campaigns.report import render, write_page
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import Row
 from analogrig.campaigns.spec import CampaignSpec, Grid
+from analogrig.reporting.campaign import render, write_page
 from tests.browser import Watched
 
 

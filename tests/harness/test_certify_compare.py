@@ -15,12 +15,11 @@ import pytest
 from scipy import stats
 
 from analogrig.bench import Bench
-from analogrig.campaigns.certificate import Certificate, Question, certify, question_of
-from analogrig.campaigns.comparison import Difference, _worded, compare, permutation_p, sign_flip_p
+from analogrig.campaigns.certificate import Certificate, Question, certify
+from analogrig.campaigns.comparison import Difference, adjust_by_holm, compare, load, match, permutation_p, sign_flip_p
 from analogrig.campaigns.plan import rig_table
+from analogrig.campaigns.plays import Count
 from analogrig.campaigns.rows import Row
-from analogrig.campaigns.sides import load, matched
-from analogrig.campaigns.trial import Count
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.dut import open_dut
@@ -33,7 +32,7 @@ from analogrig.scenario import PotChange, Scenario
 
 
 def asked(dut: str = "inproc", **settings: Any) -> Question:
-    return question_of(rig_table("emulator"), describe(dut).as_table(), Scenario.load("healthy"), **settings)
+    return Question(rig_table("emulator"), describe(dut).as_table(), Scenario.load("healthy"), **settings)
 
 
 def noisy_device(tmp_path: Path, arl0: float) -> str:
@@ -137,7 +136,7 @@ def test_run_that_is_not_valid_leaves_the_answer_open(tmp_path: Path) -> None:
 
 def test_scenario_with_changes_cannot_be_certified() -> None:
     with pytest.raises(ConfigurationError, match="certify: the scenario changes the plant"):
-        question_of(
+        Question(
             rig_table("emulator"), describe("inproc").as_table(), Scenario.load("thesis"), far=1e-5, confidence=0.9
         )
 
@@ -161,7 +160,7 @@ def test_samples_that_are_missing_make_a_run_within_this_process_as_invalid_as_e
     found = []
     for device in ("inproc", "host"):
         table = describe(device).as_table()
-        question = question_of(rig, table, Scenario.load("healthy"), far=5e-3, confidence=0.9, allowed=0)
+        question = Question(rig, table, Scenario.load("healthy"), far=5e-3, confidence=0.9, allowed=0)
         found.append(certify(question, ThisProcess()))
     assert found[0] == found[1]
     assert found[0].outcome == "inconclusive"
@@ -254,9 +253,9 @@ def test_change_that_one_side_missed_counts_for_the_latency_of_neither() -> None
 def test_probabilities_are_adjusted_as_holm_says() -> None:
     """The smallest times 4, the next times 3, ... and never less than the one before."""
     found = [Difference("x", "", 1.0, 2.0, 9, "", p, p, "worse") for p in (0.01, 0.04, 0.03, 0.005)]
-    adjusted = [each.adjusted_p for each in _worded(found, 0.025)]
+    adjusted = [each.adjusted_p for each in adjust_by_holm(found, 0.025)]
     assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert [each.word for each in _worded(found, 0.025)] == [*["no difference shown"] * 3, "worse"]
+    assert [each.word for each in adjust_by_holm(found, 0.025)] == [*["no difference shown"] * 3, "worse"]
 
 
 def test_cells_of_one_seed_are_one_observation() -> None:
@@ -425,7 +424,7 @@ def test_devices_of_two_campaigns_are_matched_by_their_names(tmp_path: Path, own
     keen, calm = own_devices
     a = campaign(tmp_path, "a", ("DEVICES", f"{keen!r}, {calm!r}"))
     b = campaign(tmp_path, "b", ("DEVICES", f"{calm!r}, {keen!r}"))
-    found = compare(*matched(load(Path(a)), load(Path(b))))
+    found = compare(*match(load(Path(a)), load(Path(b))))
     assert found.identical == (48, 48)
     assert not any(each.shown for each in found.differences)
 

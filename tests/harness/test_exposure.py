@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analogrig.bench import Bench
-from analogrig.campaigns.trials import Trials
+from analogrig.bench import Bench, direct_bench
 from analogrig.catalogue import SteppedFlag
 from analogrig.devices.dut import open_dut
 from analogrig.devices.registry import describe
@@ -90,7 +89,7 @@ def test_idle_samples_of_a_device_in_this_process_are_not_exposed() -> None:
     moved = np.maximum.accumulate(np.abs(force - force[0])) >= 64
     expected = int((innovations & warm & moved & ~idle).sum())
     assert exposure(run).armed == expected
-    within = Trials(rig, describe("inproc")).watched(scenario, 1).exposure
+    within = exposure(direct_bench(rig, describe("inproc"), alarms_only=True).play(scenario, 1))
     assert (within.armed, within.unexcited) == (expected, exposure(run).unexcited)
 
 

@@ -20,8 +20,8 @@ import pytest
 from analogrig.campaigns.conduct import journal_of
 from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
+from analogrig.campaigns.plays import play_chunk
 from analogrig.campaigns.spec import CampaignSpec
-from analogrig.campaigns.trial import play_chunk
 from analogrig.catalogue import Change
 from analogrig.cli import main
 from analogrig.errors import ConfigurationError, RecordingError

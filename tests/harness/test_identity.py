@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from analogrig import identity as identity_module
-from analogrig.campaigns.provenance import load
+from analogrig.campaigns.builds import load_commands
 from analogrig.cli import main
 from analogrig.config import fixtures
 from analogrig.devices.library import LIBRARY
@@ -199,7 +199,7 @@ def test_campaign_is_the_same_whoever_played_it_and_says_who(
     for name in ("one.json", "two.json"):
         assert main([*words, name]) in (0, 3)
         told = json.loads(capsys.readouterr().out)
-        sessions = load(Path(f"{name}.identity"))
+        sessions = load_commands(Path(f"{name}.identity"))
         assert told["played_by"] == [each.as_table() for each in sessions]
         assert len(sessions) == {"one.json": 2, "two.json": 1}[name]
         assert sessions[-1].command.endswith(name)

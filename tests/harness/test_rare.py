@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from analogrig.bench import direct_bench
 from analogrig.campaigns import rare
-from analogrig.campaigns.certificate import certify, estimate_once, question_of
+from analogrig.campaigns.certificate import Question, certify, estimate_once
 from analogrig.campaigns.plan import rig_table
 from analogrig.campaigns.rare import PLAY_N, false_alarm_rate
-from analogrig.campaigns.trials import Trials
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.description import DeviceDescription
@@ -54,8 +54,9 @@ def mean_rate(arl0: float, plays: int, branches: int) -> tuple[float, float]:
 def waited_for(arl0: float, plays: int) -> tuple[float, float]:
     """First alarms per sample of plays up to the first, with the standard error of a count."""
     first = device(arl0).estimator.warm_up_n + 16
-    trials, played = Trials(emulator(), device(arl0)), dataclasses.replace(HEALTHY, samples=first + PLAY_N)
-    alarms = [trials.alarms(played, seed) for seed in range(1000, 1000 + plays)]
+    bench = direct_bench(emulator(), device(arl0), alarms_only=True)
+    played = dataclasses.replace(HEALTHY, samples=first + PLAY_N)
+    alarms = [bench.play(played, seed).alarm_index for seed in range(1000, 1000 + plays)]
     ends = [int(each[each >= first][0]) + 1 if (each >= first).any() else played.samples for each in alarms]
     events, samples = sum(end < played.samples for end in ends), sum(end - first for end in ends)
     return events / samples, math.sqrt(events) / samples
@@ -90,7 +91,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rig_on_which_no_branch_comes_to_an_alarm_leaves_the_answer_open() -> None:
     """Without noise there is nothing to be louder; that is no proof of silence."""
     device, ideal = describe("inproc").as_table(), rig_table("emulator-ideal")
-    answer = certify(question_of(ideal, device, HEALTHY, far=1e-5, confidence=0.99, rare=64), ThisProcess())
+    answer = certify(Question(ideal, device, HEALTHY, far=1e-5, confidence=0.99, rare=64), ThisProcess())
     assert (answer.outcome, answer.alarms, answer.rate) == ("inconclusive", 0, (0.0, 1.0))
 
 
@@ -142,7 +143,7 @@ def test_bounds_of_the_mean_of_skewed_estimates_are_wrong_about_as_often_as_they
 
 
 def asked(dut: str = "inproc", **settings: Any) -> Any:
-    return question_of(rig_table("emulator"), describe(dut).as_table(), HEALTHY, **settings)
+    return Question(rig_table("emulator"), describe(dut).as_table(), HEALTHY, **settings)
 
 
 class Remembering(ThisProcess):
@@ -170,7 +171,7 @@ def test_rare_rate_certifies_refutes_or_stays_open() -> None:
 
 
 def test_estimates_do_not_depend_on_the_workers() -> None:
-    work = functools.partial(estimate_once, asked(far=1e-5, confidence=0.99, rare=64).as_json())
+    work = functools.partial(estimate_once, asked(far=1e-5, confidence=0.99, rare=64))
     assert dict(Processes(2).play(work, iter(range(4)))) == dict(ThisProcess().play(work, iter(range(4))))
 
 

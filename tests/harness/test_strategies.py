@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 
 from analogrig import config
-from analogrig.campaigns.trials import Trials
+from analogrig.bench import Bench, direct_bench
 from analogrig.devices.inproc import InprocDevice
 from analogrig.judging.information import detectable, predicted_bounds
 from analogrig.judging.verdict import judge
@@ -28,17 +28,17 @@ quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_heal
 
 
 @pytest.fixture(scope="module")
-def trials() -> Trials:
+def bench() -> Bench:
     rig = open_rig("emulator")
     assert isinstance(rig, EmulatorRig)
-    return Trials(rig, InprocDevice(name="inproc"))
+    return direct_bench(rig, InprocDevice(name="inproc"))
 
 
-def test_drawn_scenario_makes_a_valid_run_and_can_be_written_to_a_file(trials: Trials) -> None:
+def test_drawn_scenario_makes_a_valid_run_and_can_be_written_to_a_file(bench: Bench) -> None:
     @quick
     @given(scenario=scenarios(together=2), seed=seeds())
     def check(scenario: Scenario, seed: int) -> None:
-        assert judge(trials.run(scenario, seed)).valid
+        assert judge(bench.play(scenario, seed)).valid
         table = tomllib.loads(config.to_toml(scenario.as_table()))
         assert Scenario.from_table(table, "the file") == scenario
 
@@ -101,23 +101,23 @@ def test_change_of_nothing_that_shows_is_not_detectable() -> None:
     assert not detectable(dataclasses.replace(FALLS, samples=602), 1e300)
 
 
-def test_predicted_bound_is_that_of_the_run(trials: Trials) -> None:
+def test_predicted_bound_is_that_of_the_run(bench: Bench) -> None:
     (predicted,) = predicted_bounds(FALLS, 1e5)
-    (tweak,) = judge(trials.run(FALLS, 1)).tweaks
+    (tweak,) = judge(bench.play(FALLS, 1)).tweaks
     assert predicted is not None and tweak.bound_n is not None
     assert abs(predicted - tweak.bound_n) <= 1
 
 
-def test_played_says_what_it_shows_and_why(trials: Trials) -> None:
-    played = Played(trials.run(dataclasses.replace(FALLS, name="falls"), 1))
+def test_played_says_what_it_shows_and_why(bench: Bench) -> None:
+    played = Played(bench.play(dataclasses.replace(FALLS, name="falls"), 1))
     assert played.detects(within=6.0) and played.stays_quiet() and played.estimates(0.05) and played.isolates()
     late = played.detects(within=0.0)
     assert not late and "K at 600" in late.why and "allowed 1" in late.why
-    assert not Played(trials.run(dataclasses.replace(FALLS, tweaks=()), 1)).detects()
+    assert not Played(bench.play(dataclasses.replace(FALLS, tweaks=()), 1)).detects()
 
 
-def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(trials: Trials) -> None:
-    played = Played(trials.run(FALLS, 1))
+def test_estimate_follows_itself_within_a_tube_and_not_what_comes_later(bench: Bench) -> None:
+    played = Played(bench.play(FALLS, 1))
     theta = played.run.theta.astype(float)
     assert played.follows(theta, 0.0)
     shifted = theta.copy()

@@ -25,7 +25,7 @@ from tests.mutated.trial import MOST_CPU_S, MOST_MB, Case, Outcome, Running, beg
 
 _LOADED = (
     *("analogrig.bench", "analogrig.judging.verdict", "analogrig.reporting", "analogrig.reporting.summary"),
-    *("analogrig.campaigns.conduct", "analogrig.campaigns.report", "analogrig.rigs.description"),
+    *("analogrig.campaigns.conduct", "analogrig.reporting.campaign", "analogrig.rigs.description"),
     *("analogrig.hardware.self_test", "analogrig.recordings", "analogrig.links.python_can"),
     *("cantools", "asammdf"),
 )

@@ -11,17 +11,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from analogrig import config
+from analogrig.bench import can_be_direct
 from analogrig.campaigns.plan import Case, device_of, open_table
+from analogrig.campaigns.plays import Count, close_devices, count_alarms
 from analogrig.campaigns.rare import LEAD_IN_N, Estimate, false_alarm_rate
-from analogrig.campaigns.trial import Count, close_devices, count_alarms
-from analogrig.campaigns.trials import are_possible
 from analogrig.campaigns.workers import Workers
 from analogrig.errors import ConfigurationError
 from analogrig.judging.statistics import (
@@ -34,7 +32,6 @@ from analogrig.judging.statistics import (
     poisson_mean,
     upper_rate,
 )
-from analogrig.rigs.emulator import is_emulated
 from analogrig.scenario import Scenario
 from analogrig.wording import number_of
 
@@ -67,14 +64,18 @@ Answer = Literal["certified", "refuted", "inconclusive"]
 
 @dataclass(frozen=True)
 class Question:
-    """Test of the hypothesis that the false-alarm rate is below ``far`` per sample."""
+    """Test of the hypothesis that the false-alarm rate is below ``far`` per sample.
 
+    ConfigurationError: a setting is out of range, or the question cannot be answered.
+    """
+
+    rig: Any
+    """Rig as plain values, as ``open_table`` takes it."""
+    device: Any
+    """Device as plain values, as ``device_of`` takes it."""
+    scenario: Scenario
     far: float
     confidence: float
-    rig: Any
-    """Rig as plain values, as ``campaign.plan.open_table`` takes it."""
-    device: Any
-    scenario: Any
     first_seed: int = 0
     allowed: int = 5
     """Most alarms with which a test of fixed length certifies."""
@@ -83,54 +84,47 @@ class Question:
     """Number of estimates of a rare rate; None: count alarms as they occur."""
 
     def __post_init__(self) -> None:
+        problem = self._problem() or (self._length_problem() if self.rare is None else self._rare_problem(self.rare))
+        if problem:
+            raise ConfigurationError(f"certify: {problem}")
+
+    def _problem(self) -> str:
+        """Reason that the question cannot be answered; empty if it can."""
         if not 0.0 < self.far * APART < 1.0:
-            raise ValueError(f"far must be more than 0 and less than {1.0 / APART:g} per sample, not {self.far:g}")
+            return f"far must be more than 0 and less than {1.0 / APART:g} per sample, not {self.far:g}"
         if not 0.5 < self.confidence < 1.0:
-            raise ValueError(f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}")
+            return f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}"
         if not 0 <= self.allowed <= 1000:
-            raise ValueError(f"allowed must be 0 to 1000, not {self.allowed}")
+            return f"allowed must be 0 to 1000, not {self.allowed}"
         if self.device["estimator"]["trigger"] == "none":
-            raise ValueError("the device has no trigger: it raises no alarm, whatever comes")
-        if self.scenario.get("tweaks"):
-            raise ValueError("the scenario changes the plant, and this is about alarms while nothing changes")
-        if self.rare is None:
-            self._check_length()
-        else:
-            self._check_rare(self.rare)
+            return "the device has no trigger: it raises no alarm, whatever comes"
+        if self.scenario.tweaks:
+            return "the scenario changes the plant, and this is about alarms while nothing changes"
+        return ""
 
-    def _check_length(self) -> None:
-        """:raises ValueError: nobody would live to see the end."""
+    def _length_problem(self) -> str:
+        """Reason that nobody would live to see the end; empty if the test is short enough."""
         needed = poisson_mean(self.allowed, self.confidence) / self.far
-        if needed <= BENCH_YEAR_N:
-            return
+        if needed <= BENCH_YEAR_N or (self.is_in_process and needed <= IN_PROCESS_YEAR_N):
+            return ""
         year_n = IN_PROCESS_YEAR_N if self.is_in_process else BENCH_YEAR_N
-        if needed > year_n:
-            raise ValueError(
-                f"far = {self.far:g} takes {needed:.2g} samples, and in a year this device is played some {year_n:.0e}:"
-                " a rare rate is estimated instead (--rare)"
-            )
+        return (
+            f"far = {self.far:g} takes {needed:.2g} samples, and in a year this device is played some {year_n:.0e}:"
+            " a rare rate is estimated instead (--rare)"
+        )
 
-    def _check_rare(self, estimates: int) -> None:
-        """:raises ValueError: it cannot be estimated."""
+    def _rare_problem(self, estimates: int) -> str:
+        """Reason that the rare rate cannot be estimated; empty if it can."""
         if not LEAST_ESTIMATES <= estimates <= MOST_ESTIMATES:
-            raise ValueError(f"rare must be {LEAST_ESTIMATES} to {MOST_ESTIMATES} estimates, not {estimates}")
+            return f"rare must be {LEAST_ESTIMATES} to {MOST_ESTIMATES} estimates, not {estimates}"
         if self.sequential:
-            raise ValueError("a rare rate is estimated, or alarms are waited for by a sequential test")
-        drifts = self.scenario["excitation"].get("clock") == "free"
-        if drifts and self.device["estimator"]["edge_instants"] != "anywhere":
-            raise ValueError(
+            return "a rare rate is estimated, or alarms are waited for by a sequential test"
+        if self.scenario.excitation.clock == "free" and self.device["estimator"]["edge_instants"] != "anywhere":
+            return (
                 "of a generator on a clock of its own some instants of its edges are rare, and they are not drawn: wait"
                 ' for alarms, or set the device to edge_instants = "anywhere"'
             )
-
-    def as_json(self) -> str:
-        """Question as JSON text; equal questions give equal text."""
-        table = {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
-        return json.dumps(table, sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> Question:
-        return config.build(cls, json.loads(text), "the question")
+        return ""
 
     @property
     def useful_workers(self) -> int:
@@ -143,7 +137,7 @@ class Question:
     def is_in_process(self) -> bool:
         """True if the trials are played within this process, without a line."""
         with open_table(self.rig) as rig:
-            return are_possible(rig, device_of(self.device))
+            return can_be_direct(rig, device_of(self.device))
 
     @functools.cached_property
     def design_n(self) -> int:
@@ -161,9 +155,8 @@ class Certificate:
     """Number of alarms; for a rare rate, of branches that ended in one."""
     samples: int
     """Number of samples in which the trigger was armed; for a rare rate, of samples played."""
-    rate: tuple[float, float]
-    """One-sided bounds: exact for a fixed length, of a mean for a rare rate. (0, 1) for a sequential test, which
-    yields only its outcome."""
+    rate: tuple[float, float] = (0.0, 1.0)
+    """One-sided bounds: exact for a fixed length, of a mean for a rare rate. A sequential test yields none."""
 
 
 def certify(
@@ -177,10 +170,10 @@ def certify(
     :raises WorkerError, LinkError, DeviceError, RigError: they cannot be had or kept.
     """
     if question.rare is not None:
-        return _of_rare_alarms(question, question.rare, workers)
+        return _certify_rare(question, question.rare, workers)
     most = math.ceil(question.design_n * (MOST_LONGER if question.sequential else 1.0))
     run_n = _run_n(question, most)
-    work = functools.partial(count_run, question.as_json(), run_n)
+    work = functools.partial(count_run, question, run_n)
     alarms = samples = 0
     try:
         for count in _in_order(workers, work, question.first_seed):
@@ -188,7 +181,7 @@ def certify(
             if progress is not None:
                 progress(samples, most, alarms)
             if count.fault:
-                return Certificate("inconclusive", count.fault, alarms, samples, (0.0, 1.0))
+                return Certificate("inconclusive", count.fault, alarms, samples)
             answer = _sequential(question, alarms, samples) if question.sequential else None
             if samples >= most:
                 answer = answer or _at_the_end(question, alarms, samples)
@@ -199,41 +192,41 @@ def certify(
     raise AssertionError("seeds do not end")
 
 
-def count_run(question: str, run_n: int, seed: int) -> Count:
+def count_run(question: Question, run_n: int, seed: int) -> Count:
     """Alarms and exposure of one run."""
-    asked = Question.from_json(question)
-    scenario = dataclasses.replace(Scenario.from_table(asked.scenario, "the scenario"), samples=run_n)
-    return count_alarms(Case(asked.rig, asked.device, scenario, seed))
+    scenario = dataclasses.replace(question.scenario, samples=run_n)
+    return count_alarms(Case(question.rig, question.device, scenario, seed))
 
 
-def _of_rare_alarms(question: Question, count: int, workers: Workers) -> Certificate:
-    if not question.is_in_process:
-        name = question.device["name"]
-        raise ConfigurationError(f"certify: a rare rate is estimated within this process (inproc), not in {name}")
+def _certify_rare(question: Question, count: int, workers: Workers) -> Certificate:
     seeds = range(question.first_seed, question.first_seed + count)
-    found = dict(workers.play(functools.partial(estimate_once, question.as_json()), iter(seeds)))
-    estimates = [Estimate(*found[seed]) for seed in seeds]
+    found = dict(workers.play(functools.partial(estimate_once, question), iter(seeds)))
+    estimates = [found[seed] for seed in seeds]
     alarms, samples = sum(each.alarms for each in estimates), sum(each.samples for each in estimates)
-    fruitless = sum(not each.alarms for each in estimates)
-    if fruitless:
-        said = f"in {fruitless} of {number_of(len(estimates), 'estimate')} no branch came to an alarm"
-        return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
+    if fruitless := sum(not each.alarms for each in estimates):
+        reason = f"in {fruitless} of {number_of(count, 'estimate')} no branch came to an alarm"
+        return Certificate("inconclusive", reason, alarms, samples)
     rates = [each.rate for each in estimates]
     low, high = mean_bounds(rates, question.confidence)
-    said = f"the rate is {math.fsum(rates) / len(rates):.3g}, {low:.3g} to {high:.3g}"
-    said += f", from {number_of(len(rates), 'estimate')}, {number_of(samples, 'sample')}"
-    return Certificate(_answer(question.far, low, high), said, alarms, samples, (low, high))
+    reason = (
+        f"the rate is {math.fsum(rates) / count:.3g}, {low:.3g} to {high:.3g}, from {number_of(count, 'estimate')},"
+        f" {number_of(samples, 'sample')}"
+    )
+    return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high))
 
 
-def estimate_once(question: str, seed: int) -> tuple[float, int, int]:
-    """One estimate of a rare rate, as plain numbers."""
-    asked = Question.from_json(question)
-    with open_table(asked.rig) as rig:
-        if not is_emulated(rig):
-            raise ConfigurationError("certify: a rare rate is estimated on an emulated rig")
-        scenario = Scenario.from_table(asked.scenario, "the scenario")
-        rate, alarms, samples = false_alarm_rate(rig, device_of(asked.device), scenario, seed)
-        return rate, alarms, samples
+def estimate_once(question: Question, seed: int) -> Estimate:
+    """One estimate of a rare rate.
+
+    :raises ConfigurationError: the estimator does not run in this process; other errors as ``false_alarm_rate``.
+    """
+    device = device_of(question.device)
+    with open_table(question.rig) as rig:
+        if not can_be_direct(rig, device):
+            raise ConfigurationError(
+                f"certify: a rare rate is estimated within this process (inproc), not in {device.name}"
+            )
+        return false_alarm_rate(rig, device, question.scenario, seed)
 
 
 def _answer(far: float, low: float, high: float) -> Answer:
@@ -259,13 +252,14 @@ def _run_n(question: Question, most: int) -> int:
 
 
 def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:
+    """Outcome of the test of fixed length, or of a sequential one that has not decided."""
+    counted = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}"
     if question.sequential:
-        said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and still undecided"
-        return Certificate("inconclusive", said, alarms, samples, (0.0, 1.0))
+        return Certificate("inconclusive", f"{counted}, and still undecided", alarms, samples)
     low = lower_rate(alarms, samples, question.confidence)
     high = upper_rate(alarms, samples, question.confidence)
-    said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}: the rate is {low:.3g} to {high:.3g}"
-    return Certificate(_answer(question.far, low, high), said, alarms, samples, (low, high))
+    reason = f"{counted}: the rate is {low:.3g} to {high:.3g}"
+    return Certificate(_answer(question.far, low, high), reason, alarms, samples, (low, high))
 
 
 def _sequential(question: Question, alarms: int, samples: int) -> Certificate | None:
@@ -274,18 +268,8 @@ def _sequential(question: Question, alarms: int, samples: int) -> Certificate | 
     Wald's test certifies. A confidence sequence refutes; it eventually does so for any rate above the limit.
     """
     error, far = 1.0 - question.confidence, question.far
-    said = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and no more were needed"
-    better = SequentialTest(far / APART, far, error, error, trials=samples, events=alarms)
-    if better.decision is Decision.BELOW:
-        return Certificate("certified", said, alarms, samples, (0.0, 1.0))
+    reason = f"{number_of(alarms, 'alarm')} in {number_of(samples, 'sample')}, and no more were needed"
+    if SequentialTest(far / APART, far, error, error, trials=samples, events=alarms).decision is Decision.BELOW:
+        return Certificate("certified", reason, alarms, samples)
     known = ConfidenceSequence(question.confidence, far, trials=samples, events=alarms)
-    is_worse = known.decision(far) is Decision.ABOVE
-    return Certificate("refuted", said, alarms, samples, (0.0, 1.0)) if is_worse else None
-
-
-def question_of(rig: Any, device: Any, scenario: Scenario, **settings: Any) -> Question:
-    """:raises ConfigurationError: a setting is out of range."""
-    try:
-        return Question(rig=rig, device=device, scenario=scenario.as_table(), **settings)
-    except ValueError as error:
-        raise ConfigurationError(f"certify: {error}") from error
+    return Certificate("refuted", reason, alarms, samples) if known.decision(far) is Decision.ABOVE else None

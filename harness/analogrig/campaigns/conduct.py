@@ -8,73 +8,61 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from analogrig.campaigns.journal import Journal
-from analogrig.campaigns.plan import Chunk, Plan, device_as_planned
+from analogrig.campaigns.plan import Chunk, Plan, device_of
+from analogrig.campaigns.plays import close_devices, play_chunk
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import RATES, Row, counts
-from analogrig.campaigns.trial import close_devices, play_chunk
 from analogrig.campaigns.workers import Workers
 from analogrig.devices.dut import connect
 from analogrig.errors import DeviceError, LinkError
 from analogrig.judging.statistics import Decision
 
 
-@dataclass
 class Tally:
     """Chunks received so far, in any order, and the rows that count.
 
     In each cell, consecutive rounds without a gap count, up to the cell's end.
     """
 
-    plan: Plan
-    cells: int
-    came: dict[Chunk, list[Row]] = field(default_factory=dict)
-    counted: list[list[Row]] = field(init=False)
-    rounds: list[int] = field(init=False)
-    ended: list[bool] = field(init=False)
-    trials: int = 0
-    counts: list[dict[str, int]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.counted = [[] for _ in range(self.cells)]
-        self.rounds = [0] * self.cells
-        self.ended = [False] * self.cells
-        self.counts = [counts([]) for _ in range(self.cells)]
+    def __init__(self, plan: Plan) -> None:
+        self.came: dict[Chunk, list[Row]] = {}
+        self.counted: list[list[Row]] = [[] for _ in range(plan.size)]
+        self.ended = [False] * plan.size
+        self.trials = 0
+        self._stop = plan.spec.stop
+        self._rounds = [0] * plan.size
+        self._counts = [counts([]) for _ in range(plan.size)]
 
     def add(self, chunk: Chunk, rows: list[Row]) -> None:
         """Add the rows of a chunk, and count every round that is now without a gap."""
         self.came[chunk] = rows
         cell = chunk.cell
         while not self.ended[cell]:
-            following = self.came.get(Chunk((self.rounds[cell], cell)))
+            following = self.came.get(Chunk(self._rounds[cell], cell))
             if following is None:
                 return
             self._count(cell, following)
 
     def _count(self, cell: int, rows: list[Row]) -> None:
         self.counted[cell] += rows
-        self.rounds[cell] += 1
+        self._rounds[cell] += 1
         self.trials += len(rows)
         for name, count in counts(rows).items():
-            self.counts[cell][name] += count
-        stop = self.plan.spec.stop
-        if stop is not None:
-            known = RATES[stop.quantity].known(self.counts[cell], stop.confidence, stop.rate)
+            self._counts[cell][name] += count
+        if (stop := self._stop) is not None:
+            known = RATES[stop.quantity].known(self._counts[cell], stop.confidence, stop.rate)
             self.ended[cell] = known.decision(stop.rate) is not Decision.OPEN
 
     def total(self) -> dict[str, int]:
         """Total counts over all cells."""
-        return {name: sum(each[name] for each in self.counts) for name in counts([])}
+        return {name: sum(each[name] for each in self._counts) for name in counts([])}
 
 
-Progress = Callable[[Tally], None]
-
-
-def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None = None) -> Results:
+def conduct(plan: Plan, workers: Workers, out: Path, progress: Callable[[Tally], None] | None = None) -> Results:
     """Play the plan to ``out``. After any interruption, another call resumes it.
 
     :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
@@ -83,7 +71,7 @@ def conduct(plan: Plan, workers: Workers, out: Path, progress: Progress | None =
     """
     if out.exists():
         return Results.load(out).of_plan(plan, out)
-    tally = Tally(plan, len(plan.cells()))
+    tally = Tally(plan)
     with Journal(journal_of(out), plan) as journal:
         if out.exists():  # another one has ended meanwhile
             journal.remove()
@@ -113,7 +101,7 @@ def unreachable(plan: Plan) -> dict[str, str]:
     :raises ConfigurationError: a device refuses its configuration.
     """
     found = {}
-    for device in map(device_as_planned, plan.devices):
+    for device in map(device_of, plan.devices):
         try:
             if not device.is_in_process:
                 connect(device).close()

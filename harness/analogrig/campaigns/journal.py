@@ -12,11 +12,10 @@ import os
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from analogrig.campaigns.plan import Chunk, Plan
-from analogrig.campaigns.rows import Row, check_row
+from analogrig.campaigns.rows import Row, check_rows
 from analogrig.errors import ConfigurationError, RecordingError
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign-journal", 2
@@ -59,9 +58,7 @@ class Journal:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     @contextlib.contextmanager
@@ -108,13 +105,14 @@ class Journal:
 
     def _read(self, lines: Iterator[bytes], whole: int, plan: Plan) -> int:
         """Read all whole lines; return the number of bytes up to the end of the last one."""
-        chunks = set(plan.chunks())
+        seeds = {chunk: plan.seeds(chunk) for chunk in plan.chunks()}
         for line in lines:
             entry = _entry(line)
             if entry is None:
                 break
             try:
-                chunk, rows = _checked(Chunk(entry["chunk"]), list(entry["rows"]), chunks, plan)
+                chunk, rows = Chunk(*entry["chunk"]), list(entry["rows"])
+                check_rows(rows, seeds[chunk])
             except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 raise RecordingError(f"{self.path}: a line that no campaign writes ({error}): remove it") from error
             self.rows[chunk] = rows
@@ -125,18 +123,6 @@ class Journal:
         while line:
             line = line[self._file.write(line) :]
         os.fsync(self._file.fileno())
-
-
-def _checked(chunk: Chunk, rows: list[Row], chunks: set[Chunk], plan: Plan) -> tuple[Chunk, list[Row]]:
-    """:raises LookupError, TypeError, ValueError, AttributeError, OverflowError: the plan has no such chunk, or the
-    rows are not those of its trials."""
-    if chunk not in chunks:
-        raise ValueError(f"no chunk {list(chunk)} in the plan")
-    for row in rows:
-        check_row(row)
-    if [row["seed"] for row in rows] != list(plan.seeds(chunk)):
-        raise ValueError("rows of other seeds than the plan has")
-    return chunk, rows
 
 
 def _line(entry: dict[str, Any]) -> bytes:

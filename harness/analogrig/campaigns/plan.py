@@ -12,14 +12,13 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from analogrig import config
-from analogrig.campaigns import build
-from analogrig.campaigns.difference import differences, named
-from analogrig.campaigns.spec import AXES, MAX_CELLS, MAX_TRIALS, CampaignSpec
+from analogrig.campaigns import builds
+from analogrig.campaigns.spec import MAX_CELLS, MAX_TRIALS, CampaignSpec
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.registry import from_table, trusted
 from analogrig.errors import ConfigurationError
@@ -33,6 +32,11 @@ from analogrig.wording import number_of
 
 _DRAWS = 20_000
 """Random stream of the campaign's own draws, separate from the rig's streams of the same seed."""
+
+SHOWN, LONGEST = 3, 60
+"""Number of differences named in one line, and characters shown of each value."""
+
+_ABSENT = object()
 
 _CHANGES = {
     "mass_factor": "mass_kg",
@@ -62,21 +66,14 @@ class Case:
     seed: int
 
 
-class Chunk(tuple[int, int]):
-    """Pair (round, cell): the trials of one cell that a worker receives at a time."""
+class Chunk(NamedTuple):
+    """The trials of one cell that a worker receives at a time."""
 
-    __slots__ = ()
+    round: int
+    cell: int
 
     def __str__(self) -> str:
         return f"cell {self.cell}, round {self.round}"
-
-    @property
-    def round(self) -> int:
-        return self[0]
-
-    @property
-    def cell(self) -> int:
-        return self[1]
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class Plan:
             scenario=scenario.as_table(),
             rigs=tuple(rig_table(name, allow) for name in spec.rigs),
             devices=tuple(device_table(name, allow) for name in spec.devices),
-            analogrig=build.of_analogrig(),
+            analogrig=builds.of_analogrig(),
         )
         plan._check()
         return plan
@@ -130,7 +127,7 @@ class Plan:
     def as_table(self) -> dict[str, Any]:
         """Plan as plain values: everything that decides the results, and nothing else."""
         table = dataclasses.asdict(self)
-        table["spec"] = {key: _given(value) for key, value in table["spec"].items() if value is not None}
+        table["spec"] = {**config.plain(table["spec"]), "draw": config.plain(self.spec.draw.axes())}
         return table
 
     def as_json(self) -> str:
@@ -139,9 +136,8 @@ class Plan:
 
     def check_same(self, table: Any, where: str) -> None:
         """:raises ConfigurationError: the plan of that table, as JSON has it, is another; names what differs."""
-        found = list(differences(table, json.loads(self.as_json())))
-        if found:
-            raise ConfigurationError(f"{where} ({named(found, ('there', 'here'))}): choose another --out, or remove it")
+        if differences := list_differences(table, json.loads(self.as_json()), ("there", "here")):
+            raise ConfigurationError(f"{where} ({differences}): choose another --out, or remove it")
 
     def cells(self) -> list[Cell]:
         """Cells in the order of the results: rigs, devices, then the axes of the grid, the last one fastest."""
@@ -155,7 +151,7 @@ class Plan:
     def chunks(self) -> Iterator[Chunk]:
         """Yield the chunks round by round, so that all cells progress together."""
         rounds, cells = -(-self.spec.trials // self.spec.chunk), len(self.cells())
-        return (Chunk((number, cell)) for number in range(rounds) for cell in range(cells))
+        return (Chunk(number, cell) for number in range(rounds) for cell in range(cells))
 
     def seeds(self, chunk: Chunk) -> range:
         first = chunk.round * self.spec.chunk
@@ -166,7 +162,7 @@ class Plan:
     def drawn(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
         rng = np.random.default_rng([seed, _DRAWS])
-        return {axis: float(rng.uniform(*ends)) for axis, ends in self.spec.draw.axes().items()}
+        return {axis: float(rng.uniform(low, high)) for axis, (low, high) in self.spec.draw.axes().items()}
 
     def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
         """:raises ConfigurationError: the values make no scenario."""
@@ -174,7 +170,7 @@ class Plan:
         try:
             scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
         except ValueError as error:
-            raise ConfigurationError(f"{_said(values)}: {error}" if values else str(error)) from error
+            raise ConfigurationError(f"{_text(values)}: {error}" if values else str(error)) from error
         rig = dict(self.rigs[cell.rig])
         if "noise_lsb" in values:
             rig["card"] = {**rig["card"], "noise_lsb": values["noise_lsb"]}
@@ -203,8 +199,7 @@ class Plan:
         """Reason why such a trial cannot be set up on an emulated rig; empty if it can."""
         try:
             case = self.case(cell, self.spec.first_seed, drawn)
-            rig = open_table(case.rig) if "card" in case.rig else None
-            if rig is not None and is_emulated(rig):
+            if "card" in case.rig and is_emulated(rig := open_table(case.rig)):
                 rig.set_up(case.scenario, case.seed)
         except ConfigurationError as error:
             return str(error)
@@ -219,7 +214,7 @@ class Plan:
         if not opposite or self._problem(cell, opposite):
             return ""
         alone = ({axis: value} for axis, value in corner.items())
-        return f"draw: {_said(next((each for each in alone if self._problem(cell, opposite | each)), corner))}: "
+        return f"draw: {_text(next((each for each in alone if self._problem(cell, opposite | each)), corner))}: "
 
 
 def open_table(table: Mapping[str, Any]) -> Rig:
@@ -236,22 +231,18 @@ def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, A
     :raises ConfigurationError: there is none, or it is wrong, or what it runs cannot be read or is not allowed.
     """
     device = trusted(name, Trust.of(allow))
-    return {**device.as_table(), "build": build.of_device(device)}
+    return {**device.as_table(), "build": builds.of_device(device)}
 
 
 def device_of(table: Mapping[str, Any]) -> DeviceDescription:
-    """Device of such a table; its current build is not checked."""
-    return from_table({key: value for key, value in table.items() if key != "build"}, f"device {table['name']}")
-
-
-def device_as_planned(table: Mapping[str, Any]) -> DeviceDescription:
     """Device of such a table, after a check of its build if the table names one.
 
-    :raises ConfigurationError: it is another by now.
+    :raises ConfigurationError: it is another build by now.
     """
-    device = device_of(table)
+    described = {key: value for key, value in table.items() if key != "build"}
+    device = from_table(described, f"device {table['name']}")
     if "build" in table:
-        build.check_device(device, table["build"])
+        builds.check_device(device, table["build"])
     return device
 
 
@@ -261,9 +252,9 @@ def one_worker_only(*tables: Mapping[str, Any]) -> str:
 
 
 def _only_one(table: Mapping[str, Any]) -> str:
-    if table.get("kind") == "real":
-        return str(table["name"])
-    return "" if "card" in table else device_of(table).only_one
+    if "estimator" in table:
+        return device_of(table).only_one
+    return "" if "card" in table else str(table["name"])
 
 
 def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
@@ -276,12 +267,12 @@ def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]
             raise ConfigurationError(
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
             )
-        described = _given(rig.description())
+        described = config.plain(rig.description())
         return described if is_emulated(rig) else {"name": name, "kind": "real", "described": described}
 
 
 def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:
-    start: dict[str, Any] = {axis: values[axis] for axis in AXES[:3] if axis in values}
+    start: dict[str, Any] = {axis: value for axis, value in values.items() if axis in _CHANGES.values()}
     plant = dataclasses.replace(base.plant, **start)
     before = vars(plant.plant())
     changed = {_CHANGES[axis]: factor * before[_CHANGES[axis]] for axis, factor in values.items() if axis in _CHANGES}
@@ -289,12 +280,32 @@ def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -
     return dataclasses.replace(base, plant=plant, tweaks=tweaks)
 
 
-def _given(value: Any) -> Any:
-    """Plain values without the entries that are None."""
-    if isinstance(value, Mapping):
-        return {key: _given(item) for key, item in value.items() if item is not None}
-    return [_given(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _said(values: Mapping[str, float]) -> str:
+def _text(values: Mapping[str, float]) -> str:
     return ", ".join(f"{axis} = {value:g}" for axis, value in values.items())
+
+
+def list_differences(a: Any, b: Any, sides: tuple[str, str]) -> str:
+    """First few values that differ between two tables of plain values, as part of a line; empty if they are equal.
+
+    :param sides: words for the places of ``a`` and ``b``.
+    """
+    found = list(_differences(a, b))
+    more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    return ", ".join(f"{name} is {a} {sides[0]} and {b} {sides[1]}" for name, a, b in found[:SHOWN]) + more
+
+
+def _differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield each value that differs: its dotted name and both values."""
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        for key in sorted(a.keys() | b.keys()):
+            yield from _differences(a.get(key, _ABSENT), b.get(key, _ABSENT), f"{name}.{key}" if name else key)
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
+        for i, (mine, other) in enumerate(zip(a, b, strict=True)):
+            yield from _differences(mine, other, f"{name}[{i}]")
+    elif a != b:
+        yield name, _shown(a), _shown(b)
+
+
+def _shown(value: Any) -> str:
+    text = "absent" if value is _ABSENT else repr(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -1,19 +1,14 @@
 """Rate of rare false alarms, by importance sampling: branches off a play with louder noise, weighted by likelihood.
 
-Between two false alarms the trigger's statistic returns to the ground, 0, many times. Every alarm ends one climb from
-there. The rate of alarms is therefore a mean over the samples of a play: the probability that the statistic is on the
-ground and climbs to an alarm without returning. Branches estimate that probability. They start from states of the play
-with the statistic on the ground, drawn uniformly. Each continues up to an alarm or back to the ground. Its displacement
-has noise of its own, a few times as strong as the card's. A branch that ends in an alarm is weighted by the likelihood
-ratio of its noise, the card's against the louder ones. The mean is unbiased for any loudness (importance sampling;
-Siegmund, Annals of Statistics 4, 1976, for sequential tests). With twice the noise the ratio of
-likelihoods is nearly the statistic itself, a CUSUM of "the variance has grown fourfold": all weights are about
-exp(-ceiling), and the mean of few branches is good, however rare the alarms are. A mixture of LOUDER keeps single
-weights from being large (the balance heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000).
-Plays of other seeds give the bounds of the mean: ``statistics.mean_bounds``.
-
-Splitting by levels of the statistic is unbiased too, but unsuitable: one outlier lifts the statistic by many levels at
-once, and a play of some thousand samples rarely has one (harness/docs/background/campaigns.md).
+The rate is a mean over the samples of a play: the probability that the trigger's statistic is on the ground, 0, and
+climbs to an alarm without returning. Branches estimate it. They start from states of the play with the statistic on the
+ground, drawn uniformly, and continue up to an alarm or back to the ground. Their displacement has noise of its own, a
+few times as strong as the card's. A branch that ends in an alarm is weighted by the likelihood ratio of its noise. The
+mean is unbiased for any loudness (importance sampling; Siegmund, Annals of Statistics 4, 1976, for sequential tests).
+With twice the noise the likelihood ratio is nearly the statistic itself: all weights are about exp(-ceiling), and few
+branches suffice, however rare the alarms are. A mixture of LOUDER keeps single weights from being large (the balance
+heuristic of Veach and Guibas, SIGGRAPH 1995; Owen and Zhou, JASA 95, 2000). Plays of other seeds give the bounds of the
+mean: ``statistics.mean_bounds``. Why not splitting: harness/docs/decisions/024-importance-sampling.md.
 """
 
 from __future__ import annotations
@@ -25,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.campaigns.trials import entered, flags_of
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.estimator import Estimator
 from analogrig.errors import ConfigurationError, DeviceError
@@ -98,17 +92,17 @@ def false_alarm_rate(
     Valid for rates well below 1 / PLAY_N: a play ends with its first alarm.
 
     :param scenario: one without changes; its number of samples does not matter.
-    :raises ConfigurationError: the trigger has no ground to come back to; or as Trials.
+    :raises ConfigurationError: the trigger has no ground to come back to; or as Rig.perform.
     :raises DeviceError: the statistic neither comes to an alarm nor back, or the device was not excited.
     :raises LinkError: the library was not built.
     """
-    settings = dataclasses.replace(device.estimator, force_zero=rig.force_zero)
-    if settings.trigger != "cusum":
-        raise ConfigurationError(f"rare rates are found for the trigger cusum, not {settings.trigger} of {device.name}")
-    estimator = Estimator(settings, library=device.estimator_library)
-    first = settings.warm_up_n + LEAD_IN_N
+    trigger, first = device.estimator.trigger, device.estimator.warm_up_n + LEAD_IN_N
+    if trigger != "cusum":
+        raise ConfigurationError(f"rare rates are found for the trigger cusum, not {trigger} of {device.name}")
     played = dataclasses.replace(scenario, samples=first + PLAY_N + TAIL_N)
-    performance = rig.perform(played, seed, block_samples=played.samples)
+    performance = rig.in_blocks(played.samples).perform(played, seed)
+    settings = dataclasses.replace(device.estimator, force_zero=performance.channels["force"].zero)
+    estimator = Estimator(settings, library=device.estimator_library)
     return _Climbs(rig, settings, estimator, performance, np.random.default_rng([seed, _BRANCHES])).estimate(
         first, branches
     )
@@ -129,6 +123,7 @@ class _Climbs:
         self._settings = settings
         self._estimator = estimator
         (self._play,) = performance.blocks
+        self._signals = _entered(self._play)
         self._noise_lsb = performance.channels["force"].noise_lsb
         self._rng = rng
         self._samples = 0
@@ -152,11 +147,10 @@ class _Climbs:
         searched."""
         end = first + PLAY_N
         self._estimator.restart()
-        steps = self._estimator.run(*(signal[:end] for signal in entered(self._play)))
+        steps = self._estimator.run(*(signal[:end] for signal in self._signals), with_theta=False)
         self._samples += end
         numbers = np.isfinite(steps.innovation) & np.isfinite(steps.statistic)
-        force = self._play.codes[:end, CHANNELS.index("force")]
-        heard = ObservedRecord(force, flags_of(steps.status), numbers, steps.alarms)
+        heard = ObservedRecord(self._signals[0][:end], steps.flags, numbers, steps.alarms)
         if fault := record_exposure(heard, self._settings.as_table(), self._noise_lsb).lack_of_evidence:
             raise DeviceError(fault)
         alarms = steps.alarms[steps.alarms >= first]
@@ -165,11 +159,10 @@ class _Climbs:
 
     def _kept_at(self, samples: NDArray[np.intp]) -> NDArray[np.uint8]:
         """Saved states of the estimator after each of these samples, which must be in rising order."""
-        signals = entered(self._play)
         kept, before = [], 0
         self._estimator.restart()
         for after in (samples + 1).tolist():
-            self._estimator.alarms(*(signal[before:after] for signal in signals))
+            self._estimator.run(*(signal[before:after] for signal in self._signals), with_theta=False)
             kept.append(self._estimator.save())
             before = after
         self._samples += before
@@ -205,8 +198,14 @@ class _Climbs:
         normals = self._rng.standard_normal((*index.shape, len(CHANNELS)))
         normals[:, :, _DISPLACEMENT] *= going.louder[:, None]
         codes, clipped = self._rig.sampler(self._rng).sample(volts, normals.reshape(volts.shape))
-        signals = entered(Block(0, volts, codes, clipped))
+        signals = _entered(Block(0, volts, codes, clipped))
         return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, _DISPLACEMENT]
+
+
+def _entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """Estimator inputs of one block: force, displacement, and True for each sample that is not missing; (n,) each."""
+    force, displacement, missing = block.signals()
+    return force, displacement, ~missing
 
 
 def _first_true(found: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -1,21 +1,20 @@
-"""Results of a campaign: one JSON file without dates, and its tables."""
+"""Results of a campaign: one JSON file without dates, and their summary."""
 
 from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from analogrig import config
 from analogrig.campaigns.plan import Cell, Plan
-from analogrig.campaigns.rows import RATES, Row, changes, check_row, counts, is_valid, valid
+from analogrig.campaigns.rows import RATES, Row, changes, check_rows, counts, is_valid
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.plant import PARAMETERS
 from analogrig.storage import replace_file
-from analogrig.wording import counter_text, number_of
+from analogrig.wording import number_of
 
 FORMAT, FORMAT_VERSION = "analogrig-campaign", 2
 
@@ -90,10 +89,7 @@ class Results:
             raise ValueError(f"{number_of(len(self.rows), 'cell')}, where the plan has {self.plan.size}")
         spec = self.plan.spec
         for rows in self.rows:
-            for row in rows:
-                check_row(row)
-            if [row["seed"] for row in rows] != [spec.first_seed + i for i in range(len(rows))]:
-                raise ValueError("rows of other seeds than the plan has")
+            check_rows(rows, range(spec.first_seed, spec.first_seed + len(rows)))
             if not (1 if spec.stop else spec.trials) <= len(rows) <= spec.trials:
                 raise ValueError(f"a cell of {number_of(len(rows), 'trial')}")
 
@@ -128,11 +124,10 @@ class Summary:
 
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Summary:
-        counted, sound = counts(rows), valid(rows)
+        counted, sound = counts(rows), list(filter(is_valid, rows))
         found = [change for each in sound for change in changes(each)]
-        noticed = [change for change in found if change.latency_n is not None]
-        latencies = sorted(change.latency_n for change in noticed if change.latency_n is not None)
-        bounds = [change.bound_n for change in noticed if change.bound_n is not None]
+        latencies = sorted(change.latency_n for change in found if change.latency_n is not None)
+        bounds = [each.bound_n for each in found if each.latency_n is not None and each.bound_n is not None]
         errors = [each["errors"] for each in sound if each["errors"]]
         rates = {name: rate.known(counted, CONFIDENCE).bounds for name, rate in RATES.items()}
         return cls(
@@ -154,98 +149,3 @@ class Summary:
             },
             doubt=next((f"seed {each['seed']}: {each.get('why', '')}" for each in rows if not is_valid(each)), ""),
         )
-
-
-def label(plan: Plan, cell: Cell) -> dict[str, str]:
-    """Labels that identify a cell: rig and device where there are several, and the values of the grid."""
-    out = {}
-    if len(plan.rigs) > 1:
-        out["rig"] = str(plan.rigs[cell.rig]["name"])
-    if len(plan.devices) > 1:
-        out["device"] = str(plan.devices[cell.device]["name"])
-    return out | {axis: f"{value:g}" for axis, value in cell.values.items()}
-
-
-def anytime_text(counted: Mapping[str, int]) -> str:
-    """Rates of the events that ``rows.counts`` counts, with bounds, in one line."""
-    parts = []
-    for name, rate in RATES.items():
-        if counted[rate.exposure]:
-            below = rate.known(counted, CONFIDENCE).bounds[1]
-            events, exposure = counter_text(counted[name], name), counter_text(counted[rate.exposure], rate.unit)
-            parts.append(f"{events} in {exposure} (rate below {below:.2g})")
-    return ", ".join(parts)
-
-
-@dataclass(frozen=True)
-class Column:
-    """Column of the tables."""
-
-    title: str
-    short: str
-    """Title where there is little room."""
-    form: str
-    of: Callable[[Summary], float | None]
-
-    def cell(self, summary: Summary, absent: str) -> str:
-        value = self.of(summary)
-        return absent if value is None else format(value, self.form)
-
-
-COLUMNS = (
-    Column("trials", "trials", ",", lambda summary: summary.trials),
-    Column("failed", "failed", ",", lambda summary: summary.failed),
-    Column("inconclusive", "inconcl.", ",", lambda summary: summary.inconclusive),
-    Column("missed", "missed", ",", lambda summary: summary.missed),
-    Column("visible", "of", ",", lambda summary: summary.visible),
-    Column("miss rate at most", "at most", ".2g", lambda summary: summary.miss_rate[1] if summary.visible else None),
-    Column("false alarms", "false al.", ",", lambda summary: summary.false_alarms),
-    Column(
-        "per sample at most",
-        "rate below",
-        ".2g",
-        lambda summary: summary.false_alarm_rate[1] if summary.armed else None,
-    ),
-    Column("latency", "latency", ".1f", lambda summary: summary.latency_n),
-    Column("95th percentile", "p95", ".1f", lambda summary: summary.latency_p95_n),
-    Column("bound", "bound", ".1f", lambda summary: summary.bound_n),
-)
-
-
-def text(results: Results) -> str:
-    """Results as several lines of text, without a final newline."""
-    spec, total = results.plan.spec, results.total()
-    cells = results.cells()
-    labels = [label(results.plan, cell) for cell, _ in cells]
-    names = list(labels[0]) if len(cells) > 1 else []
-    counts = ((len(cells), "cell"), (total.trials, "trial"), (total.samples, "sample"))
-    head = f"campaign {spec.name}: {', '.join(number_of(*each) for each in counts)}: "
-    rows = [[*names, *(column.short for column in COLUMNS)]]
-    rows += [
-        [*(each[name] for name in names), *_numbers(summary)] for each, (_, summary) in zip(labels, cells, strict=True)
-    ]
-    if len(cells) > 1:
-        rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
-    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
-    if total.inconclusive:
-        notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.doubt}")
-    return "\n".join(
-        [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
-    )
-
-
-def as_json(results: Results) -> dict[str, Any]:
-    """Results as plain values; rates as [low, high]."""
-    cells = [{**label(results.plan, cell), **vars(summary)} for cell, summary in results.cells()]
-    return {
-        "campaign": results.plan.spec.name,
-        "outcome": results.outcome(),
-        "total": vars(results.total()),
-        "cells": cells,
-    }
-
-
-def _numbers(summary: Summary) -> list[str]:
-    return [column.cell(summary, "-") for column in COLUMNS]

@@ -79,8 +79,19 @@ def _errors(verdict: Verdict) -> list[float]:
     return found if all(map(math.isfinite, found)) else []
 
 
-def check_row(row: Any) -> None:
-    """:raises ValueError, TypeError, KeyError, AttributeError: it is not one of ``row``."""
+def check_rows(rows: Sequence[Any], seeds: range) -> None:
+    """Check rows from a file.
+
+    :raises ValueError, TypeError, LookupError, AttributeError, OverflowError: one is not of ``row``, or they are of
+        other seeds.
+    """
+    for each in rows:
+        _check_row(each)
+    if [each["seed"] for each in rows] != list(seeds):
+        raise ValueError("rows of other seeds than the plan has")
+
+
+def _check_row(row: Any) -> None:
     if row["outcome"] not in ("passed", "failed", "inconclusive"):
         raise ValueError("a row without an outcome")
     rising = [row[name] for name in ("false_alarms", "armed", "samples")]
@@ -138,18 +149,13 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
     ``samples``, ``armed`` (samples in which the trigger was armed), ``false_alarms``, ``visible`` (detectable changes)
     and ``missed`` (of those).
     """
-    sound = valid(rows)
+    sound = list(filter(is_valid, rows))
     visible = [change for each in sound for change in changes(each) if change.bound_n is not None]
     return {
         **{name: sum(each[name] for each in sound) for name in ("samples", "armed", "false_alarms")},
         "visible": len(visible),
         "missed": sum(change.missed for change in visible),
     }
-
-
-def valid(rows: Sequence[Row]) -> list[Row]:
-    """Valid rows."""
-    return list(filter(is_valid, rows))
 
 
 def is_valid(row: Row) -> bool:

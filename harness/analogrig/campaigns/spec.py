@@ -13,17 +13,10 @@ from analogrig.trust import resolve_name
 
 MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
-AXES = (
-    *("mass_kg", "damping_n_s_per_m", "stiffness_n_per_m"),
-    *("mass_factor", "damping_factor", "stiffness_factor"),
-    "noise_lsb",
-)
-"""Axes that can be varied: plant at the start, factors at the change, rms noise of the card."""
-
 
 @dataclass(frozen=True)
-class Grid:
-    """The ``[grid]`` table: every combination of these values is a cell."""
+class _Axes:
+    """What can be varied: plant at the start, factors at the change, rms noise of the card."""
 
     mass_kg: tuple[float, ...] = ()
     damping_n_s_per_m: tuple[float, ...] = ()
@@ -33,36 +26,29 @@ class Grid:
     stiffness_factor: tuple[float, ...] = ()
     noise_lsb: tuple[float, ...] = ()
 
-    def __post_init__(self) -> None:
-        for axis, values in vars(self).items():
-            if len(set(values)) != len(values):
-                raise ValueError(f"{axis} has a value twice")
-
     def axes(self) -> dict[str, tuple[float, ...]]:
         """Axes that are given, with their values."""
         return {axis: values for axis, values in vars(self).items() if values}
 
 
 @dataclass(frozen=True)
-class Draw:
-    """The ``[draw]`` table: values drawn for each trial from its seed, uniformly between the ends."""
+class Grid(_Axes):
+    """The ``[grid]`` table: every combination of these values is a cell."""
 
-    mass_kg: tuple[float, float] | None = None
-    damping_n_s_per_m: tuple[float, float] | None = None
-    stiffness_n_per_m: tuple[float, float] | None = None
-    mass_factor: tuple[float, float] | None = None
-    damping_factor: tuple[float, float] | None = None
-    stiffness_factor: tuple[float, float] | None = None
-    noise_lsb: tuple[float, float] | None = None
+    def __post_init__(self) -> None:
+        for axis, values in self.axes().items():
+            if len(set(values)) != len(values):
+                raise ValueError(f"{axis} has a value twice")
+
+
+@dataclass(frozen=True)
+class Draw(_Axes):
+    """The ``[draw]`` table: values drawn for each trial from its seed, uniformly between the ends (low, high)."""
 
     def __post_init__(self) -> None:
         for axis, ends in self.axes().items():
-            if not ends[0] < ends[1]:
-                raise ValueError(f"{axis} must be (low, high), not ({ends[0]:g}, {ends[1]:g})")
-
-    def axes(self) -> dict[str, tuple[float, float]]:
-        """Axes that are given, with both ends."""
-        return {axis: ends for axis, ends in vars(self).items() if ends is not None}
+            if len(ends) != 2 or not ends[0] < ends[1]:
+                raise ValueError(f"{axis} must be (low, high), not ({', '.join(f'{end:g}' for end in ends)})")
 
     def corners(self) -> tuple[dict[str, float], ...]:
         """Low ends of all axes, and high ends of all axes.

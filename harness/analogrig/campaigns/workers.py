@@ -1,7 +1,8 @@
 """Workers that play the chunks of a campaign: this process, processes of this machine, or a cluster of Dask.
 
-Each takes tasks when it has capacity, and yields results in any order. Only the tasks in flight on a killed worker are
-given to another. A task that has killed ``MOST_DEATHS`` workers ends the campaign.
+Each takes tasks when it has capacity, and yields results in any order. Processes and cluster are executors of
+concurrent.futures. Only the tasks in flight on a killed worker are given to another. A task that has killed
+``MOST_DEATHS`` workers ends the campaign.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import resource
 import signal
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -27,7 +29,7 @@ from analogrig.wording import number_of
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_LOADED = ("analogrig.campaigns.trial", "analogrig.campaigns.certificate")
+_LOADED = ("analogrig.campaigns.plays", "analogrig.campaigns.certificate")
 """Modules that every worker needs. The fork server loads them once, while this process reads its arguments."""
 
 MOST_DEATHS = 3
@@ -96,7 +98,52 @@ class ThisProcess:
             yield task, work(task)
 
 
-class Processes:
+class _Executors(ABC):
+    """Workers behind executors of concurrent.futures."""
+
+    _broken: type[Exception] = BrokenProcessPool
+    """Error of a task whose worker has died."""
+    _most_deaths = MOST_DEATHS
+    _complaint = f"{number_of(MOST_DEATHS, 'worker')} died over it, one after the other"
+
+    def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
+        busy: dict[Future[Result], tuple[int, Task, int]] = {}
+        try:
+            free = list(range(self._start()))
+            while True:
+                while free and (task := next(tasks, None)) is not None:
+                    slot = free.pop()
+                    busy[self._submit(slot, work, task)] = (slot, task, 0)
+                if not busy:
+                    return
+                for future in wait(busy, return_when=FIRST_COMPLETED).done:
+                    slot, task, deaths = busy.pop(future)
+                    try:
+                        result = future.result()
+                    except self._broken as error:
+                        if deaths + 1 >= self._most_deaths:
+                            raise WorkerError(f"{task}: {self._complaint}") from error
+                        busy[self._submit(slot, work, task)] = (slot, task, deaths + 1)
+                        continue
+                    free.append(slot)
+                    yield task, result
+        finally:
+            self._end()
+
+    @abstractmethod
+    def _start(self) -> int:
+        """Prepare for the first task; return the number of slots, which are the tasks in flight."""
+
+    @abstractmethod
+    def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
+        """Start a task in a slot."""
+
+    @abstractmethod
+    def _end(self) -> None:
+        """End all tasks at once, even in the middle of one."""
+
+
+class Processes(_Executors):
     """Worker processes of this machine, each in a pool of its own, so that the end of one does not affect the
     others."""
 
@@ -105,100 +152,75 @@ class Processes:
             raise ConfigurationError(f"there must be at least one worker, not {count}")
         _check_descriptors(count)
         self._count = count
+        self._pools: list[ProcessPoolExecutor] = []
 
-    def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
+    def _start(self) -> int:
         prepare()
-        pools = [_pool() for _ in range(self._count)]
-        busy: dict[Future[Result], tuple[int, Task, int]] = {}
+        self._pools = [_pool() for _ in range(self._count)]
+        return self._count
+
+    def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:
         try:
-            free = list(range(self._count))
-            while True:
-                while free and (task := next(tasks, None)) is not None:
-                    number = free.pop()
-                    busy[_submit(pools, number, work, task)] = (number, task, 0)
-                if not busy:
-                    return
-                for future in wait(busy, return_when=FIRST_COMPLETED).done:
-                    number, task, deaths = busy.pop(future)
-                    try:
-                        result = future.result()
-                    except BrokenProcessPool as error:
-                        _check_deaths(task, deaths + 1, error)
-                        busy[_submit(pools, number, work, task)] = (number, task, deaths + 1)
-                        continue
-                    free.append(number)
-                    yield task, result
-        finally:
-            for pool in pools:
-                _end(pool)
+            return self._pools[slot].submit(work, task)
+        except BrokenProcessPool:  # its worker has died while it had no task
+            self._pools[slot].shutdown(wait=False)
+            self._pools[slot] = _pool()
+            return self._pools[slot].submit(work, task)
+
+    def _end(self) -> None:
+        for pool in self._pools:
+            for process in list((getattr(pool, "_processes", None) or {}).values()):
+                with contextlib.suppress(OSError, ValueError):
+                    process.kill()
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
-class Dask:
+class Dask(_Executors):
     """Workers of a Dask cluster, by the address of its scheduler, such as ``tcp://host:8786``."""
+
+    _most_deaths = 1  # the scheduler has tried several by then
+    _complaint = "the cluster lost every worker that tried it"
 
     def __init__(self, address: str) -> None:
         """:raises ConfigurationError: Dask is not installed.
         :raises WorkerError: nobody answers there.
         """
         try:
-            self._dask: Any = importlib.import_module("distributed")  # it ships no complete annotations
+            dask: Any = importlib.import_module("distributed")  # it ships no complete annotations
         except ImportError as error:
             raise ConfigurationError("--cluster needs Dask: pip install 'analogrig[cluster]'") from error
         for name in _TALKATIVE:
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        self._address = address
+        self._address, self._broken = address, dask.KilledWorker
         try:
-            self._client = self._dask.Client(address, timeout=_ANSWER_S)
+            self._client = dask.Client(address, timeout=_ANSWER_S)
         except (OSError, ValueError) as error:
             raise WorkerError(f"--cluster {address}: no scheduler answers ({error})") from error
 
     def play(self, work: Callable[[Task], Result], tasks: Iterator[Task]) -> Iterator[tuple[Task, Result]]:
-        sent: dict[Any, Task] = {}
-
-        def send() -> Any:
-            task = next(tasks, None)
-            if task is None:
-                return None
-            future = self._client.submit(work, task, pure=False)
-            sent[future] = task
-            return future
-
-        hands = sum(self._client.nthreads().values()) * _IN_HAND
-        if not hands:
-            raise WorkerError(f"--cluster {self._address}: the scheduler has no workers")
-        completed = self._dask.as_completed([future for future in (send() for _ in range(hands)) if future is not None])
         try:
-            for future in completed:
-                task = sent.pop(future)
-                try:
-                    result = future.result()
-                except self._dask.KilledWorker as error:
-                    raise WorkerError(f"{task}: the cluster lost every worker that tried it") from error
-                another = send()
-                if another is not None:
-                    completed.add(another)
-                yield task, result
+            yield from super().play(work, tasks)
         except (OSError, CancelledError) as error:  # Dask cancels the futures of a client that has lost its scheduler
             raise WorkerError(f"--cluster {self._address}: the connection to the scheduler is lost") from error
-        finally:
-            with contextlib.suppress(OSError, CancelledError):
-                self._client.cancel(list(sent))
+
+    def _start(self) -> int:
+        slots: int = sum(self._client.nthreads().values()) * _IN_HAND
+        if not slots:
+            raise WorkerError(f"--cluster {self._address}: the scheduler has no workers")
+        self._executor = self._client.get_executor(pure=False)
+        return slots
+
+    def _submit(self, slot: int, work: Callable[[Task], Result], task: Task) -> Future[Result]:  # noqa: ARG002
+        future: Future[Result] = self._executor.submit(work, task)
+        return future
+
+    def _end(self) -> None:
+        with contextlib.suppress(OSError, CancelledError, AttributeError):
+            self._executor.shutdown(wait=False)
 
     def close(self) -> None:
         with contextlib.suppress(OSError, CancelledError):
             self._client.close()
-
-
-def _submit(
-    pools: list[ProcessPoolExecutor], number: int, work: Callable[[Task], Result], task: Task
-) -> Future[Result]:
-    """Submit a task to the pool of that number; replace the pool first if its worker has died, even while idle."""
-    try:
-        return pools[number].submit(work, task)
-    except BrokenProcessPool:
-        pools[number].shutdown(wait=False)
-        pools[number] = _pool()
-        return pools[number].submit(work, task)
 
 
 def _pool() -> ProcessPoolExecutor:
@@ -216,16 +238,3 @@ def _begin() -> None:
 def _end_with(sentinel: int) -> None:
     connection.wait([sentinel])
     os._exit(1)
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    """End the worker of a pool at once, even in the middle of a task."""
-    for process in list((getattr(pool, "_processes", None) or {}).values()):
-        with contextlib.suppress(OSError, ValueError):
-            process.kill()
-    pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _check_deaths(task: object, deaths: int, error: Exception) -> None:
-    if deaths >= MOST_DEATHS:
-        raise WorkerError(f"{task}: {number_of(deaths, 'worker')} died over it, one after the other") from error

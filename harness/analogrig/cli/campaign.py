@@ -66,14 +66,13 @@ def begin(arguments: argparse.Namespace) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
+    from analogrig.campaigns.builds import commands_of, load_commands
     from analogrig.campaigns.conduct import conduct, journal_of, unreachable
     from analogrig.campaigns.plan import Plan, one_worker_only
-    from analogrig.campaigns.provenance import load, provenance_of
-    from analogrig.campaigns.report import page_of, write_page
-    from analogrig.campaigns.results import as_json, text
     from analogrig.campaigns.spec import CampaignSpec
     from analogrig.errors import WorkerError
     from analogrig.output import move_aside
+    from analogrig.reporting.campaign import as_json, page_of, text, write_page
 
     plan = Plan.of(CampaignSpec.load(arguments.spec), trust_of(arguments))
     out = arguments.out or Path("build/campaign") / f"{plan.spec.name}.json"
@@ -94,7 +93,7 @@ def _run(arguments: argparse.Namespace) -> int:
         return complain(f"interrupted: {kept}", INTERRUPTED)
     except WorkerError as error:
         return complain(f"INCONCLUSIVE: {error}; {kept}", INCONCLUSIVE)
-    played_by = load(provenance_of(out))
+    played_by = load_commands(commands_of(out))
     write_page(results, page, played_by)
     if arguments.json:
         places = {"results": str(out), "page": str(page)}
@@ -106,15 +105,16 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _note_session(plan: Plan, out: Path, arguments: argparse.Namespace) -> None:
     """Keep the identity of this command beside the results that it will play a part of, if they lack any."""
+    from analogrig.campaigns.builds import commands_of, load_commands, save_commands
     from analogrig.campaigns.conduct import journal_of
-    from analogrig.campaigns.provenance import device_files, load, provenance_of, save
+    from analogrig.campaigns.plan import device_of
     from analogrig.identity import Identity
 
     if out.exists():
         return
-    earlier = load(provenance_of(out)) if journal_of(out).exists() else ()
-    identity = Identity.here(arguments.command_line, arguments.started, device_files(plan.devices))
-    save(provenance_of(out), (*earlier, identity))
+    earlier = load_commands(commands_of(out)) if journal_of(out).exists() else ()
+    files = [file for device in plan.devices for file in device_of(device).files()]
+    save_commands(commands_of(out), (*earlier, Identity.here(arguments.command_line, arguments.started, files)))
 
 
 @contextlib.contextmanager
@@ -147,7 +147,7 @@ def progress(plan: Plan) -> Callable[[Tally], None] | None:
     line = open_progress_line()
     if line is None:
         return None
-    from analogrig.campaigns.results import anytime_text
+    from analogrig.reporting.campaign import anytime_text
 
     most = len(plan.cells()) * plan.spec.trials
 

@@ -70,14 +70,13 @@ def add(commands: Any) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     begin(arguments)
-    from analogrig.campaigns.certificate import certify, question_of
-    from analogrig.campaigns.plan import device_table, one_worker_only, rig_table
-    from analogrig.campaigns.provenance import device_files
+    from analogrig.campaigns.certificate import Question, certify
+    from analogrig.campaigns.plan import device_of, device_table, one_worker_only, rig_table
     from analogrig.errors import DeviceError, LinkError, RigError, WorkerError
     from analogrig.scenario import Scenario
 
     trust = trust_of(arguments)
-    question = question_of(
+    question = Question(
         rig_table(arguments.rig, trust),
         device_table(arguments.dut, trust),
         Scenario.load(arguments.scenario),
@@ -94,7 +93,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)
     if arguments.json:
-        show_result(_as_json(question, answer), arguments, device_files([question.device]))
+        show_result(_as_json(question, answer), arguments, device_of(question.device).files())
     else:
         show(_sentence(question, answer))
     return _STATUS[answer.outcome]
@@ -113,7 +112,7 @@ def _as_json(question: Question, answer: Certificate) -> dict[str, Any]:
     asked = {
         name: getattr(question, name) for name in ("far", "confidence", "allowed", "sequential", "rare", "first_seed")
     }
-    names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario["name"]}
+    names = {"rig": question.rig["name"], "dut": question.device["name"], "scenario": question.scenario.name}
     return {**names, **asked, **vars(answer)}
 
 

@@ -43,11 +43,10 @@ def _probability(text: str) -> float:
 def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from analogrig.campaigns.comparison import PAIRED, compare
-    from analogrig.campaigns.sides import load, matched
+    from analogrig.campaigns.comparison import PAIRED, compare, load, match
 
     with show_work(f"comparing {arguments.a} and {arguments.b}"):
-        found = compare(*matched(load(arguments.a), load(arguments.b)), arguments.alpha)
+        found = compare(*match(load(arguments.a), load(arguments.b)), arguments.alpha)
     if arguments.json:
         show_result(asdict(found), arguments)
     else:

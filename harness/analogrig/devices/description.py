@@ -14,6 +14,7 @@ from analogrig import config
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.identity import DeviceFile
 from analogrig.links.line import CanLine, SerialLine
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
@@ -130,6 +131,10 @@ class DeviceDescription:
     def program(self) -> Path | None:
         """File with the device's code on this machine; None for a device elsewhere."""
         return None
+
+    def files(self) -> tuple[DeviceFile, ...]:
+        """Library, program or firmware that the device runs on this machine, if any."""
+        return () if self.program is None else (DeviceFile.of(self.name, self.program),)
 
     @property
     def estimator_library(self) -> Path:

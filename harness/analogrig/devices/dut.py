@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from analogrig.catalogue import (
     Status,
 )
 from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import Device
 from analogrig.devices.registry import recorded, trusted
 from analogrig.errors import (
     CatalogueMismatch,
@@ -45,7 +46,6 @@ from analogrig.errors import (
     LinkTimeout,
 )
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.exchange import Exchange, Packing, Replies, Stretch, most_answers
@@ -70,7 +70,7 @@ class DeviceIdentity:
     """Number of blocks of samples that fit in its input buffer."""
 
 
-class Dut:
+class Dut(Device):
     """Device under test behind a link: configured by ``configure``, fed by ``Bench.play``, a context manager.
 
     Methods raise LinkError if the link fails or the device does not answer in time, and DeviceError for a wrong answer.
@@ -79,7 +79,7 @@ class Dut:
 
     def __init__(self, link: Link, description: DeviceDescription) -> None:
         """Take over ``link``. Nothing is sent yet."""
-        self._description = description
+        super().__init__(description)
         self._talk = Conversation(link, description.name, description.timeout_s)
         self._identity: DeviceIdentity | None = None
         self._run = secrets.randbelow(RUNS)
@@ -87,10 +87,6 @@ class Dut:
         self._exchange: Exchange | None = None
         self._counted: Mapping[str, int] = {}
         self._line_s = 0.0
-
-    @property
-    def name(self) -> str:
-        return self._description.name
 
     @property
     def link_name(self) -> str:
@@ -120,34 +116,12 @@ class Dut:
         """
         self._talk.limit_s = self._talk.clock() + left_s
 
-    @property
-    def estimator(self) -> EstimatorConfig:
-        """Configuration of its estimator."""
-        return self._description.estimator
-
-    @property
-    def parameters(self) -> int:
-        """Number of elements of theta."""
-        return self._description.estimator.parameters
-
     def description(self) -> Mapping[str, Any]:
         """Description and identity in plain values, for the record."""
         table = self._description.as_table()
         return table if self._identity is None else {**table, "identity": dataclasses.asdict(self._identity)}
 
-    def files(self) -> tuple[DeviceFile, ...]:
-        """Library, program or firmware that the device runs on this machine, if any."""
-        program = self._description.program
-        return () if program is None else (DeviceFile.of(self.name, program),)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def close(self) -> None:
-        """Release the device, and end it if it was started for this."""
         self._talk.link.close()
 
     # ---------------------------------------------------------------------------------------- before and after the run
@@ -196,10 +170,6 @@ class Dut:
                     f"device {self.name}: {key.name.lower()} = {value:g} was not applied:"
                     f" {_word(Result, answer.result)}, it has {answer.value:g}"
                 )
-
-    def set_force_zero(self, code: float) -> None:
-        """Set the code that means zero force; errors as ``configure``."""
-        self.configure(dataclasses.replace(self._description.estimator, force_zero=code))
 
     def pace(self, period_s: float) -> Pace:
         """Pace of a run in real time, with a sample every ``period_s`` on the link's clock.

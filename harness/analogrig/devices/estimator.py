@@ -7,11 +7,11 @@ import enum
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analogrig.catalogue import SteppedFlag
 from analogrig.devices.library import LIBRARY, load_library
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
@@ -26,12 +26,16 @@ class StepStatus(enum.IntEnum):
     GATHERING = 3
 
 
+_FLAGS = bytes((0, SteppedFlag.MISSING, SteppedFlag.REFUSED, SteppedFlag.GATHERING)).ljust(256, b"\0")
+"""Flags of a Run by StepStatus, as a table of bytes: to look them up in an array takes several times as long."""
+
+
 @dataclass(frozen=True, eq=False)
 class EstimatorOutput:
     """Output of the estimator for n samples."""
 
     theta: NDArray[np.float32]
-    """(n, p) after each sample."""
+    """(n, p) after each sample; (n, 0) if it was not asked for."""
     innovation: NDArray[np.float32]
     """(n,) codes; 0 where there was no equation."""
     statistic: NDArray[np.float32]
@@ -40,6 +44,14 @@ class EstimatorOutput:
     """(n,) StepStatus."""
     alarms: NDArray[np.int64]
     """Indices of the samples with an alarm."""
+
+    @property
+    def flags(self) -> NDArray[np.uint8]:
+        """(n,): flags of a Run for each status."""
+        return np.frombuffer(self.status.tobytes().translate(_FLAGS), np.uint8)
+
+
+_NO_ALARMS = np.empty(0, np.int64)
 
 
 class _Out(ctypes.Structure):
@@ -106,40 +118,31 @@ class Estimator:
         counters = self._c.library_counters(self._state)
         return {name: int(getattr(counters, name)) for name in _COUNTERS}
 
-    def run(self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None) -> EstimatorOutput:
+    def run(
+        self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, *, with_theta: bool = True
+    ) -> EstimatorOutput:
         """Estimator output for n samples.
 
         :param u: (n,) codes of force.
         :param y: (n,) codes of displacement.
         :param valid: (n,) false where the sample is missing.
-        """
-        n = np.size(u)
-        filled: dict[str, NDArray[Any]] = {
-            "theta": np.empty((n, self.parameters), np.float32),
-            "innovation": np.empty(n, np.float32),
-            "statistic": np.empty(n, np.float32),
-            "status": np.empty(n, np.uint8),
-        }
-        return EstimatorOutput(**filled, alarms=self.alarms(u, y, valid, **filled))
-
-    def alarms(
-        self, u: ArrayLike, y: ArrayLike, valid: ArrayLike | None = None, **filled: NDArray[Any]
-    ) -> NDArray[np.int64]:
-        """Indices of the samples with an alarm; several times as fast as ``run``.
-
-        :param filled: arrays of the names, shapes and dtypes of ``EstimatorOutput`` to be filled as well.
+        :param with_theta: False: omit theta, which takes half of the time.
         :raises ValueError: u, y and valid differ in length.
         """
+        n = np.size(u)
         inputs: list[NDArray[np.float32]] = [np.ascontiguousarray(x, dtype=np.float32) for x in (u, y)]
         mask = None if valid is None else np.ascontiguousarray(valid, dtype=np.uint8)
         shapes = {x.shape for x in inputs} | (set() if mask is None else {mask.shape})
         if len(shapes) != 1 or inputs[0].ndim != 1:
             raise ValueError("u, y and valid must be one-dimensional and of one length")
-        n, alarm = len(inputs[0]), np.empty(len(inputs[0]), np.uint8)
-        out = _Out(alarm=alarm.ctypes.data, **{name: array.ctypes.data for name, array in filled.items()})
+        theta = np.empty((n, self.parameters if with_theta else 0), np.float32)
+        innovation, statistic = np.empty(n, np.float32), np.empty(n, np.float32)
+        status, alarm = np.empty(n, np.uint8), np.empty(n, np.uint8)
+        arrays = (theta, innovation, statistic, status, alarm)
+        out = _Out(*(array.ctypes.data if array.size else None for array in arrays))
         valid_at = None if mask is None else mask.ctypes.data
         alarms_n = self._c.library_run(self._state, n, *(x.ctypes.data for x in inputs), valid_at, ctypes.byref(out))
-        return np.flatnonzero(alarm) if alarms_n else np.empty(0, np.int64)
+        return EstimatorOutput(theta, innovation, statistic, status, np.flatnonzero(alarm) if alarms_n else _NO_ALARMS)
 
     def save(self) -> NDArray[np.uint8]:
         """State after the last sample, for ``branch`` of the same object; (size,)."""

@@ -26,7 +26,7 @@ _QUANTISATION_LSB = 12.0**-0.5
 
 _FORCE = CHANNELS.index("force")
 
-_NOT_PROCESSED = SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST
+_NOT_PROCESSED = np.uint8(SteppedFlag.MISSING | SteppedFlag.REFUSED | LOST)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,8 @@ def record_exposure(record: ObservedRecord, estimator: Mapping[str, Any], noise_
     armed[record.alarms] = True
     non_finite = ~record.are_finite
     non_finite[record.alarms] = False  # an alarm is the required response to a non-finite estimate
-    return Exposure(len(armed), int(armed.sum()), int((~excited).sum()), int(non_finite.sum()), estimator)
+    armed_n, unexcited_n, non_finite_n = (int(np.count_nonzero(each)) for each in (armed, ~excited, non_finite))
+    return Exposure(len(armed), armed_n, unexcited_n, non_finite_n, estimator)
 
 
 def _excitation_mask(

@@ -33,6 +33,8 @@ from analogrig.wording import number_of
 LARGEST_LEVEL = 700.0
 """Largest argument of exp() whose result is finite."""
 
+_NOT_PROCESSED = np.uint8(LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)
+
 Outcome = Literal["passed", "failed", "inconclusive"]
 
 Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not judged"]
@@ -205,7 +207,7 @@ def judge(run: Run) -> Verdict:
     trigger = run.conditions.dut["estimator"]
     level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
     results = _evaluate_hypotheses(run, expect, level)
-    invalid = _invalid_reasons(run, expect)
+    invalid = invalid_reasons(run, exposure(run), expect)
     outcome, reasons = _decide_outcome(results, expect)
     certain = set(results[0].false_alarms).intersection(*(each.false_alarms for each in results))
     possible = {index for each in results for index in each.false_alarms}
@@ -218,7 +220,7 @@ def judge(run: Run) -> Verdict:
         estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
         arl0=math.exp(min(level, LARGEST_LEVEL)),
         ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
-        missing_n=int(run.missing.sum()),
+        missing_n=int(np.count_nonzero(run.missing)),
         theta_hash=run.theta_hash(),
         overloads=dict(run.conditions.overloads),
     )
@@ -415,40 +417,30 @@ def _alarms_of_change(alarms: Sequence[int], ramp_end: int) -> set[int]:
     return {index for index in alarms if index <= ramp_end} | set(after_ramp[:1])
 
 
-def _invalid_reasons(run: Run, expect: Expectations) -> list[str]:
-    """Reasons that the run permits no verdict; empty if it is valid."""
+def invalid_reasons(run: Run, shown: Exposure, expect: Expectations) -> list[str]:
+    """Reasons that a run with the exposure ``shown`` permits no verdict; empty if it is valid."""
     reasons = list(run.conditions.faults)
     if run.samples < run.conditions.samples_asked:
         reasons.append(f"the run ended after {run.samples} of {number_of(run.conditions.samples_asked, 'sample')}")
     reasons += _loss_reasons(run)
-    refused, missing = run.conditions.counters.get("refused", 0), int(run.missing.sum())
-    return reasons + evidence_gaps(exposure(run), expect, refused=refused, missing=missing, words=missing_text(run))
-
-
-def evidence_gaps(
-    shown: Exposure, expect: Expectations, *, refused: int, missing: int, words: str = MISSING
-) -> list[str]:
-    """Reasons that the device's answers prove nothing; empty if they count as evidence.
-
-    :param refused: number of samples that the device refused.
-    :param missing: number of missing samples; ``words`` is their predicate in the message.
-    """
-    refusals = [f"the device refused {number_of(refused, 'sample')}"] if refused else []
-    unarmed = [shown.lack_of_evidence] if shown.lack_of_evidence else []
-    return [*refusals, *expect.excess_missing(shown.samples, missing, words), *unarmed]
+    refused = run.conditions.counters.get("refused", 0)
+    reasons += [f"the device refused {number_of(refused, 'sample')}"] if refused else []
+    reasons += expect.excess_missing(run.samples, int(np.count_nonzero(run.missing)), missing_text(run))
+    return reasons + ([shown.lack_of_evidence] if shown.lack_of_evidence else [])
 
 
 def _loss_reasons(run: Run) -> list[str]:
     """Reasons for invalidity from lost samples: too many, or counts of device and harness that disagree."""
-    most, lost = int(run.conditions.dut.get("most_lost_n", 0)), int(run.lost.sum())
+    is_lost, most = run.lost, int(run.conditions.dut.get("most_lost_n", 0))
+    lost = int(np.count_nonzero(is_lost))
     where = "not or only in part in the log" if is_captured(run) else "lost on the way to the device"
     reasons = [f"{number_of(lost, 'sample was', 'samples were')} {where}, more than {most}"] if lost > most else []
-    after_n = int(np.argmin(run.lost[::-1])) if lost < run.samples else run.samples
+    after_n = int(np.argmin(is_lost[::-1])) if lost < run.samples else run.samples
     known = lost - after_n  # the device cannot count samples lost after the last one it received
     missed = run.conditions.counters.get("samples_lost", known)
     if missed != known:
         reasons.append(f"the device counted {number_of(missed, 'lost sample')}, the harness {known}")
-    answered = int(((run.flags & (LOST | SteppedFlag.MISSING | SteppedFlag.REFUSED)) == 0).sum())
+    answered = run.samples - int(np.count_nonzero(run.flags & _NOT_PROCESSED))
     updated = run.conditions.counters.get("updated", answered)
     if updated != answered:
         reasons.append(f"the device counted {number_of(updated, 'update')}, the harness received {answered}")

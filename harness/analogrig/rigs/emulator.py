@@ -287,21 +287,24 @@ class EmulatorRig(Rig):
     capabilities = frozenset({"tweak", "excite"})
     computes_circuit = True
 
-    def __init__(self, description: EmulatorDescription) -> None:
+    def __init__(self, description: EmulatorDescription, block_samples: int = BLOCK_SAMPLES) -> None:
         """:raises EmulatorError: the card or the amplifiers cannot be."""
         self._description = description
         self._card = description.card.card()
         self._amplifier = preset(description.computer.op_amp)  # refused here, and not when it is first played
         self._last_prepared: _Prepared | None = None
+        self._table = dataclasses.asdict(description)  # to write it takes as long as to play a thousand samples
+        self._block_samples = block_samples
 
     def description(self) -> Mapping[str, Any]:
-        return dataclasses.asdict(self._description)
+        return self._table
 
-    @property
-    def force_zero(self) -> float:
-        """Code at zero force; it may lie outside the range."""
-        channel = CHANNELS.index("force")
-        return -self._card.ranges_v[channel][0] / float(self._card.lsb_v[channel])
+    def in_blocks(self, samples: int) -> EmulatorRig:
+        """The same rig with blocks of at most ``samples`` samples. Only the speed differs.
+
+        Data for a scenario that fits in one block are prepared once for all seeds.
+        """
+        return EmulatorRig(self._description, samples)
 
     def sampler(self, rng: np.random.Generator) -> Sampler:
         """Sampler of the rig's card with its own noise, to convert again what the circuit has played."""
@@ -323,12 +326,8 @@ class EmulatorRig(Rig):
             changes.append(PotTurn(tweak.sample, settings, tweak.ramp_n))
         return SetUp(computer, excitation, tuple(changes))
 
-    def perform(self, scenario: Scenario, seed: int, block_samples: int = BLOCK_SAMPLES) -> Performance:
-        """Play a scenario, as Rig.perform does; the length of the blocks affects only speed.
-
-        Data for a scenario that fits in one block are prepared once for all seeds.
-        """
-        if scenario.samples <= block_samples:
+    def perform(self, scenario: Scenario, seed: int) -> Performance:
+        if scenario.samples <= self._block_samples:
             prepared = self._prepare(scenario, seed)
             if prepared.play is not None:
                 return self._repeat(prepared, prepared.play, scenario, seed)
@@ -337,7 +336,13 @@ class EmulatorRig(Rig):
             machine = self._description.computer.add_noise(computer, seed)
             jitter = Stream.APERTURE.generator(seed)
             volts = acquired(
-                machine, self._card, excitation, scenario.samples, changes, rng=jitter, block_samples=block_samples
+                machine,
+                self._card,
+                excitation,
+                scenario.samples,
+                changes,
+                rng=jitter,
+                block_samples=self._block_samples,
             )
         return Performance(
             sample_period_s=1.0 / self._card.rate_hz,

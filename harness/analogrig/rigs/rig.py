@@ -17,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.plant import Segment
-from analogrig.run import Channel
+from analogrig.run import CHANNELS, Channel, missing_samples
 from analogrig.scenario import Scenario
 from analogrig.trust import Thing
 
 BLOCK_SAMPLES = 256
 """Block length in samples from rig to device: long enough to be fast, short enough to show progress and lose little."""
+
+_FORCE, _DISPLACEMENT = CHANNELS.index("force"), CHANNELS.index("displacement")
 
 CHANNEL_UNITS = {"force": "N", "displacement": "m", "velocity": "m/s", "net_force": "N"}
 
@@ -41,6 +43,10 @@ class Block:
     """(n, 4): True if the code is the end of the range, not a measurement."""
     record: int = 0
     """Number of the gap-free record that holds the block; nothing was sampled between two records."""
+
+    def signals(self) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+        """Samples as the device takes them: force, displacement, and True for each that is missing; (n,) each."""
+        return self.codes[:, _FORCE], self.codes[:, _DISPLACEMENT], missing_samples(self.clipped)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from analogrig.scenario import Scenario, Statement
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.devices.dut import Dut
+    from analogrig.devices.device import Device
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.testing.played import Played
@@ -60,7 +60,7 @@ class Play(Protocol):
     ) -> Played:
         """Play a scenario, by default with the seed that it has."""
 
-    def on(self, rig: Rig, dut: Dut) -> Play:
+    def on(self, rig: Rig, dut: Device) -> Play:
         """Return the same fixture for another rig or device."""
 
     def note(self, finding: Finding, seed: int) -> None:

@@ -18,7 +18,7 @@ from analogrig.testing.plugin.settings import DUT, RIG, RUNS_DIR, SCENARIO_DIR, 
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.devices.dut import Dut
+    from analogrig.devices.device import Device
     from analogrig.rigs.rig import Rig
     from analogrig.scenario import Scenario
     from analogrig.testing.counterexample import Counterexample
@@ -132,7 +132,7 @@ class Player:
     def __repr__(self) -> str:
         return "hil_play"
 
-    def on(self, rig: Rig, dut: Dut) -> Player:
+    def on(self, rig: Rig, dut: Device) -> Player:
         """Player for another rig or device."""
         from analogrig.bench import Bench
 

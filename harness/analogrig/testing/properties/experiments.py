@@ -17,16 +17,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from analogrig.bench import Bench
+from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns.rare import false_alarm_rate
-from analogrig.campaigns.trials import Trials, are_possible
 from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import Device
 from analogrig.devices.dut import Dut, connect
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
+from analogrig.judging.exposure import Exposure, exposure
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
 from analogrig.judging.verdict import judge
-from analogrig.rigs.emulator import EmulatorRig, is_emulated
+from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
 from analogrig.run import Run
@@ -50,7 +51,7 @@ _EVER = 1e9
 """Multiple of the information bound that allows any latency: an alarm before the next change suffices."""
 
 
-def device_description(dut: Dut) -> DeviceDescription:
+def device_description(dut: Device) -> DeviceDescription:
     """Description of the device in its present configuration."""
     return recorded(dut.description())
 
@@ -101,19 +102,16 @@ def false_alarms_at_most(
 
     Each trial takes ``samples_each`` samples.
     """
-    trials = _trials(play, f"takes {samples} samples: analogrig certify")
+    bench = _direct_bench(play, f"takes {samples} samples: analogrig certify")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     alarms: list[NDArray[np.int64]] = []
     armed = 0
     while armed < samples:
-        watched = trials.watched(scenario, seed + len(alarms))
-        alarms.append(watched.alarms)
-        armed += watched.exposure.armed
-        if watched.exposure.lack_of_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
-            why = (
-                watched.exposure.lack_of_evidence
-                or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
-            )
+        found, shown = _count_alarms(bench, scenario, seed + len(alarms))
+        alarms.append(found)
+        armed += shown.armed
+        if shown.lack_of_evidence or len(alarms) * samples_each > _MOST_UNARMED * samples:
+            why = shown.lack_of_evidence or f"the trigger was armed in {armed} of {len(alarms) * samples_each} samples"
             raise Inconclusive(why)
     count = sum(map(len, alarms))
     why = f"{count} false alarms in {armed} samples, allowed {allowed}"
@@ -130,14 +128,13 @@ def false_alarms_of_plants_rarer(
     """Finding: over random plants, the lower confidence limit of the false-alarm rate is at most ``rate``."""
     from analogrig.testing.strategies import random_suspensions
 
-    trials = _trials(play, f"takes {plants * samples_each} samples: analogrig campaign")
+    bench = _direct_bench(play, f"takes {plants * samples_each} samples: analogrig campaign")
     scenario = dataclasses.replace(scenario, samples=samples_each)
     drawn = [dataclasses.replace(scenario, plant=plant) for plant in random_suspensions(plants, seed)]
-    played = [trials.watched(each, seed) for each in drawn]
-    if nothing := next((each.exposure.lack_of_evidence for each in played if each.exposure.lack_of_evidence), ""):
+    alarms, shown = zip(*(_count_alarms(bench, each, seed) for each in drawn), strict=True)
+    if nothing := next((each.lack_of_evidence for each in shown if each.lack_of_evidence), ""):
         raise Inconclusive(nothing)
-    alarms = [each.alarms for each in played]
-    count, samples = sum(map(len, alarms)), sum(each.exposure.armed for each in played)
+    count, samples = sum(map(len, alarms)), sum(each.armed for each in shown)
     low = lower_rate(count, samples, confidence)
     why = f"{count} false alarms in {samples} samples: {low:.2g} a sample at least, allowed {rate:g}"
     if _MOST_UNARMED * samples < plants * samples_each:
@@ -167,19 +164,25 @@ def rare_false_alarms_rarer(
     return _witness(play, scenario, seed + int(np.argmax(rates)), np.zeros(0, np.int64), why)
 
 
-def _trials(play: Play, otherwise: str) -> Trials:
-    return Trials(*_in_this_process(play, otherwise))
+def _direct_bench(play: Play, otherwise: str) -> Bench:
+    return direct_bench(*_in_this_process(play, otherwise), alarms_only=True)
+
+
+def _count_alarms(bench: Bench, scenario: Scenario, seed: int) -> tuple[NDArray[np.int64], Exposure]:
+    """Samples with an alarm, and the exposure of the play."""
+    run = raise_if_interrupted(bench.play(scenario, seed))
+    return run.alarm_index, exposure(run)
 
 
 def _in_this_process(play: Play, otherwise: str) -> tuple[EmulatorRig, DeviceDescription]:
     """Rig and device, if trials without a line equal those on the bench; else the test is skipped."""
     rig, device = play.bench.rig, device_description(play.bench.dut)
-    if not is_emulated(rig) or not are_possible(rig, device):
+    if not can_be_direct(rig, device):
         pytest.skip(f"{otherwise}, or an emulated rig and --hil-dut inproc, not {play.bench.dut.name}")
     return rig, device
 
 
-def _with_most(alarms: list[NDArray[np.int64]]) -> int:
+def _with_most(alarms: Sequence[NDArray[np.int64]]) -> int:
     return int(np.argmax([len(each) for each in alarms]))
 
 

@@ -1,4 +1,4 @@
-"""Trials without a line: what Bench plays, to the bit."""
+"""Direct bench: the same runs as over a line, to the bit."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from analogrig.bench import Bench
-from analogrig.campaigns.trials import BLOCK_SAMPLES, Trials, are_possible
+from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
 from analogrig.devices.dut import open_dut
 from analogrig.devices.registry import describe
 from analogrig.judging.verdict import judge
@@ -27,10 +26,10 @@ def emulator(name: str) -> EmulatorRig:
     ("scenario_name", "rig_name"),
     [("thesis", "emulator"), ("thesis", "emulator-0-10v"), ("shock", "emulator-skewed"), ("slow", "emulator-real")],
 )
-def test_trial_is_the_run_of_the_bench_to_the_bit(scenario_name: str, rig_name: str) -> None:
+def test_run_without_a_line_is_that_over_a_line_to_the_bit(scenario_name: str, rig_name: str) -> None:
     scenario, rig = Scenario.load(scenario_name), emulator(rig_name)
     scenario = dataclasses.replace(scenario, samples=min(scenario.samples, 2000))
-    trial = Trials(rig, describe("inproc")).run(scenario, 7)
+    trial = direct_bench(rig, describe("inproc")).play(scenario, 7)
     with open_dut("inproc", exchange="block") as dut:
         run = Bench(rig, dut).play(scenario, 7)
     assert trial.codes.tobytes() == run.codes.tobytes()
@@ -49,37 +48,40 @@ def test_trial_is_the_run_of_the_bench_to_the_bit(scenario_name: str, rig_name: 
 
 def test_alarms_alone_are_those_of_the_run_across_blocks() -> None:
     thesis = Scenario.load("thesis")
-    late = tuple(dataclasses.replace(tweak, sample=tweak.sample + BLOCK_SAMPLES) for tweak in thesis.tweaks)
-    scenario = dataclasses.replace(thesis, samples=thesis.samples + BLOCK_SAMPLES, tweaks=late)
-    trials = Trials(emulator("emulator"), describe("inproc"))
-    alarms = trials.alarms(scenario, 3)
-    assert len(alarms) >= len(late)
-    assert alarms.tolist() == trials.run(scenario, 3).alarm_index.tolist()
-    assert alarms.tolist() == trials.alarms(scenario, 3).tolist()  # a trial leaves nothing behind
+    late = tuple(dataclasses.replace(tweak, sample=tweak.sample + DIRECT_BLOCK_SAMPLES) for tweak in thesis.tweaks)
+    scenario = dataclasses.replace(thesis, samples=thesis.samples + DIRECT_BLOCK_SAMPLES, tweaks=late)
+    rig, device = emulator("emulator"), describe("inproc")
+    whole, bench = direct_bench(rig, device).play(scenario, 3), direct_bench(rig, device, alarms_only=True)
+    for _ in range(2):  # a play leaves nothing behind
+        run = bench.play(scenario, 3)
+        assert run.theta.shape == (scenario.samples, 0)
+        assert len(run.alarm_index) >= len(late)
+        for name in ("alarm_index", "alarm_kind", "alarm_statistic", "codes", "statistic", "innovation", "flags"):
+            assert getattr(run, name).tobytes() == getattr(whole, name).tobytes()
 
 
 def test_length_of_blocks_changes_no_code() -> None:
     rig, scenario = emulator("emulator-real"), Scenario.load("thesis")
-    parts = [[block.codes for block in rig.perform(scenario, 5, n).blocks] for n in (64, 5000)]
+    parts = [[block.codes for block in rig.in_blocks(n).perform(scenario, 5).blocks] for n in (64, 5000)]
     assert np.concatenate(parts[0]).tobytes() == np.concatenate(parts[1]).tobytes()
 
 
 @pytest.mark.parametrize("rig_name", ["emulator", "emulator-0-10v", "emulator-ideal", "emulator-real"])
-def test_trials_of_one_scenario_are_each_what_a_rig_of_its_own_plays(rig_name: str) -> None:
-    trials, thesis = Trials(emulator(rig_name), describe("inproc")), Scenario.load("thesis")
+def test_plays_of_one_scenario_are_each_those_of_a_rig_of_its_own(rig_name: str) -> None:
+    bench, thesis = direct_bench(emulator(rig_name), describe("inproc")), Scenario.load("thesis")
     other = dataclasses.replace(thesis, tweaks=thesis.tweaks[:2], samples=1500)
     for scenario, seed in ((thesis, 3), (thesis, 1), (other, 1), (thesis, 4)):
-        trial = trials.run(scenario, seed)
+        trial = bench.play(scenario, seed)
         own = list(emulator(rig_name).perform(scenario, seed).blocks)
         assert trial.codes.tobytes() == np.concatenate([block.codes for block in own]).tobytes()
         assert trial.conditions.segments == scenario.segments()
         assert trial.conditions.scenario == scenario.as_table()
 
 
-def test_device_whose_line_is_spoiled_needs_the_bench() -> None:
+def test_device_whose_line_matters_is_not_played_without_it() -> None:
     rig, device = emulator("emulator"), describe("inproc")
-    assert are_possible(rig, device)
-    assert not are_possible(rig, dataclasses.replace(device, wire_faults="flip@0.001"))
-    assert not are_possible(rig, dataclasses.replace(device, report_interval_n=10))
-    assert not are_possible(rig, describe("inproc?link=can"))
-    assert not are_possible(rig, describe("host"))
+    assert can_be_direct(rig, device)
+    assert not can_be_direct(rig, dataclasses.replace(device, wire_faults="flip@0.001"))
+    assert not can_be_direct(rig, dataclasses.replace(device, report_interval_n=10))
+    assert not can_be_direct(rig, describe("inproc?link=can"))
+    assert not can_be_direct(rig, describe("host"))

@@ -1,19 +1,22 @@
-"""Page of a campaign: its table, and maps of latency and miss rate over two axes of the grid."""
+"""Tables of a campaign, and its page: with maps of latency and miss rate over two axes of the grid."""
 
 from __future__ import annotations
 
 import html
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from analogrig.campaigns.results import COLUMNS, CONFIDENCE, Results, Summary, label
+from analogrig.campaigns.results import CONFIDENCE, Results, Summary
+from analogrig.campaigns.rows import RATES
 from analogrig.errors import ConfigurationError
 from analogrig.identity import Identity
 from analogrig.reporting.page import FOLDER, assemble_page
 from analogrig.reporting.tables import provenance
 from analogrig.storage import replace_file
+from analogrig.wording import counter_text, number_of
 
 _TEMPLATE = FOLDER / "campaign.html"
 
@@ -27,19 +30,102 @@ _DEEPEST = (0, 114, 178)
 MOST_MAPS = 40
 
 
+def _labelled(results: Results) -> list[tuple[dict[str, str], Summary]]:
+    """Cells with the labels that identify them: rig and device where there are several, and the values of the grid."""
+    plan, out = results.plan, []
+    for cell, summary in results.cells():
+        labels = {"rig": str(plan.rigs[cell.rig]["name"])} if len(plan.rigs) > 1 else {}
+        labels |= {"device": str(plan.devices[cell.device]["name"])} if len(plan.devices) > 1 else {}
+        out.append((labels | {axis: f"{value:g}" for axis, value in cell.values.items()}, summary))
+    return out
+
+
+def anytime_text(counted: Mapping[str, int]) -> str:
+    """Rates of the events that ``rows.counts`` counts, with bounds, in one line."""
+    parts = []
+    for name, rate in RATES.items():
+        if counted[rate.exposure]:
+            below = rate.known(counted, CONFIDENCE).bounds[1]
+            events, exposure = counter_text(counted[name], name), counter_text(counted[rate.exposure], rate.unit)
+            parts.append(f"{events} in {exposure} (rate below {below:.2g})")
+    return ", ".join(parts)
+
+
 @dataclass(frozen=True)
-class Quantity:
-    """Quantity that a map shows."""
+class Column:
+    """Column of the tables."""
 
     title: str
-    of: Callable[[Summary], float | None]
+    short: str
+    """Title where there is little room."""
     form: str
+    of: Callable[[Summary], float | None]
+
+    def cell(self, summary: Summary, absent: str) -> str:
+        value = self.of(summary)
+        return absent if value is None else format(value, self.form)
 
 
-QUANTITIES = (
-    Quantity("Mean latency [samples]", lambda summary: summary.latency_n, ".1f"),
-    Quantity("Miss rate", lambda summary: summary.missed / summary.visible if summary.visible else None, ".1%"),
+COLUMNS = (
+    Column("trials", "trials", ",", lambda summary: summary.trials),
+    Column("failed", "failed", ",", lambda summary: summary.failed),
+    Column("inconclusive", "inconcl.", ",", lambda summary: summary.inconclusive),
+    Column("missed", "missed", ",", lambda summary: summary.missed),
+    Column("visible", "of", ",", lambda summary: summary.visible),
+    Column("miss rate at most", "at most", ".2g", lambda summary: summary.miss_rate[1] if summary.visible else None),
+    Column("false alarms", "false al.", ",", lambda summary: summary.false_alarms),
+    Column(
+        "per sample at most",
+        "rate below",
+        ".2g",
+        lambda summary: summary.false_alarm_rate[1] if summary.armed else None,
+    ),
+    Column("latency", "latency", ".1f", lambda summary: summary.latency_n),
+    Column("95th percentile", "p95", ".1f", lambda summary: summary.latency_p95_n),
+    Column("bound", "bound", ".1f", lambda summary: summary.bound_n),
 )
+
+MAPPED = (
+    Column("Mean latency [samples]", "", ".1f", lambda summary: summary.latency_n),
+    Column("Miss rate", "", ".1%", lambda summary: summary.missed / summary.visible if summary.visible else None),
+)
+"""Quantities of the maps."""
+
+
+def text(results: Results) -> str:
+    """Results as several lines of text, without a final newline."""
+    spec, total = results.plan.spec, results.total()
+    cells = _labelled(results)
+    names = list(cells[0][0]) if len(cells) > 1 else []
+    counts = ((len(cells), "cell"), (total.trials, "trial"), (total.samples, "sample"))
+    head = f"campaign {spec.name}: {', '.join(number_of(*each) for each in counts)}: "
+    rows = [[*names, *(column.short for column in COLUMNS)]]
+    rows += [[*(labels[name] for name in names), *_numbers(summary)] for labels, summary in cells]
+    if len(cells) > 1:
+        rows.append([*("all" if name == names[0] else "" for name in names), *_numbers(total)])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(value.rjust(width) for value, width in zip(row, widths, strict=True)) for row in rows]
+    notes = [f"bounds at {CONFIDENCE:.0%}, whenever the campaign ended; latency, p95 and bound in samples"]
+    if total.inconclusive:
+        notes.append(f"{number_of(total.inconclusive, 'trial')} inconclusive, such as {total.doubt}")
+    return "\n".join(
+        [head + results.outcome().upper(), "", *(f"  {line}" for line in lines), "", *(f"  {note}" for note in notes)]
+    )
+
+
+def as_json(results: Results) -> dict[str, Any]:
+    """Results as plain values; rates as [low, high]."""
+    cells = [{**labels, **vars(summary)} for labels, summary in _labelled(results)]
+    return {
+        "campaign": results.plan.spec.name,
+        "outcome": results.outcome(),
+        "total": vars(results.total()),
+        "cells": cells,
+    }
+
+
+def _numbers(summary: Summary) -> list[str]:
+    return [column.cell(summary, "-") for column in COLUMNS]
 
 
 def page_of(out: Path) -> Path:
@@ -99,7 +185,7 @@ def _maps(results: Results) -> str:
     if not axes:
         return ""
     across, down = axes[0], axes[1] if len(axes) > 1 else None
-    cells = [(label(results.plan, cell), summary) for cell, summary in results.cells()]
+    cells = _labelled(results)
     rest = [tuple((name, value) for name, value in names.items() if name not in axes) for names, _ in cells]
     sections = []
     for group in list(dict.fromkeys(rest))[:MOST_MAPS]:
@@ -109,12 +195,12 @@ def _maps(results: Results) -> str:
             if other == group
         }
         where = ", ".join(f"{name} {value}" for name, value in group)
-        maps = "".join(_map(quantity, found, (across, down or ""), where) for quantity in QUANTITIES)
+        maps = "".join(_map(quantity, found, (across, down or ""), where) for quantity in MAPPED)
         sections.append(f'<div class="maps">{maps}</div>')
     return f'<section aria-labelledby="maps"><h2 id="maps">Maps</h2>{"".join(sections)}</section>'
 
 
-def _map(quantity: Quantity, found: dict[tuple[str, str], Summary], axes: tuple[str, str], where: str) -> str:
+def _map(quantity: Column, found: dict[tuple[str, str], Summary], axes: tuple[str, str], where: str) -> str:
     columns, rows = (list(dict.fromkeys(key[i] for key in found)) for i in range(2))
     values = {key: quantity.of(summary) for key, summary in found.items()}
     most = max((value for value in values.values() if value is not None), default=0.0)
@@ -149,7 +235,7 @@ def _words(x: float, y: float, text: str, anchor: str = "middle", colour: str = 
 
 
 def _table(results: Results) -> str:
-    cells = [(label(results.plan, cell), summary) for cell, summary in results.cells()]
+    cells = _labelled(results)
     names = list(cells[0][0])
     head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in names)
     head += "".join(f'<th scope="col" class="number">{column.title}</th>' for column in COLUMNS)

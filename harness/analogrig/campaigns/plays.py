@@ -1,0 +1,168 @@
+"""Work of a worker: plays, each on the bench of its rig and device, which stay open for the next one."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
+from analogrig.campaigns import builds
+from analogrig.campaigns.plan import Case, Cell, Chunk, Plan, device_of, open_table
+from analogrig.campaigns.rows import Row, row, row_of_none
+from analogrig.devices.device import Device
+from analogrig.devices.dut import connect
+from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
+from analogrig.judging.exposure import exposure
+from analogrig.judging.verdict import invalid_reasons, judge
+from analogrig.rigs.rig import Rig
+from analogrig.run import Run
+
+MOST_KEPT = 64
+"""Largest number of rigs, and of devices, that are open at once."""
+
+Kept = TypeVar("Kept")
+
+
+class _Cache(Generic[Kept]):
+    """The most recently opened rigs or devices, by plain values that describe them: a worker gets cells in turn."""
+
+    def __init__(self, opened: Callable[..., AbstractContextManager[Kept]]) -> None:
+        self._opened = opened
+        self._kept: dict[str, tuple[Kept, ExitStack]] = {}
+
+    def get(self, *described: Any) -> Kept:
+        """Return the open object of this description; open it first if necessary."""
+        key = json.dumps(described, sort_keys=True)
+        if key not in self._kept:
+            while len(self._kept) >= MOST_KEPT:
+                self._close(next(iter(self._kept)))
+            with ExitStack() as stack:
+                self._kept[key] = stack.enter_context(self._opened(*described)), stack.pop_all()
+        return self._kept[key][0]
+
+    def drop(self, *described: Any) -> None:
+        """Close the object of this description, so that the next play reopens it."""
+        self._close(json.dumps(described, sort_keys=True))
+
+    def close(self) -> None:
+        while self._kept:
+            self._close(next(iter(self._kept)))
+
+    def _close(self, key: str) -> None:
+        if key in self._kept:
+            with contextlib.suppress(AnalogrigError):
+                self._kept.pop(key)[1].close()
+
+
+class _Benches(threading.local):
+    """Open rigs, devices and direct benches of one thread."""
+
+    def __init__(self) -> None:
+        self._rigs: _Cache[Rig] = _Cache(open_table)
+        self._devices: _Cache[Device] = _Cache(lambda table: connect(device_of(table)))
+        self._direct: _Cache[Bench | None] = _Cache(self._direct_bench)
+
+    def _direct_bench(
+        self,
+        rig: Any,
+        device: Any,
+        alarms_only: bool,  # noqa: FBT001 - part of the key
+    ) -> AbstractContextManager[Bench | None]:
+        opened, planned = self._rigs.get(rig), device_of(device)
+        if not can_be_direct(opened, planned):
+            return contextlib.nullcontext()
+        return contextlib.nullcontext(direct_bench(opened, planned, alarms_only=alarms_only))
+
+    def play(self, case: Case, *, alarms_only: bool = False) -> Run:
+        """Play a case, without a line where that makes no difference. After an invalid run the device is reopened.
+
+        :param alarms_only: omit the estimates where that makes it faster.
+        :raises ConfigurationError: the case cannot be played, the device refuses its configuration, or is another build
+            than was planned.
+        :raises LinkError, DeviceError, RigError: the device or the rig cannot be had.
+        :raises KeyboardInterrupt: the user ended it.
+        """
+        bench = self._direct.get(case.rig, case.device, alarms_only)
+        try:
+            bench = bench or Bench(self._rigs.get(case.rig), self._devices.get(case.device))
+            run = bench.play(case.scenario, case.seed)
+        except BaseException as error:
+            self._devices.drop(case.device)
+            if isinstance(error, RigError):
+                self._rigs.drop(case.rig)
+            raise
+        if run.conditions.faults:
+            self._devices.drop(case.device)
+        return raise_if_interrupted(run)
+
+    def close(self) -> None:
+        for kept in (self._direct, self._devices, self._rigs):
+            kept.close()
+
+
+_benches = _Benches()
+
+
+def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
+    """Rows of a chunk of the plan (``Plan.as_json``): the same in every process on every machine.
+
+    :raises ConfigurationError: the build here is another, or a device refuses its configuration; names cell and seed.
+    """
+    planned, cells = _plan(plan)
+    numbered = Chunk(*chunk)
+    rows = []
+    for seed in planned.seeds(numbered):
+        try:
+            rows.append(_play_trial(planned, cells[numbered.cell], seed))
+        except ConfigurationError as error:
+            raise ConfigurationError(
+                f"campaign {planned.spec.name}, cell {numbered.cell}, seed {seed}: {error}"
+            ) from error
+    return rows
+
+
+def _play_trial(plan: Plan, cell: Cell, seed: int) -> Row:
+    """Row of a trial. One that cannot be played is inconclusive: the next one may succeed."""
+    drawn = plan.drawn(seed)
+    try:
+        run = _benches.play(plan.case(cell, seed))
+    except (DeviceError, LinkError, RigError) as error:
+        return row_of_none(seed, drawn, " ".join(str(error).split()))
+    return row(run, judge(run), drawn)
+
+
+@dataclass(frozen=True)
+class Count:
+    """Alarms and exposure of a trial in which nothing changes."""
+
+    alarms: int
+    armed: int
+    """Samples in which the trigger was armed."""
+    fault: str = ""
+    """Reason why the trial is no evidence; empty if it is."""
+
+
+def count_alarms(case: Case) -> Count:
+    """Count the alarms of a case by the fastest available way; errors as ``_Benches.play``."""
+    run = _benches.play(case, alarms_only=True)
+    shown = exposure(run)
+    faults = invalid_reasons(run, shown, case.scenario.expect)
+    return Count(len(run.alarm_index), shown.armed, f"seed {case.seed}: {faults[0]}" if faults else "")
+
+
+@functools.lru_cache(maxsize=2)
+def _plan(text: str) -> tuple[Plan, list[Cell]]:
+    plan = Plan.from_json(text)
+    builds.check_analogrig(plan.analogrig)
+    return plan, plan.cells()
+
+
+def close_devices() -> None:
+    """Close the devices and rigs that this thread's chunks have opened."""
+    _benches.close()

@@ -1,0 +1,42 @@
+"""The structure keeps what design promises: imports run one way, one name means one thing."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests import metrics
+
+
+@pytest.fixture(scope="module")
+def tree() -> metrics.Tree:
+    return metrics.read(None)
+
+
+def made(**modules: str) -> metrics.Tree:
+    files = {f"harness/analogrig/{name.replace('__', '/')}.py": text for name, text in modules.items()}
+    return metrics.Tree("made", {"harness/analogrig/__init__.py": "", **files})
+
+
+def test_imports_run_one_way(tree: metrics.Tree) -> None:
+    assert metrics.upward(metrics.arrows(tree)) == []
+    assert metrics.circles(metrics.arrows(tree)) == []
+
+
+def test_upward_import_is_found_wherever_it_stands() -> None:
+    below = made(rigs__rig="def f():\n    from analogrig.cli import main\n", cli__main="import analogrig.rigs.rig\n")
+    assert metrics.upward(metrics.arrows(below)) == [("rigs", "cli")]
+    assert metrics.circles(metrics.arrows(below)) == [{"rigs", "cli"}]
+
+
+def test_docstrings_can_be_read_alone(tree: metrics.Tree) -> None:
+    assert metrics.share_of_bad(tree) <= 0.03
+    assert metrics.share_of_bad(made(run='"""Whether it runs."""\nN = 1\n"""The number."""\n')) == 0.5
+
+
+def test_type_has_one_meaning(tree: metrics.Tree) -> None:
+    assert metrics.doubled(tree) == []
+
+
+def test_no_caller_asks_for_a_concrete_rig_or_device(tree: metrics.Tree) -> None:
+    assert metrics.isinstances(tree) == 0
+    assert metrics.isinstances(made(bench="isinstance(rig, EmulatorRig)")) == 1
