@@ -80,10 +80,8 @@ static bool variances_valid(const est_config_t* const config) {
 /// An edge or a noise that does not fit into the range of the codes is in another unit.
 static bool codes_valid(const est_config_t* const config) {
     const float range = config->code_high - config->code_low;
-    return within(config->code_low, -EST_CODE_LIMIT, EST_CODE_LIMIT) &&
-           within(config->code_high, -EST_CODE_LIMIT, EST_CODE_LIMIT) &&
-           within(config->edge_codes, FLT_MIN, EST_CODE_LIMIT) && (config->edge_codes <= range) &&
-           ((config->noise_variance * NOISE_SHARE) <= (range * range)) &&
+    return within(config->code_low, -EST_CODE_LIMIT, config->code_high) && (config->code_high <= EST_CODE_LIMIT) &&
+           within(config->edge_codes, FLT_MIN, range) && ((config->noise_variance * NOISE_SHARE) <= (range * range)) &&
            ((uint32_t)config->edge_instants <= (uint32_t)EST_EDGES_ANYWHERE);
 }
 

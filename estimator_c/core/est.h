@@ -168,8 +168,8 @@ typedef enum {
 typedef float (*est_trigger_fn)(void* context, float innovation, float variance, bool anew);
 
 typedef struct {
-    est_trigger_kind_t kind;
-    est_reset_t        reset;
+    est_trigger_kind_t kind;        ///< statistic
+    est_reset_t        reset;       ///< effect of an alarm
     bool               absolute;    ///< mean between faults: average |innovation| instead of the innovation
     uint16_t           hold_off_n;  ///< innovations after an alarm during which the statistic is held at zero; 0 .. 200
     uint16_t           warm_up_n;   ///< innovations after est_init() during which it is held at zero; usually 150
@@ -221,8 +221,8 @@ typedef struct {
     /// alarms. Too large a value hides changes: the standard deviation is at most 1/32 of code_high - code_low.
     float noise_variance;
     float c[EST_NA_MAX];  ///< prefilter C = 1 + c[0] z^-1 + ...; zeros inside the unit circle; 0: none
-    /// Smallest step of u that is an edge; > 0, at most EST_CODE_LIMIT and at most code_high - code_low [codes]. Usually a
-    /// tenth to a half of the steps of u, and at least 10 times the noise.
+    /// Smallest step of u that is an edge; > 0, at most code_high - code_low [codes]. Usually a tenth to a half of the
+    /// steps of u, and at least 10 times the noise.
     float edge_codes;
     /// u and y are refused as saturated at or beyond these codes; -EST_CODE_LIMIT <= code_low < code_high <=
     /// EST_CODE_LIMIT. Usually the ends of the converter's range, or one code beyond those that u or y may reach.
@@ -435,7 +435,8 @@ EST_RESULT_USED bool est_init(est_t* self, const est_config_t* config);
 /// Bad data never fails and never enters the estimate: see est_status_t.
 /// Cost: about 3 n^2 / 2 multiplications and n divisions with n parameters. The longest step takes up to 1.3 times a
 /// typical one if edges may slip, 1.2 times otherwise.
-/// RAM: the state, and stack that depends on the build: STACK. May be called from an interrupt.
+/// RAM: the state, and stack: on a Cortex-M some 250 bytes, at -O0 2,400; on an AVR 280, at -O0 1,600 (make
+/// cost). May be called from an interrupt.
 est_step_t est_step(est_t* self, est_sample_t sample);
 
 /// Number of parameters: na + nb + nc + offset. Cost: constant. May be called from an interrupt.

@@ -15,7 +15,7 @@
 /// True iff every value is in the range stated in est.h. Values that this kind of trigger ignores are checked too.
 static inline bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known =
-        ((uint32_t)config->kind <= (uint32_t)EST_TRIGGER_CUSTOM) &&
+        (config->kind <= EST_TRIGGER_CUSTOM) &&
         (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
         ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);
