@@ -111,8 +111,8 @@ extern "C" {
 #endif
 
 /// Names with the maxima, as est_init_na2U_nb3U_nk1U_nc0U_theta6U. Private.
-#define EST_NAME_JOINED(name, na, nb, nk, nc, theta) name##_na##na##_nb##nb##_nk##nk##_nc##nc##_theta##theta
-#define EST_NAME_EXPANDED(name, na, nb, nk, nc, theta) EST_NAME_JOINED(name, na, nb, nk, nc, theta)
+#define EST_NAME_JOINED(name, a, b, k, c, n) name##_na##a##_nb##b##_nk##k##_nc##c##_theta##n  // MISRA D6
+#define EST_NAME_EXPANDED(name, a, b, k, c, n) EST_NAME_JOINED(name, a, b, k, c, n)
 #define EST_NAME(name) EST_NAME_EXPANDED(name, EST_NA_MAX, EST_NB_MAX, EST_NK_MAX, EST_NC_MAX, EST_THETA_MAX)
 #define est_init EST_NAME(est_init)
 
