@@ -553,7 +553,7 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
 EST_SHARED est_config_t copy_config(const est_config_t* const config) { return *config; }
 
 est_config_t est_config_default(void) {
-    static const est_config_t config = EST_CONFIG_DEFAULT;  // MISRA D2
+    static const est_config_t config = EST_CONFIG_DEFAULT;
     return copy_config(&config);
 }
 
