@@ -336,9 +336,8 @@ def costs(folder: Path) -> Iterator[Cost]:
         yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
     state_bytes = bench.state_bytes("estimator")
     yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
-    for processor, level in itertools.product(stack.BUILDS, stack.LEVELS):
-        stack_bytes = stack.stack_bytes(processor, level, folder)
-        yield Cost(f"{processor.name}, stack of est_step() at {level}", stack_bytes, "B")
+    for build, level in itertools.product(stack.BUILDS, stack.LEVELS):
+        yield Cost(f"{build.name}, stack of est_step() at {level}", stack.stack_bytes(build, level, folder), "B")
     yield from isolation(bench)
     for processor in (M4F, M3):
         yield from device(bench.device(processor))

@@ -99,7 +99,7 @@ def test_cmake_project_rejects_another_minor_version(tmp_path: Path) -> None:
     (user / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(user C)\nfind_package(est 9.9 REQUIRED)\n"
     )
-    command = ["cmake", "-S", user, "-B", user / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
+    command: list[str | Path] = ["cmake", "-S", user, "-B", user / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "est" in done.stderr
