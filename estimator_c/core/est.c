@@ -574,8 +574,8 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 }
 
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
-    EST_ASSERT((self != NULL) && orders_valid(self->config) &&  // fails if the configuration has been overwritten
-               within(self->config->forgetting, FORGETTING_MIN, 1.0F));
+    EST_ASSERT(self != NULL);
+    EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
     est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
     step.statistic  = self->trigger.statistic;
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {

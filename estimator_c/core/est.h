@@ -168,11 +168,11 @@ typedef enum {
 typedef float (*est_trigger_fn)(void* context, float innovation, float variance, bool anew);
 
 typedef struct {
-    est_trigger_kind_t kind;        ///< statistic
-    est_reset_t        reset;       ///< effect of an alarm
-    bool               absolute;    ///< mean between faults: average |innovation| instead of the innovation
-    uint16_t           hold_off_n;  ///< innovations after an alarm during which the statistic is held at zero; 0 .. 200
-    uint16_t           warm_up_n;   ///< innovations after est_init() during which it is held at zero; usually 150
+    est_trigger_kind_t kind;      ///< statistic
+    est_reset_t        reset;     ///< effect of an alarm
+    bool               absolute;  ///< mean between faults: average |innovation| instead of the innovation
+    uint16_t hold_off_n;          ///< innovations after an alarm during which the statistic is held at zero; usually 0
+    uint16_t warm_up_n;           ///< innovations after est_init() during which it is held at zero; usually 150
     /// > 0, at most EST_CEILING_LIMIT. Cumulative sum: ln(ARL0), usually 9 .. 16. The two triggers of the thesis: [codes],
     /// usually 4 .. 10 times the standard deviation of the noise.
     float          ceiling;
@@ -310,7 +310,7 @@ typedef enum {
 
 /// Result of one step.
 typedef struct {
-    est_status_t status;
+    est_status_t status;      ///< treatment of the sample
     bool         alarm;       ///< the plant has changed; estimation restarts with the next sample
     bool         idle;        ///< excitation is lost: the estimate does not improve. Always: edge_codes is too large
     float        innovation;  ///< e(k) = y_f(k) - phi_f(k)' theta(k-1) [codes]; 0 unless status is EST_UPDATED
