@@ -48,7 +48,7 @@ export UV_NATIVE_TLS := 1
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
         cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
-        can-guest wheel lock clean distclean
+        can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
 found = $(shell command -v $1 2>/dev/null)
@@ -158,6 +158,13 @@ mutate: $(PRODUCTS) ## alter the core, which the tests must notice; ARGS="--samp
 wheel: $(PRODUCTS) ## build an sdist, and from it a wheel, into build/dist
 	@$(BIN)/python -m build --no-isolation --outdir $(BUILD)/dist
 	@rm -rf *.egg-info
+
+dist: ## pack the C estimator of the last commit for CMake, PlatformIO, Zephyr and ESP-IDF: build/dist/est-VERSION.tar.gz
+	@mkdir -p $(BUILD)/dist
+	@version=$$(awk '/^#define EST_VERSION_/ { printf "%s%s", dot, $$3; dot = "." }' estimator_c/core/est.h) && \
+	    git archive --prefix=est-$$version/ --add-file=LICENSE --output=$(BUILD)/dist/est-$$version.tar.gz HEAD:estimator_c \
+	        README.md CMakeLists.txt library.json library.properties idf_component.yml core isolation src zephyr examples && \
+	    echo $(BUILD)/dist/est-$$version.tar.gz
 
 wheels: $(BUILD)/wheels/.made ## build manylinux wheels for x86_64 and aarch64 into build/wheels; downloads zig, 100 MB
 

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "est.h"
 #include "est_assert.h"
 #include "est_edges.h"
@@ -6,28 +8,6 @@
 
 #include <float.h>
 #include <stddef.h>
-
-/// Orders of the default configuration: those fixed by the build, else ARX(2, 3) with offset. A build with less room
-/// drops the offset first, then b's, then a's.
-#ifdef EST_FIXED_NA
-#define DEFAULT_NA EST_FIXED_NA
-#define DEFAULT_NB EST_FIXED_NB
-#define DEFAULT_NK EST_FIXED_NK
-#define DEFAULT_NC EST_FIXED_NC
-#define DEFAULT_OFFSET EST_FIXED_OFFSET
-#else
-#if (EST_NA_MAX < 2) || (EST_THETA_MAX < 3)
-#define DEFAULT_NA 1U
-#else
-#define DEFAULT_NA 2U
-#endif
-#define WANTED_NB ((EST_NB_MAX < 3U) ? EST_NB_MAX : 3U)
-#define ROOM_NB (EST_THETA_MAX - DEFAULT_NA)
-#define DEFAULT_NB ((WANTED_NB < ROOM_NB) ? WANTED_NB : ROOM_NB)
-#define DEFAULT_NK 0U
-#define DEFAULT_NC 0U
-#define DEFAULT_OFFSET ((DEFAULT_NA + DEFAULT_NB) < EST_THETA_MAX)
-#endif
 
 /// Factor by which a slip increases the variance of every parameter. With 10, the covariance of the shifted b's is too
 /// small and false alarms follow. With 10,000, a simultaneous change of the plant passes unnoticed.
@@ -51,6 +31,9 @@
 /// The estimate remembers some 1 / (1 - forgetting) samples. After this many times that without an edge, A is
 /// determined by the noise, which any A = C fits, and C must not follow.
 #define REFRESH_MEMORIES 2.0F
+
+/// Square of the smallest ratio of the range of the codes to the standard deviation of the noise.
+#define NOISE_SHARE 1024.0F
 
 /// Rate at which the noise variance is followed. A squared innovation counts at most NOISE_CLIP times its expected
 /// value, so that a change of the plant is not taken for noise. Clipping leaves NOISE_KEPT of the variance of
@@ -94,11 +77,12 @@ static bool variances_valid(const est_config_t* const config) {
            within(config->random_walk, 0.0F, EST_VARIANCE_MAX) && within(config->forgetting, FORGETTING_MIN, 1.0F);
 }
 
+/// An edge or a noise that does not fit into the range of the codes is in another unit.
 static bool codes_valid(const est_config_t* const config) {
-    return within(config->edge_codes, FLT_MIN, EST_CODE_LIMIT) &&
-           within(config->code_low, -EST_CODE_LIMIT, EST_CODE_LIMIT) &&
-           within(config->code_high, -EST_CODE_LIMIT, EST_CODE_LIMIT) && (config->code_low < config->code_high) &&
-           (config->edge_instants >= EST_EDGES_LOCKED) && (config->edge_instants <= EST_EDGES_ANYWHERE);
+    const float range = config->code_high - config->code_low;
+    return within(config->code_low, -EST_CODE_LIMIT, config->code_high) && (config->code_high <= EST_CODE_LIMIT) &&
+           within(config->edge_codes, FLT_MIN, range) && ((config->noise_variance * NOISE_SHARE) <= (range * range)) &&
+           ((uint32_t)config->edge_instants <= (uint32_t)EST_EDGES_ANYWHERE);
 }
 
 static bool needs_adaptation(const est_config_t* const config) {
@@ -569,36 +553,7 @@ static void dispatch_equation(est_t* const self, const float y, est_step_t* cons
 EST_SHARED est_config_t copy_config(const est_config_t* const config) { return *config; }
 
 est_config_t est_config_default(void) {
-    static const est_config_t config = {  // MISRA D2
-        .na             = (uint8_t)DEFAULT_NA,
-        .nb             = (uint8_t)DEFAULT_NB,
-        .nk             = (uint8_t)DEFAULT_NK,
-        .nc             = (uint8_t)DEFAULT_NC,
-        .offset         = DEFAULT_OFFSET,
-        .refresh_n      = EST_WITH_ADAPTATION ? 40U : 0U,
-        .stuck_n        = EST_WITH_WATCH ? 16U : 0U,
-        .idle_n         = EST_WITH_WATCH ? 1000U : 0U,
-        .edge_instants  = EST_WITH_EDGES ? EST_EDGES_MAY_SLIP : EST_EDGES_LOCKED,
-        .forgetting     = 0.99F,
-        .random_walk    = 0.0F,
-        .p0             = 10.0F,
-        .p0_offset      = 1.0e6F,
-        .noise_variance = 1.2F,
-#if DEFAULT_NA > 1
-        .c = { -1.6F, 0.64F },
-#else
-        .c = { -0.8F },
-#endif
-        .edge_codes = 64.0F,
-        .code_low   = -EST_CODE_LIMIT,
-        .code_high  = EST_CODE_LIMIT,
-        .trigger    = { .kind       = EST_TRIGGER_CUSUM,
-                        .reset      = EST_RESET_COVARIANCE,
-                        .absolute   = false,
-                        .hold_off_n = 0U,
-                        .warm_up_n  = 150U,
-                        .ceiling    = 11.512925F },
-    };
+    static const est_config_t config = EST_CONFIG_DEFAULT;
     return copy_config(&config);
 }
 
@@ -620,6 +575,7 @@ bool est_init(est_t* const self, const est_config_t* const config) {
 
 est_step_t est_step(est_t* const self, const est_sample_t sample) {
     EST_ASSERT(self != NULL);
+    EST_ASSERT(within(self->config->forgetting, FORGETTING_MIN, 1.0F));  // else the configuration was overwritten
     est_step_t step = { .status = examine(self, sample), .alarm = false, .innovation = 0.0F };
     step.statistic  = self->trigger.statistic;
     if ((step.status == EST_MISSING) || (step.status == EST_REFUSED)) {

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Edges of u whose instant is in doubt. A generator on its own clock drifts against the sampling clock. When one of
 /// its edges crosses a sampling instant, u is recorded one sample earlier or later from then on, relative to its
 /// effect on the plant. The b's jump, but the plant has not changed. This module computes the effect of moving the

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// One equation of the model: filled from the samples, whitened, and used to update the estimate. Most of the time of
 /// a step is spent here. The functions are inline, so that a call with a constant shape becomes straight-line code.
 

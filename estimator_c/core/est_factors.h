@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Covariance of theta in factors: P = U D U' / weight with U unit upper triangular, in units of the noise variance. A
 /// product of this form cannot lose symmetry, and stays positive as long as D does.
 

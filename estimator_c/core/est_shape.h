@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Compile-time choices of a build: the shape of the model, its features, inlining and unrolling. Private to the
 /// library.
 
@@ -5,26 +6,6 @@
 #define EST_SHAPE_H_INCLUDED
 
 #include "est.h"
-
-/// Features that -DEST_WITH_...=0 omits. A configuration that requests an omitted feature is refused.
-#ifndef EST_WITH_EDGES
-#define EST_WITH_EDGES 1  ///< EST_EDGES_MAY_SLIP and EST_EDGES_ANYWHERE
-#endif
-#ifndef EST_WITH_TRIGGERS
-#define EST_WITH_TRIGGERS 1  ///< triggers other than the cumulative sum
-#endif
-#ifndef EST_WITH_ADAPTATION
-#define EST_WITH_ADAPTATION 1  ///< nc, random_walk, noise_estimated, refresh_n
-#endif
-#ifndef EST_WITH_WATCH
-#define EST_WITH_WATCH 1  ///< stuck_n, idle_n, and the count of saturated samples
-#endif
-
-/// Check of the configuration by est_init(). May be omitted if the configuration is a constant that
-/// est_config_valid() has accepted elsewhere, as in a test on the host.
-#ifndef EST_WITH_CHECKS
-#define EST_WITH_CHECKS 1
-#endif
 
 #ifdef EST_FIXED_NA
 #if (EST_FIXED_NA > EST_NA_MAX) || (EST_FIXED_NB > EST_NB_MAX) || (EST_FIXED_NK > EST_NK_MAX) ||                       \
@@ -59,7 +40,7 @@
 #endif
 
 /// Loops over the parameters and over small constants. A build for size keeps them as loops.
-#if defined(__GNUC__) && (defined(EST_FIXED_NA) || !EST_FOR_SIZE)
+#if (defined(__clang__) || (defined(__GNUC__) && (__GNUC__ >= 8))) && (defined(EST_FIXED_NA) || !EST_FOR_SIZE)
 #define EST_UNROLL _Pragma("GCC unroll 8")
 #else
 #define EST_UNROLL

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Change triggers. They see the innovation and its variance, under every reading of the edges in doubt, and nothing
 /// else of the estimator. A trigger of the user is a function in the configuration (est_trigger_fn). A new trigger of
 /// the library needs a new est_trigger_kind_t, a function here, and a value in device/, catalogue/ and harness/.
@@ -14,7 +15,7 @@
 /// True iff every value is in the range stated in est.h. Values that this kind of trigger ignores are checked too.
 static inline bool est_trigger_config_valid(const est_trigger_config_t* const config) {
     const bool known =
-        (config->kind >= EST_TRIGGER_NONE) && (config->kind <= EST_TRIGGER_CUSTOM) &&
+        (config->kind <= EST_TRIGGER_CUSTOM) &&
         (EST_WITH_TRIGGERS || (config->kind == EST_TRIGGER_NONE) || (config->kind == EST_TRIGGER_CUSUM)) &&
         ((config->kind != EST_TRIGGER_CUSTOM) || (config->custom != NULL));
     const bool reset = (config->reset == EST_RESET_COVARIANCE) || (config->reset == EST_RESET_ALL);

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Whitening filter. Consecutive equations of the model have the coloured noise C(z) e. The filter makes it white and
 /// treats every element of the equation alike, so that the equation still holds. It is not 1/C, which would need the
 /// e's before the first equation. It is the innovations filter of a moving average that begins there (Brockwell and

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// can_device: the device on a CAN bus. The identifier of a frame is that of its message in estimator_c/catalogue.
 ///
 /// The bus may have other nodes. A frame is foreign unless it is a data frame with an 11-bit identifier of a message

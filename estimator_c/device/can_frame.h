@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// can_frame: a frame of CAN or CAN FD, independent of controller, adapter or socket.
 ///
 /// Distributed under the terms of the MIT License.

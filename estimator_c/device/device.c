@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "device.h"
 #include "est_assert.h"
 
@@ -315,7 +317,9 @@ static void reset(device_t* const self) {
     self->settings          = settings_default();
     self->running           = false;
     self->report_interval_n = 1U;
-    (void)est_init(&self->estimator, &self->settings.estimator);
+    const bool accepted     = est_init(&self->estimator, &self->settings.estimator);
+    EST_ASSERT(accepted);  // the default configuration is valid
+    (void)accepted;
 }
 
 static uint8_t start(device_t* const self, const uint32_t run) {

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// device: the device under test without its hardware. It receives messages, runs the estimator, and returns answers.
 ///
 /// The messages are those of estimator_c/catalogue. The device sends nothing unasked: each message of the harness has

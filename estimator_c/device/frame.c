@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "frame.h"
 #include "est_assert.h"
 

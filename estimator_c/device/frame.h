@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// frame: serial framing of messages.
 ///
 ///     0x00 | COBS(identifier, payload, CRC-32C) | 0x00        checksum little-endian

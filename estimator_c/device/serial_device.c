@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "serial_device.h"
 #include "est_assert.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// serial_device: the device on a serial line. Messages are framed as in frame.h.
 ///
 /// No heap, no globals, no recursion. The caller owns the state, which belongs to one context.

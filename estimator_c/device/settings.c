@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "settings.h"
 
 #include "analogrig_codec.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// settings: the configuration of a device, accessed by the keys of the catalogue.
 
 #ifndef SETTINGS_H_INCLUDED

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "slcan.h"
 #include "est_assert.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// slcan: CAN frames as lines of text, in the protocol of LAWICEL's adapters (CAN232 version 3, CANUSB version 1.0D).
 /// python-can, Linux's slcand and many tools support it. CAN FD uses the extension of the CANable (d, D, b, B).
 ///

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "slcan_device.h"
 #include "est_assert.h"
 

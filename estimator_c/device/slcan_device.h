@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// slcan_device: the device on a CAN bus of its own, behind an slcan adapter. To its user it is an adapter with a bus
 /// on which the device is the only other node.
 ///

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Run the estimator in every configuration on data that are identical everywhere. Print the numbers of steps and
 /// events, and a hash of all results. bit_exact.py compares the output between compilers and targets.
 

@@ -7,6 +7,7 @@ writes build/cost.json, a list of {name, value, unit, limit, compared_with, rati
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import statistics
@@ -16,6 +17,8 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from estimator_c.evidence import stack
 
 __all__ = ["Cost", "costs", "count_steps", "executed", "link", "main", "missing_tools"]
 
@@ -30,7 +33,7 @@ RESULTS = Path("build/cost.json")
 
 COMPILER = "arm-none-eabi-gcc"
 SIMULATOR = "qemu-system-arm"
-PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm"}
+PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm", "avr-gcc": "gcc-avr avr-libc"}
 
 FLAGS = (
     *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
@@ -333,6 +336,8 @@ def costs(folder: Path) -> Iterator[Cost]:
         yield Cost(f"M4F, {name}", text_bytes, "B", limit, ratio=text_bytes / limit)
     state_bytes = bench.state_bytes("estimator")
     yield Cost("M4F, state: sizeof(est_t)", state_bytes, "B", 320, ratio=state_bytes / 320)
+    for build, level in itertools.product(stack.BUILDS, stack.LEVELS):
+        yield Cost(f"{build.name}, stack of est_step() at {level}", stack.stack_bytes(build, level, folder), "B")
     yield from isolation(bench)
     for processor in (M4F, M3):
         yield from device(bench.device(processor))

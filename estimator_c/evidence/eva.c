@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Entry point for Frama-C's Eva: est_config_valid() with any configuration; then any number of any samples with a
 /// valid configuration of these orders (-DNA=2U and so on). A float may have any value, including NaN and the
 /// infinities. eva.py runs the analysis.

@@ -31,6 +31,8 @@ HERE = Path(__file__).parent
 CORE = HERE.parent / "core"
 RESULTS = HERE.parents[1] / "build" / "eva.json"
 THETA_MAX, NC_MAX = 6, 2
+INIT = f"est_init_na2U_nb3U_nk1U_nc{NC_MAX}U_theta{THETA_MAX}U"
+"""Name that est.h gives to est_init()."""
 
 OPTIONS = (
     "-eva",
@@ -41,7 +43,7 @@ OPTIONS = (
     "-eva-slevel-function=main:2",
     "-eva-widening-delay=1",
     "-eva-widening-period=1",
-    "-eva-split-return-function=orders_valid:0,est_config_valid:0,est_init:0",
+    f"-eva-split-return-function=orders_valid:0,est_config_valid:0,{INIT}:0",
     "-warn-special-float=none",
 )
 """Within a function as many paths are told apart as it has (with an edge in doubt or not, each turn of a loop), but a

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Call the functions that a typical program calls, so that the linker keeps them and drops the rest. -DFOOTPRINT_ALL
 /// adds the rest of the interface, -DFOOTPRINT_ISOLATES isolation.
 
@@ -17,8 +18,8 @@ est_isolation_t isolation;
 #endif
 
 OUTSIDE void reset(void) {
-    config = est_config_default();
-    (void)est_init(&estimator, &config);
+    config                    = est_config_default();
+    sink                      = est_init(&estimator, &config) ? 1.0F : 0.0F;
     const est_sample_t sample = { .u = sink, .y = sink, .valid = true };
     const est_step_t   step   = est_step(&estimator, sample);
     sink                      = step.statistic + est_theta(&estimator, 0U);
@@ -28,7 +29,7 @@ OUTSIDE void reset(void) {
     sink = est_invariants_hold(&estimator) ? 1.0F : 0.0F;
 #endif
 #ifdef FOOTPRINT_ISOLATES
-    (void)est_isolation_init(&isolation, &config, 0.0F);
+    sink = est_isolation_init(&isolation, &config, 0.0F) ? 1.0F : 0.0F;
     est_isolation_enter(&isolation, &estimator, sample, step);
     (void)est_isolation_work(&isolation);
     sink = est_isolation_diagnosis(&isolation).extent;

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Bare-metal program for a Cortex-M: generate the samples of a realistic run, enter them into a subject, and end the
 /// simulation. Instructions in the section .outside are not counted (see cost.py).
 

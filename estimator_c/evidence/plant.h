@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// plant: a mass on a spring and a damper, driven by a square wave and sampled by a 12-bit card with 1 LSB of noise.
 /// Integer arithmetic only, so that every compiler and target computes the same codes.
 

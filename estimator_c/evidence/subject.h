@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// subject: interface of the code that image.c measures. These functions are not counted; those that they call are.
 
 #ifndef SUBJECT_H_INCLUDED

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// The device as a subject: enter the frame of a sample, and write the frames of its answers.
 
 #include "analogrig_catalogue.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// The estimator as a subject. -DSUBJECT_NA=2U, _NB, _NK and _OFFSET set the orders, -DSUBJECT_LOCKED the generator
 /// on the clock of the card, -DSUBJECT_ISOLATES the isolation of the change.
 
@@ -27,9 +28,11 @@ SUBJECT void subject_begin(void) {
 #ifdef SUBJECT_LOCKED
     config.edge_instants = EST_EDGES_LOCKED;
 #endif
-    (void)est_init(&estimator, &config);  // subject_judge() detects a refusal: nothing is counted
+    const bool accepted = est_init(&estimator, &config);
+    (void)accepted;  // subject_judge() detects a refusal: nothing is counted
 #ifdef SUBJECT_ISOLATES
-    (void)est_isolation_init(&isolation, &config, 0.0F);
+    const bool applies = est_isolation_init(&isolation, &config, 0.0F);
+    (void)applies;
 #endif
 }
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Textbook recursive least squares for an ARX model with delay 1: regressor, prediction and update, without checks,
 /// prefilter or trigger. The reference for the cost of the estimator (see cost.py). -DTEXTBOOK_N is the number of
 /// parameters, half of them a's. The order is an argument, as in a library.

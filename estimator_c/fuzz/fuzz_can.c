@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// libFuzzer target for the device on a CAN bus, with and without CAN FD; see fuzz_line.h. Messages of the harness
 /// are mixed with frames of any identifier, kind and length. `make fuzz` builds and runs it.
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// libFuzzer target for the public API of core and isolation: any configuration, any samples, any number of slices of
 /// work. The invariants must hold after every step, and the sanitizers must find nothing. `make fuzz` builds and runs
 /// it.

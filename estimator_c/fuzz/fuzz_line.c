@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "fuzz_line.h"
 
 #include "analogrig_catalogue.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// fuzz_line: common part of the fuzz targets for the device, one for each kind of line. Any bytes and messages are
 /// entered in pieces of any size, and answered into outputs of any size. The output must consist of complete messages
 /// of the device with consecutive numbers. The answers to a message are bounded, the size of the pieces has no

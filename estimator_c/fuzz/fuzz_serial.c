@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// libFuzzer target for the device on a serial line; see fuzz_line.h. `make fuzz` builds and runs it.
 
 #include "analogrig_catalogue.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// libFuzzer target for the device behind slcan: lines, commands and any bytes; see fuzz_line.h. `make fuzz` builds
 /// and runs it.
 

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "est_isolation.h"
 #include "est_assert.h"
 

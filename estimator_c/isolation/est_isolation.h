@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// est_isolation: after an alarm of est.h, diagnose the parameter that has changed (mass, damping or stiffness), its
 /// extent and its onset. Thesis 6.2.1.2 leaves this open.
 ///
@@ -12,8 +13,6 @@
 ///     while (est_isolation_work(&isolation)) { }                           // now, or later and a few calls at a time
 ///     const est_diagnosis_t diagnosis = est_isolation_diagnosis(&isolation);
 ///     if (diagnosis.change != EST_CHANGE_UNDECIDED) { ... }
-///
-/// Distributed under the terms of the MIT License.
 
 #ifndef EST_ISOLATION_H_INCLUDED
 #define EST_ISOLATION_H_INCLUDED
@@ -23,6 +22,9 @@
 #ifdef __cplusplus
 extern "C" {
 #endif
+
+/// A name with the maxima of est.h: files compiled with different ones do not link.
+#define est_isolation_init EST_NAME(est_isolation_init)
 
 /// Number of stored samples: those before the alarm, which contain the onset, and those that wait for
 /// est_isolation_work().
@@ -38,6 +40,7 @@ extern "C" {
 /// Number of effects in every equation: those of M, B, K, and of an impulse at the onset.
 #define EST_ISOLATION_EFFECTS_N 4U
 
+/// Changes that are told apart.
 typedef enum {
     EST_CHANGE_UNDECIDED = 0,  ///< no alarm, or not enough evidence
     EST_CHANGE_MASS      = 1,
@@ -122,7 +125,7 @@ typedef struct {
 /// stay unchanged. `force_zero` is u at F = 0 [codes], from which the force of the spring is counted. Returns false
 /// iff na is not 2, nb + nk exceeds 3, the trigger is not the cumulative sum, or edges may come anywhere. The method
 /// then does not apply and the state is unusable. Cost: constant. RAM: 1.3 kB. May be called from an interrupt.
-bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
+EST_RESULT_USED bool est_isolation_init(est_isolation_t* self, const est_config_t* config, float force_zero);
 
 /// Enter the input and result of an est_step(); to be called after every step. A gap before the diagnosis leaves it
 /// undecided. Cost: some 150 instructions on a Cortex-M4F, at an alarm 2,400 (make cost). May be called from an

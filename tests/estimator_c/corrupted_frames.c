@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Frames of any message, every one of them corrupted, for both decoders; and whether that of the device takes any of them
 /// for something that nobody sent. test_corrupted_frames.py compiles it together with frame.c.
 

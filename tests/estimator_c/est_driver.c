@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /* Runs whole blocks of samples through the public header est.h, for the tests. */
 
 #include "est.h"
@@ -127,7 +128,9 @@ void driver_watch(size_t t, size_t n, const double* u, const double* y, unsigned
     const est_config_t* const kept  = &config;
     const uint8_t             count = est_theta_count(&self);
     for (size_t run = 0; run < t; run++) {
-        (void)est_init(&self, kept);
+        if (!est_init(&self, kept)) {
+            return;
+        }
         for (size_t k = run * n; k < ((run + 1) * n); k++) {
             alarm[k] = est_step(&self, (est_sample_t){ .u = (float)u[k], .y = (float)y[k], .valid = true }).alarm;
         }
@@ -222,8 +225,9 @@ void driver_isolate(size_t               t,
         double* const out = &found[run * 8U];
         out[0] = out[1] = (double)n;
         out[2] = out[3] = 0.0;
-        est_init(&self, &config);
-        est_isolation_init(&isolation, &config, (float)force_zero);
+        if (!est_init(&self, &config) || !est_isolation_init(&isolation, &config, (float)force_zero)) {
+            return;
+        }
         for (size_t k = 0; k < n; k++) {
             const size_t       at     = (run * n) + k;
             const est_sample_t sample = { .u = (float)u[at], .y = (float)y[at], .valid = valid[at] != 0 };
@@ -261,11 +265,12 @@ void driver_diagnose(size_t               n,
                      int*                 worked,
                      double*              found) {
     static est_isolation_t isolation;
-    est_init(&self, &config);
+    if (!est_init(&self, &config) || !est_isolation_init(&isolation, &config, 0.0F)) {
+        return;
+    }
     for (uint8_t i = 0; i < est_theta_count(&self); i++) {
         self.theta[i] = (float)theta[i];
     }
-    est_isolation_init(&isolation, &config, 0.0F);
     for (size_t k = 0; k < n; k++) {
         const est_step_t step = { .status    = (est_status_t)status[k],
                                   .statistic = (float)statistic[k],

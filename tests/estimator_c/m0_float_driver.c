@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /* Runs one routine of estimator_c/ports/cortex_m0/float.S, for the tests: its name is the argument; reads pairs of
    words, the operands, and writes a word for each pair. */
 

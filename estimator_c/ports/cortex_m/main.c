@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// The device as firmware of the MPS2 boards, on either of their first two UARTs (Arm's CMSDK APB UART, DDI 0479):
 /// frames on the first, slcan on the second. The UART that first receives a byte is served until the board is reset.
 /// Interrupts store received bytes in a ring, so that none is lost while the estimator runs. The processor sleeps

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "semihosting.h"
 
 #include <stdbool.h>

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// semihosting: services of a simulator or debugger for its target (Arm semihosting).
 
 #ifndef SEMIHOSTING_H_INCLUDED

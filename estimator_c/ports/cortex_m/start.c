@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Start-up code for any Cortex-M, from reset to main(): vector table, initialised memory, floating-point unit.
 
 #include "semihosting.h"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Arithmetic of float for processors that have neither that nor a long multiplication (ARMv6-M: Cortex-M0, M0+, M1):
 /// the single-precision helpers of Arm's run-time ABI (RTABI32, 4.1.2 and 4.1.4), to be linked ahead of libgcc.
 ///

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// analogrig-device: the device as a process of this computer, behind a pseudo-terminal or a serial device.
 ///
 /// The process ends with its standard input, so that it cannot outlive the process that started it.

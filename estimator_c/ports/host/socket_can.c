@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #define _DEFAULT_SOURCE  // for SO_RXQ_OVFL, which is specific to Linux
 
 #include "socket_can.h"

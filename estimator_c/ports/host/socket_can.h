@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// socket_can: frames of a CAN interface of Linux, as consecutive objects of can_frame_t.
 
 #ifndef SOCKET_CAN_H_INCLUDED

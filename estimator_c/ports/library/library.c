@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "library.h"
 
 size_t library_size(void) { return sizeof(library_t); }

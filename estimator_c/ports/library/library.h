@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// library: the estimator as a shared library of the host. It runs est_step() over blocks of samples, without frames
 /// or links, for campaigns and exploration. The caller owns the state.
 

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "can_device.h"
 #include "device_line.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// device_line: interface between the loop of a port and the shell that it runs.
 ///
 /// Distributed under the terms of the MIT License.

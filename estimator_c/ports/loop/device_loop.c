@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "device_loop.h"
 
 #if (DEVICE_LOOP_INPUT_SIZE < DEVICE_LOOP_LEAST) || (DEVICE_LOOP_OUTPUT_SIZE < DEVICE_LOOP_LEAST)

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// device_loop: the loop of every port (receive, run the device, transmit, sleep), and the functions that a port
 /// provides.
 ///

@@ -1,3 +1,5 @@
+// SPDX-License-Identifier: MIT
+
 #include "device_line.h"
 #include "serial_device.h"
 

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 /// Part of a C library that the generated codecs need; a bare compiler has none. Defined in start.c.
 
 #ifndef STRING_H_INCLUDED
