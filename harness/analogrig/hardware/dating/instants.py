@@ -258,7 +258,7 @@ class _Guess:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _ProfileLikelihood:
     """Profile likelihood: cost of each candidate instant at its best values of the unknowns."""
 
     guess: _Guess
@@ -317,7 +317,7 @@ class _Problem:
         """First and last sample of the search range, for messages."""
         return f"{self.search.start} to {self.search.stop - 1}"
 
-    def fit_beside(self) -> _Fit:
+    def fit_beside(self) -> _ProfileLikelihood:
         """Fit to the samples beside the search range alone; edges anywhere or locked, whichever is more likely."""
         valid = self.signals.valid.copy()
         valid[self.candidates] = False
@@ -327,7 +327,7 @@ class _Problem:
         locked = beside.fit(dataclasses.replace(anywhere.guess, half_width=_LOCKED))
         return min(anywhere, locked, key=lambda each: float(each.cost.min()))
 
-    def fit(self, guess: _Guess) -> _Fit:
+    def fit(self, guess: _Guess) -> _ProfileLikelihood:
         """Iterate ``profile`` from ``guess`` until M, B, K have converged."""
         for _ in range(_ROUNDS):
             last, fit = guess, self.profile(guess)
@@ -336,7 +336,7 @@ class _Problem:
                 break
         return fit
 
-    def profile(self, guess: _Guess) -> _Fit:
+    def profile(self, guess: _Guess) -> _ProfileLikelihood:
         """Profile likelihood of all candidates, linear in the unknowns about ``guess``."""
         old, new = self.filters(guess)
         at = np.append(np.r_[self.candidates], len(self.signals) - 1)
@@ -354,7 +354,7 @@ class _Problem:
         *cost, unchanged = (fit + log + old.log[at] + new.log[at]).tolist()
         best = int(np.argmin(cost))
         limits = np.array([np.inf, np.inf, *[np.inf, *[_LARGEST_STEP] * len(PARAMETERS)] * 2])
-        return _Fit(
+        return _ProfileLikelihood(
             dataclasses.replace(guess, unknowns=unknowns + np.clip(steps[best], -limits, limits), sample=int(at[best])),
             np.array(cost),
             unchanged,
@@ -389,7 +389,7 @@ class _Problem:
         ]
         return max(_LEAST_OVERDISPERSION, colour(innovations), unexplained)
 
-    def objection(self, fit: _Fit, beside: _Fit, divisor: float) -> NoInstant | None:
+    def objection(self, fit: _ProfileLikelihood, beside: _ProfileLikelihood, divisor: float) -> NoInstant | None:
         """Reason to reject the most likely instant; None to accept it."""
         noise_ratio = max(1.0, beside.unexplained)
         if fit.unexplained > _MOST_UNEXPLAINED * noise_ratio or noise_ratio > _MOST_NOISE_RATIO:
