@@ -268,7 +268,7 @@ def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]
                 f"{name}: a recording plays one scenario with one seed: analogrig replay is for it"
             )
         described = config.plain(rig.description())
-        return described if is_emulated(rig) else {"name": name, "kind": "real", "described": described}
+        return described if is_emulated(rig) else {"name": name, "kind": described["kind"], "described": described}
 
 
 def _scenario(base: Scenario, values: Mapping[str, float], spec: CampaignSpec) -> Scenario:

@@ -80,7 +80,7 @@ class Rig(Protocol):
     """Instrument that plays scenarios and yields blocks of samples; a context manager.
 
     ``open_rig`` returns one, ``Bench.play`` uses it. Methods raise RigError if the instrument fails, ConfigurationError
-    if it cannot play a scenario.
+    if it cannot play a scenario. Subclass it; the defaults suit a rig that plays any scenario and holds nothing.
     """
 
     capabilities: frozenset[str]

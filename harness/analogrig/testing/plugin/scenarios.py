@@ -17,8 +17,6 @@ from analogrig.testing.plugin.settings import DUT, RIG, SCENARIO_DIR, Option, ti
 if TYPE_CHECKING:
     from analogrig.testing.statement import Finding
 
-RIG_KINDS = ("emulator", "real")
-
 _FOLDER = pytest.StashKey[Path]()
 """Folder whose scenario files are tests; absent without one."""
 
@@ -75,6 +73,7 @@ def _is_scenario(path: Path) -> bool:
     from analogrig import config
     from analogrig.devices.registry import KINDS
     from analogrig.errors import AnalogrigError
+    from analogrig.rigs.description import KINDS as RIG_KINDS
 
     with contextlib.suppress(AnalogrigError):
         return config.read_toml(path).get("kind", "scenario") not in {*KINDS, *RIG_KINDS}
