@@ -22,5 +22,5 @@ def allowing(rig: str) -> list[str]:
 
 
 def open_allowed(rig: str) -> Rig:
-    """As ``open_rig``."""
+    """Rig as from ``open_rig``, with all that its file names allowed."""
     return open_rig(rig, allow=named_by(rig))

@@ -7,7 +7,7 @@ import pytest
 from tests import tools
 
 CORES = ("m3", "m4", "m7")
-"""Those that QEMU has a board of."""
+"""Cores that QEMU has a board of."""
 
 FOLDER = tools.FIRMWARE
 

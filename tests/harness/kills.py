@@ -49,7 +49,7 @@ class Case:
     check: Callable[[Path, Path], None]
     """Told the folder as it is, and as it was before the command."""
     ends: bool = True
-    """Whether it ends by itself."""
+    """True if the command ends by itself."""
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -161,7 +161,7 @@ def test_order_in_which_chunks_come_changes_nothing(tmp_path: Path, reference: P
 
 
 def test_campaign_goes_on_from_every_state_of_its_journal(tmp_path: Path, reference: Path) -> None:
-    """As if the power had gone after any byte: every length of the last line, and all numbers of lines."""
+    """A loss of power may come after any byte: try every length of the last line, and all numbers of lines."""
     plan, out = planned(tmp_path), tmp_path / "out.json"
     with Journal(journal_of(out), plan) as journal:
         for chunk in plan.chunks():

@@ -46,7 +46,7 @@ def device(arl0: float) -> DeviceDescription:
 
 
 def mean_rate(arl0: float, plays: int, branches: int) -> tuple[float, float]:
-    """Of plays from seed 0 on, with its standard error."""
+    """Mean rate of plays from seed 0 on, with its standard error."""
     rates = [false_alarm_rate(emulator(), device(arl0), HEALTHY, seed, branches).rate for seed in range(plays)]
     return float(np.mean(rates)), float(np.std(rates, ddof=1)) / math.sqrt(plays)
 

@@ -25,10 +25,10 @@ from analogrig.testing.properties.test_detection import SINGLY
 from tests.harness.firmware import needs_firmware
 
 LONG = "rarer_than or of_all_kinds or stay_rare or noticed_soon or faults_of_the_line"
-"""Those for which a line is too slow; its faults are tried apart, with short time-outs."""
+"""Properties for which a line is too slow; its faults are tried apart, with short time-outs."""
 
 FIRMWARE = "found_once or come_to_the_truth or warm_up or answers_with_numbers"
-"""Those of short plays: QEMU takes 1500 samples a second."""
+"""Properties of short plays: QEMU takes 1500 samples a second."""
 
 DIFFERING, MISS = 7e-4, 1e-3
 """So large a part of the samples does not differ, with confidence 99.9 %: 10,000 samples without a difference."""
