@@ -74,7 +74,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
     spec = SPEC.replace("[draw]", "noise_lsb = [0.5]\n[draw]")
     plan = planned(tmp_path, spec)
-    damping = plan.drawn(4)["damping_n_s_per_m"]
+    damping = plan.draw(4)["damping_n_s_per_m"]
     assert 2500.0 < damping < 3021.0
     base = dataclasses.replace(Scenario.load("healthy"), samples=1300)
     plant = dataclasses.replace(base.plant, damping_n_s_per_m=damping)
@@ -85,7 +85,7 @@ def test_trial_is_the_run_of_its_values_and_seed(tmp_path: Path) -> None:
         run = Bench(rig, dut).play(scenario, 4)
     played = play_chunk(plan.as_json(), (2, 1))
     assert [each["seed"] for each in played] == [4, 5]
-    assert played[0] == row(run, judge(run), plan.drawn(4))
+    assert played[0] == row(run, judge(run), plan.draw(4))
 
 
 def test_plan_reads_the_same_after_a_journey_as_text(tmp_path: Path) -> None:

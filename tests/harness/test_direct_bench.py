@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
 from analogrig.devices.dut import open_dut
@@ -14,6 +16,7 @@ from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.scenario import Scenario
+from analogrig_emulator import EmulatorError, Sampler
 
 
 def emulator(name: str) -> EmulatorRig:
@@ -58,6 +61,27 @@ def test_alarms_alone_are_those_of_the_run_across_blocks() -> None:
         assert len(run.alarm_index) >= len(late)
         for name in ("alarm_index", "alarm_kind", "alarm_statistic", "codes", "statistic", "innovation", "flags"):
             assert getattr(run, name).tobytes() == getattr(whole, name).tobytes()
+
+
+def test_rig_that_fails_within_a_play_ends_the_run_and_not_the_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = dataclasses.replace(Scenario.load("healthy"), samples=2 * DIRECT_BLOCK_SAMPLES)
+    bench = direct_bench(emulator("emulator"), describe("inproc"))
+    whole, sample = bench.play(scenario, 1), Sampler.sample
+    blocks: list[int] = []
+
+    def fail_in_second_block(sampler: Sampler, volts: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
+        blocks.append(len(volts))
+        if len(blocks) == 2:
+            raise EmulatorError("the voltage must be finite")
+        return sample(sampler, volts)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Sampler, "sample", fail_in_second_block)
+        run = bench.play(scenario, 1)
+    assert run.conditions.faults == ("the voltage must be finite",)
+    assert run.theta.tobytes() == whole.theta[:DIRECT_BLOCK_SAMPLES].tobytes()
+    assert judge(run).outcome == "inconclusive"
+    assert bench.play(scenario, 1).theta_hash() == whole.theta_hash()
 
 
 def test_length_of_blocks_changes_no_code() -> None:

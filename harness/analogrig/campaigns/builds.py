@@ -1,4 +1,4 @@
-"""What plays a campaign: its builds, identified by file contents, and its commands.
+"""Builds that play a campaign, identified by file contents, and the commands that played it.
 
 The trials of one campaign all come from one build. A name does not identify a build: the firmware, library or analogrig
 behind it may differ on another machine, or when a campaign resumes. The commands stand in a file beside the results,

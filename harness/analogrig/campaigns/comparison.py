@@ -241,7 +241,7 @@ def load(path: Path) -> Side:
     :raises ConfigurationError: two recordings are of one play; names them.
     """
     if path.is_dir() or path.suffix == ".npz":
-        side = Side(_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
+        side = Side(_load_recordings(sorted(path.rglob("*.npz")) if path.is_dir() else [path]))
     else:
         results = Results.load(path)
         cells = zip(results.plan.cells(), results.rows, strict=True)
@@ -261,13 +261,13 @@ def match(a: Side, b: Side) -> tuple[Sequence[Observation], Sequence[Observation
     :raises ConfigurationError: they are of different campaigns, or played nothing in common; names what differs.
     """
     if a.plan is not None and b.plan is not None:
-        _check_same("A and B are different campaigns", _played(a.plan), _played(b.plan))
+        _check_same("A and B are different campaigns", _decisive_settings(a.plan), _decisive_settings(b.plan))
         return a.trials, _in_order(b, _names(a.plan), _names(b.plan))
     if a.plan is not None or b.plan is not None:
         raise ConfigurationError("A and B cannot be compared: one is a campaign, the other are recordings")
     common = {key[:-1] for key, _ in a.trials} & {key[:-1] for key, _ in b.trials}
     if not common:
-        _check_same("A and B played nothing in common", *(_recorded_play(side.trials[0]) for side in (a, b)))
+        _check_same("A and B played nothing in common", *(_recorded_tables(side.trials[0]) for side in (a, b)))
     ours, theirs = ([each for each in side.trials if each[0][:-1] in common] for side in (a, b))
     return ours, theirs
 
@@ -289,12 +289,12 @@ def _in_order(side: Side, wanted: Sequence[str], names: Sequence[str]) -> Sequen
     return [((key[0], wanted.index(names[int(str(key[1]))]), *key[2:]), each) for key, each in side.trials]
 
 
-def _recorded_play(trial: Observation) -> dict[str, Any]:
+def _recorded_tables(trial: Observation) -> dict[str, Any]:
     (scenario, rig, _), _ = trial
     return {"scenario": json.loads(str(scenario)), "rig": json.loads(str(rig))}
 
 
-def _played(plan: Plan) -> dict[str, Any]:
+def _decisive_settings(plan: Plan) -> dict[str, Any]:
     """Settings that decide what a campaign played, without its devices and names."""
     table = plan.as_table()
     spec = {key: value for key, value in table["spec"].items() if key not in _NAMES}
@@ -303,8 +303,8 @@ def _played(plan: Plan) -> dict[str, Any]:
     return {
         **spec,
         "devices": len(plan.devices),
-        "scenario": _unnamed(table["scenario"]),
-        "rigs": [_unnamed(rig) for rig in table["rigs"]],
+        "scenario": _without_names(table["scenario"]),
+        "rigs": [_without_names(rig) for rig in table["rigs"]],
     }
 
 
@@ -312,7 +312,7 @@ _NAMES = frozenset({"name", "description", "scenario", "rigs", "devices", "sampl
 """Keys of a campaign's file that are irrelevant, or whose contents are in the plan."""
 
 
-def _unnamed(table: Mapping[str, Any]) -> dict[str, Any]:
+def _without_names(table: Mapping[str, Any]) -> dict[str, Any]:
     """Table without its name and description, unless it has nothing else."""
     rest = {key: value for key, value in table.items() if key not in {"name", "description"}}
     return rest or dict(table)
@@ -323,19 +323,19 @@ def _valid(trials: Sequence[Observation]) -> dict[tuple[object, ...], Row]:
     return {key: each for key, each in trials if is_valid(each)}
 
 
-def _recordings(paths: Sequence[Path]) -> tuple[Observation, ...]:
+def _load_recordings(paths: Sequence[Path]) -> tuple[Observation, ...]:
     found: dict[tuple[object, ...], tuple[Path, Row]] = {}
     for path in paths:
-        key, trial = _recorded(path)
+        key, trial = _load_recording(path)
         if key in found:
             raise ConfigurationError(f"{found[key][0]} and {path} are of one scenario, rig and seed: which is meant?")
         found[key] = path, trial
     return tuple((key, trial) for key, (_, trial) in found.items())
 
 
-def _recorded(path: Path) -> Observation:
+def _load_recording(path: Path) -> Observation:
     run = Run.load(path)
     of = run.conditions
     played = json.dumps(dict(of.scenario), sort_keys=True)  # many may have one name: what strategies draw
-    machine = json.dumps(_unnamed(of.rig), sort_keys=True)
+    machine = json.dumps(_without_names(of.rig), sort_keys=True)
     return (played, machine, of.seed), row(run, judge(run))

@@ -159,14 +159,14 @@ class Plan:
             self.spec.first_seed + first, self.spec.first_seed + min(first + self.spec.chunk, self.spec.trials)
         )
 
-    def drawn(self, seed: int) -> dict[str, float]:
+    def draw(self, seed: int) -> dict[str, float]:
         """Drawn values of a trial, by axis name."""
         rng = np.random.default_rng([seed, _DRAWS])
         return {axis: float(rng.uniform(low, high)) for axis, (low, high) in self.spec.draw.axes().items()}
 
     def case(self, cell: Cell, seed: int, drawn: Mapping[str, float] | None = None) -> Case:
         """:raises ConfigurationError: the values make no scenario."""
-        values = {**cell.values, **(self.drawn(seed) if drawn is None else drawn)}
+        values = {**cell.values, **(self.draw(seed) if drawn is None else drawn)}
         try:
             scenario = _scenario(Scenario.from_table(self.scenario, "the campaign's scenario"), values, self.spec)
         except ValueError as error:
@@ -190,10 +190,10 @@ class Plan:
         if "noise_lsb" in axes and any("card" not in table for table in self.rigs):
             raise ConfigurationError(f"{where}: noise_lsb is for emulated rigs")
         for cell in self.cells():
-            for drawn, opposite in (*itertools.permutations(spec.draw.corners(), 2), (self.drawn(spec.first_seed), {})):
+            for drawn, opposite in (*itertools.permutations(spec.draw.corners(), 2), (self.draw(spec.first_seed), {})):
                 problem = self._problem(cell, drawn)
                 if problem:
-                    raise ConfigurationError(f"{where}: {self._blamed(cell, drawn, opposite)}{problem}")
+                    raise ConfigurationError(f"{where}: {self._blame(cell, drawn, opposite)}{problem}")
 
     def _problem(self, cell: Cell, drawn: Mapping[str, float]) -> str:
         """Reason why such a trial cannot be set up on an emulated rig; empty if it can."""
@@ -205,7 +205,7 @@ class Plan:
             return str(error)
         return ""
 
-    def _blamed(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
+    def _blame(self, cell: Cell, corner: dict[str, float], opposite: dict[str, float]) -> str:
         """Error prefix with the drawn value at fault.
 
         It names the one value that is wrong by itself, or all values if none is. It is empty if the opposite corner
@@ -303,9 +303,9 @@ def _differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, str, str
         for i, (mine, other) in enumerate(zip(a, b, strict=True)):
             yield from _differences(mine, other, f"{name}[{i}]")
     elif a != b:
-        yield name, _shown(a), _shown(b)
+        yield name, _value_text(a), _value_text(b)
 
 
-def _shown(value: Any) -> str:
+def _value_text(value: Any) -> str:
     text = "absent" if value is _ABSENT else repr(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -129,7 +129,7 @@ def play_chunk(plan: str, chunk: tuple[int, int]) -> list[Row]:
 
 def _play_trial(plan: Plan, cell: Cell, seed: int) -> Row:
     """Row of a trial. One that cannot be played is inconclusive: the next one may succeed."""
-    drawn = plan.drawn(seed)
+    drawn = plan.draw(seed)
     try:
         run = _benches.play(plan.case(cell, seed))
     except (DeviceError, LinkError, RigError) as error:

@@ -123,7 +123,7 @@ class _Climbs:
         self._settings = settings
         self._estimator = estimator
         (self._play,) = performance.blocks
-        self._signals = _entered(self._play)
+        self._signals = _estimator_inputs(self._play)
         self._noise_lsb = performance.channels["force"].noise_lsb
         self._rng = rng
         self._samples = 0
@@ -198,11 +198,11 @@ class _Climbs:
         normals = self._rng.standard_normal((*index.shape, len(CHANNELS)))
         normals[:, :, _DISPLACEMENT] *= going.louder[:, None]
         codes, clipped = self._rig.sampler(self._rng).sample(volts, normals.reshape(volts.shape))
-        signals = _entered(Block(0, volts, codes, clipped))
+        signals = _estimator_inputs(Block(0, volts, codes, clipped))
         return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, _DISPLACEMENT]
 
 
-def _entered(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+def _estimator_inputs(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
     """Estimator inputs of one block: force, displacement, and True for each sample that is not missing; (n,) each."""
     force, displacement, missing = block.signals()
     return force, displacement, ~missing

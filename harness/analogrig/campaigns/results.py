@@ -129,7 +129,7 @@ class Summary:
         latencies = sorted(change.latency_n for change in found if change.latency_n is not None)
         bounds = [each.bound_n for each in found if each.latency_n is not None and each.bound_n is not None]
         errors = [each["errors"] for each in sound if each["errors"]]
-        rates = {name: rate.known(counted, CONFIDENCE).bounds for name, rate in RATES.items()}
+        rates = {name: rate.sequence(counted, CONFIDENCE).bounds for name, rate in RATES.items()}
         return cls(
             **counted,
             trials=len(rows),

@@ -131,7 +131,9 @@ class Rate:
     expected: float
     """Rate at which the bounds are tightest."""
 
-    def known(self, counted: Mapping[str, int], confidence: float, around: float | None = None) -> ConfidenceSequence:
+    def sequence(
+        self, counted: Mapping[str, int], confidence: float, around: float | None = None
+    ) -> ConfidenceSequence:
         """Confidence sequence for the rate; ``around`` overrides the rate at which its bounds are tightest."""
         expected = self.expected if around is None else around
         return ConfidenceSequence(confidence, expected, trials=counted[self.exposure], events=counted[self.events])

@@ -16,7 +16,7 @@ MAX_CELLS, MAX_TRIALS = 10_000, 10_000_000
 
 @dataclass(frozen=True)
 class _Axes:
-    """What can be varied: plant at the start, factors at the change, rms noise of the card."""
+    """Axes that can be varied: plant at the start, factors at the change, rms noise of the card."""
 
     mass_kg: tuple[float, ...] = ()
     damping_n_s_per_m: tuple[float, ...] = ()

@@ -45,7 +45,7 @@ def anytime_text(counted: Mapping[str, int]) -> str:
     parts = []
     for name, rate in RATES.items():
         if counted[rate.exposure]:
-            below = rate.known(counted, CONFIDENCE).bounds[1]
+            below = rate.sequence(counted, CONFIDENCE).bounds[1]
             events, exposure = counter_text(counted[name], name), counter_text(counted[rate.exposure], rate.unit)
             parts.append(f"{events} in {exposure} (rate below {below:.2g})")
     return ", ".join(parts)
