@@ -80,15 +80,17 @@ WAYS: tuple[tuple[LinkKind, ExchangeKind], ...] = (
 """Exchanges of the link; a classic frame carries no block."""
 
 
-def signals() -> NDArray[np.uint16]:
-    """(MOST_N, 4) codes of a second-order system whose gain grows at CHANGE_AT and is as before from BACK_AT on,
-    long enough for a diagnosis; velocity and net force are zero."""
+def signals(back_at: int = BACK_AT) -> NDArray[np.uint16]:
+    """(MOST_N, 4) codes of a second-order system; velocity and net force are zero.
+
+    Its gain grows at CHANGE_AT and is as before from ``back_at`` on, long enough for a diagnosis.
+    """
     rng = np.random.default_rng(7)
     codes = np.zeros((MOST_N, len(CHANNELS)))
     u = np.where((np.arange(MOST_N) // 8) % 2, 3900.0, 150.0)
     y = np.zeros(MOST_N)
     for k in range(2, MOST_N):
-        gain = 1.4 if CHANGE_AT <= k < BACK_AT else 1.0
+        gain = 1.4 if CHANGE_AT <= k < back_at else 1.0
         y[k] = 1.5 * y[k - 1] - 0.54 * y[k - 2] + gain * (0.01 * u[k - 1] + 0.02 * u[k - 2])
     codes[:, CHANNELS.index("force")] = u
     codes[:, CHANNELS.index("displacement")] = np.clip(np.round(y + rng.normal(size=MOST_N)), 0, 4095)
