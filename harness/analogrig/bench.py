@@ -32,7 +32,8 @@ Progress = Callable[[int, int], None]
 _RETAINED_BYTES = 30_000_000
 """Freed memory that the allocator keeps for the next play."""
 
-INTERRUPTED_BY_USER = "interrupted by the user"
+_INTERRUPTED_BY = "interrupted by "
+"""Start of the fault of an interrupted run; the name of the signal follows."""
 
 DIRECT_BLOCK_SAMPLES = 16_384
 """Block length in samples of a direct bench; such blocks fit in the cache."""
@@ -116,12 +117,17 @@ def _shift_replies(first: int, reply: Replies) -> Replies:
     )
 
 
-def raise_if_interrupted(run: Run) -> Run:
-    """Return ``run`` if the user did not interrupt it.
+def was_interrupted(run: Run) -> bool:
+    """True if a signal ended the run."""
+    return any(fault.startswith(_INTERRUPTED_BY) for fault in run.conditions.faults)
 
-    :raises KeyboardInterrupt: the user interrupted the run.
+
+def raise_if_interrupted(run: Run) -> Run:
+    """Return ``run`` if no signal ended it.
+
+    :raises KeyboardInterrupt: a signal ended the run.
     """
-    if INTERRUPTED_BY_USER in run.conditions.faults:
+    if was_interrupted(run):
         raise KeyboardInterrupt
     return run
 
@@ -229,8 +235,8 @@ class Bench:
                 self.dut.handshake()  # the device awaits samples; a handshake keeps this run out of the next one
         except (DeviceError, LinkError) as error:
             faults.append(str(error))
-        except KeyboardInterrupt:
-            faults.append(INTERRUPTED_BY_USER)
+        except KeyboardInterrupt as error:
+            faults.append(f"{_INTERRUPTED_BY}{str(error) or 'SIGINT'}")
         if pace is not None and pace.overruns:
             faults.append(
                 f"{pace.overruns} of {pace.messages} messages of samples overran: late, or the window was full"

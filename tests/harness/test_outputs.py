@@ -211,7 +211,7 @@ def test_folder_says_that_the_run_has_not_ended_until_a_signal_keeps_what_was_re
         said, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
-    assert "INCONCLUSIVE" in said
+    assert "INCONCLUSIVE" in said and "interrupted by SIGTERM" in said
     assert verdict(out)["outcome"] == page_outcome(out) == "inconclusive"
     run = Run.load(out / "run.npz")
     assert 0 < run.samples < 2_000_000

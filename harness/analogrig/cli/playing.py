@@ -203,7 +203,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
 
     :param identity: of this command.
     """
-    from analogrig.bench import INTERRUPTED_BY_USER
+    from analogrig.bench import was_interrupted
     from analogrig.errors import RecordingError
     from analogrig.judging.verdict import judge
     from analogrig.output import REPORT_FILE, RUN_FILE
@@ -232,7 +232,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
         show(f"{summary(run, verdict)}\nreport: {output.page}\nrun:    {output.path / RUN_FILE}")
     if not verdict.valid:
         complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
-    return INTERRUPTED if INTERRUPTED_BY_USER in run.conditions.faults else STATUS[verdict.outcome]
+    return INTERRUPTED if was_interrupted(run) else STATUS[verdict.outcome]
 
 
 def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolder) -> dict[str, Any]:
