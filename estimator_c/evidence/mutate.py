@@ -67,7 +67,7 @@ GENERATED = ROOT / "build" / "generated"
 TESTS = (
     *("tests/estimator_c/test_est_estimation.py", "tests/estimator_c/test_est_watch.py"),
     *("tests/estimator_c/test_est_trigger.py", "tests/estimator_c/test_est_adversarial.py"),
-    *("tests/estimator_c/test_numerics.py", "tests/harness/test_reference.py"),
+    *("tests/estimator_c/test_numerics.py", "tests/estimator_c/test_reference.py"),
 )
 LONG = "not millions_of_samples and not long_free_running and not rarer_than_promised"
 DEADLINE_S = 8
@@ -303,7 +303,7 @@ KEPT = {
     "tests.estimator_c.test_est_trigger": ("suspension", "statistic_of_the_twin"),
     "tests.estimator_c.test_est_estimation": ("batch",),
     "tests.estimator_c.test_numerics": ("wide",),
-    "tests.harness.test_reference": ("followed",),
+    "tests.estimator_c.test_reference": ("followed",),
 }
 """Functions of the tests that take time and do not ask the core. A module comes before those that import from it."""
 
