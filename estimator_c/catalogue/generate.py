@@ -3,9 +3,9 @@
 From analogrig.dbc beside this file come
 
 - ``OUT_C_DIR/analogrig_codec.{h,c}``: cantools' own C codec, one struct with pack and unpack for each message;
-- ``OUT_C_DIR/analogrig_catalogue.{h,c}``: what that codec lacks: the hash of the catalogue, and for each identifier the
-  exact length (unpack accepts a longer buffer), the sender, and whether its serial frame is seeded; strides for the
-  repeated signals of a block;
+- ``OUT_C_DIR/analogrig_catalogue.{h,c}``: additions to that codec: the hash of the catalogue; for each identifier the
+  exact length (unpack accepts a longer buffer), the sender, and the seed of its serial frame; strides for the repeated
+  signals of a block;
 - ``OUT_PY``: the same as plain Python tables, so that the harness needs no cantools.
 
 The same catalogue gives the same files on every machine and day. A file that would not change is left alone.

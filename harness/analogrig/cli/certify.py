@@ -1,4 +1,4 @@
-"""``analogrig certify``: whether a device raises false alarms rarely enough."""
+"""``analogrig certify``: test of a device's false-alarm rate against a limit."""
 
 from __future__ import annotations
 
