@@ -24,13 +24,19 @@ from analogrig.rigs.description import describe
 from analogrig.rigs.emulator import CardDescription, ComputerDescription, MeasuredValues
 from analogrig.scenario import Scenario
 
-DOCS = Path(__file__).parents[1] / "harness" / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "harness" / "docs"
 PAGES = sorted(path for folder in ("tutorials", "howto", "background") for path in (DOCS / folder).glob("*.md"))
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?:^|\s)(analogrig (?!serve --port 5000 &).*)$")
-MOST_WORDS = 25
-NO_PROSE = re.compile(r"^```.*?^```|^:::.*?^::::$|^(?:\||#)[^\n]*$", re.MULTILINE | re.DOTALL)
-"""Blocks, tables and headings."""
+PROSE = [
+    *(path for path in sorted(DOCS.rglob("*.md")) if path.parent.name != "reference"),
+    *(ROOT / name for name in ("README.md", "harness/README.md", "emulator/README.md", "harness/examples/README.md")),
+]
+MOST_WORDS, MOST_CELL_WORDS, MOST_COLUMNS = 25, 20, 100
+BLOCKS = re.compile(r"^ *```.*?^ *```|^:::.*?^::::$", re.MULTILINE | re.DOTALL)
+NO_PROSE = re.compile(r"^(?:\||#|!\[)[^\n]*$", re.MULTILINE)
+"""Tables, headings and pictures."""
 RUN_BY_ANOTHER_TEST = {"serve-the-emulator"}
 """Pages whose Python needs a server: tests/served/test_page.py."""
 SET_BY_THE_HARNESS = {"force_zero"}
@@ -135,16 +141,16 @@ def test_page_has_every_key(page: str, described: type) -> None:
     assert [key for key in keys if not re.search(rf"\b{key}\b", text)] == []
 
 
-def test_sentences_of_the_pages_are_short() -> None:
-    long = []
-    for path in sorted(DOCS.rglob("*.md")):
-        if path.parent.name == "reference":
-            continue
-        text = NO_PROSE.sub("", path.read_text(encoding="utf-8"))
-        long += [
-            f"{path.name}: {s}" for s in re.split(r"(?<=[.!?:])\s+|\n\n|\n- ", text) if len(s.split()) > MOST_WORDS
-        ]
-    assert not long
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: str(page.relative_to(ROOT)))
+def test_sentences_cells_and_lines_are_short(page: Path) -> None:
+    text = BLOCKS.sub("", page.read_text(encoding="utf-8"))
+    prose = NO_PROSE.sub("", text)
+    sentences = re.split(r"(?<=[.!?:])\s+|\n\n|\n *- |\n\d+\. ", prose)
+    cells = [cell for line in text.splitlines() if line.startswith("|") for cell in re.split(r" \| |[.;:] ", line)]
+    long = [sentence for sentence in sentences if len(sentence.split()) > MOST_WORDS]
+    long += [cell for cell in cells if len(cell.strip("| ").split()) > MOST_CELL_WORDS]
+    long += [line for line in prose.splitlines() if len(line) > MOST_COLUMNS]
+    assert long == []
 
 
 def test_every_page_of_a_key_is_written_from_the_dataclass_that_reads_it(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ MADE_UP = {
     ),  # files of a reader
     *("claims.json", "report.html", "run.npz", "simulated.npz", "thesis.html", "verdict.json"),  # results
     *("/run", "dx/dt", "generated/", "without/", "suite/"),  # in a guest, or beside the page
+    *("components/", "libraries/"),  # folders of a reader's project
 }
 """Paths of files that are not in this repository, and directories named by their last part."""
 

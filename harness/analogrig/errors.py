@@ -1,25 +1,25 @@
-"""What can go wrong, as one tree; every message is one line that names the cause and the place.
+"""Tree of all errors. Every message is one line that names the cause and the place.
 
 AnalogrigError
 ├── ConfigurationError          a file, key, value or command-line argument is wrong
 ├── RecordingError              a recording cannot be read or written
 ├── RigError                    the rig failed
 │   ├── RigTimeout              the instrument did not answer, or finish, in time
-│   ├── RigClosed               the instrument cannot be reached, or is gone
+│   ├── RigClosed               the instrument is unreachable or disconnected
 │   ├── RigRefused              the instrument refused a command
-│   ├── RecordIncomplete        the record that it gave is not whole
-│   ├── RecordStale             the record that it gave is an old one
-│   └── SelfTestError           its self-test could not be made
-├── WorkerError                 the workers of a campaign cannot be had or kept
+│   ├── RecordIncomplete        the record has fewer samples than asked
+│   ├── RecordStale             the record is an old one
+│   └── SelfTestError           the self-test could not be made
+├── WorkerError                 workers of a campaign failed to start, or were lost
 ├── LinkError                   the link failed
-│   ├── LinkTimeout             nothing came in time
-│   └── LinkClosed              the other end is gone
+│   ├── LinkTimeout             no answer in time
+│   └── LinkClosed              the other end has closed
 ├── TimeLimitReached            the time limit of the run is over
-└── DeviceError                 the device answers, but not as it should
-    ├── CatalogueMismatch       it was built from another message catalogue
-    └── DeviceRefused           it refused a command or a value
+└── DeviceError                 the device gave a wrong answer
+    ├── CatalogueMismatch       the device has another message catalogue
+    └── DeviceRefused           the device refused a command or a value
 
-Errors of the operating system and of libraries are wrapped once, where they appear; the cause is kept.
+Errors of the operating system and of libraries are wrapped once, where they occur; the cause is kept.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from analogrig.wording import one_line
 
 
 class AnalogrigError(Exception):
-    """The root: catch this to catch everything that the harness raises on purpose."""
+    """Root of all errors that the harness raises on purpose."""
 
     def __init__(self, message: str = "") -> None:
         super().__init__(one_line(message))
@@ -51,7 +51,7 @@ class RigTimeout(RigError):  # noqa: N818 - the word of the field
 
 
 class RigClosed(RigError):  # noqa: N818 - the word of the field
-    """The instrument cannot be reached, or is gone."""
+    """The instrument is unreachable or disconnected."""
 
 
 class RigRefused(RigError):  # noqa: N818 - the word of the field
@@ -59,23 +59,23 @@ class RigRefused(RigError):  # noqa: N818 - the word of the field
 
 
 class RecordIncomplete(RigError):  # noqa: N818 - the word of the field
-    """The record that the instrument gave is not whole."""
+    """The record has fewer samples than asked."""
 
 
 class RecordStale(RigError):  # noqa: N818 - the word of the field
-    """The record that the instrument gave is an old one."""
+    """The record is an old one."""
 
 
 class SelfTestError(RigError):
-    """The self-test of the rig could not be made: nothing is known about it."""
+    """The self-test of the rig could not be made."""
 
 
 class WorkerError(AnalogrigError):
-    """The workers of a campaign cannot be had or kept."""
+    """Workers of a campaign failed to start, or were lost."""
 
 
 class LinkError(AnalogrigError):
-    """The link failed: nothing can be said about the device."""
+    """The link failed. The run proves nothing about the device."""
 
 
 class LinkTimeout(LinkError):  # noqa: N818 - the word of the field
@@ -83,7 +83,7 @@ class LinkTimeout(LinkError):  # noqa: N818 - the word of the field
 
 
 class LinkClosed(LinkError):  # noqa: N818 - the word of the field
-    """The other end is gone."""
+    """The other end has closed."""
 
 
 class TimeLimitReached(AnalogrigError):  # noqa: N818 - the word of the field
@@ -91,11 +91,11 @@ class TimeLimitReached(AnalogrigError):  # noqa: N818 - the word of the field
 
 
 class DeviceError(AnalogrigError):
-    """The device answers, but not as it should."""
+    """The device gave a wrong answer."""
 
 
 class CatalogueMismatch(DeviceError):  # noqa: N818 - the word of the field
-    """The device was built from another message catalogue."""
+    """The device has another message catalogue."""
 
 
 class DeviceRefused(DeviceError):  # noqa: N818 - the word of the field

@@ -7,6 +7,7 @@ import ast
 import dataclasses
 import functools
 import inspect
+import itertools
 import re
 import textwrap
 import types
@@ -18,6 +19,7 @@ from typing import Any, Literal
 import cantools
 
 import analogrig
+import analogrig_emulator
 from analogrig import cli, errors
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.devices.registry import KINDS
@@ -56,7 +58,8 @@ def write_reference(folder: Path) -> None:
     """Write every reference page into ``folder`` and remove others. Unchanged pages keep their time stamp."""
     pages: dict[str, Callable[[], Iterable[str]]] = {
         "commands": _commands,
-        "python": _python,
+        "python": functools.partial(_python, analogrig, "Python interface"),
+        "emulator": functools.partial(_python, analogrig_emulator, "Python interface of the emulator"),
         "c": _c_interface,
         "messages": _messages,
         "errors": _errors,
@@ -210,17 +213,36 @@ def _default(field: dataclasses.Field[Any]) -> str:
 # --------------------------------------------------------------------------------------------------------------- Python
 
 
-def _python() -> Iterator[str]:
-    yield "# Python interface"
+def _python(package: types.ModuleType, title: str) -> Iterator[str]:
+    yield f"# {title}"
     yield ""
-    yield "`import analogrig` offers these names and no others. Everything else is private and may move."
-    for name in sorted(analogrig.__all__, key=str.lower):
-        thing = getattr(analogrig, name)
+    yield f"`import {package.__name__}` offers these names and no others. Everything else is private and may move."
+    constants = _constant_texts(Path(str(package.__file__)).parent)
+    for name in sorted(package.__all__, key=str.lower):
+        thing = getattr(package, name)
+        is_value = not callable(thing) and not inspect.ismodule(thing)
+        text = constants.get(name, "") if is_value else inspect.getdoc(thing) or ""
+        if not text:
+            continue
         yield from ("", f"## {name}", "")
         yield from _signature(name, thing)
-        yield _documentation(inspect.getdoc(thing) or "")
+        yield _documentation(text)
         if inspect.isclass(thing):
             yield from _members(thing)
+
+
+def _constant_texts(folder: Path) -> dict[str, str]:
+    """Return the docstring under each constant of the modules of a package."""
+    out: dict[str, str] = {}
+    for path in folder.rglob("*.py"):
+        body = ast.parse(path.read_text(encoding="utf-8")).body
+        for statement, text in itertools.pairwise(body):
+            targets = statement.targets if isinstance(statement, ast.Assign) else []
+            targets = [statement.target] if isinstance(statement, ast.AnnAssign) else targets
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                names = (each.id for each in ast.walk(ast.List(targets)) if isinstance(each, ast.Name))
+                out.update(dict.fromkeys(names, inspect.cleandoc(str(text.value.value))))
+    return out
 
 
 def _signature(name: str, thing: Any) -> Iterator[str]:

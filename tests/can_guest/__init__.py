@@ -1,1 +1,1 @@
-"""SocketCAN for machines whose kernel has none: a guest under QEMU, and the tests that run in it (README.md)."""
+"""Guest under QEMU with SocketCAN, for machines whose kernel has none, and the tests that run in it (README.md)."""

@@ -1,4 +1,4 @@
-"""The tests of suite/ in a guest: results in build/can_guest. python -m tests.can_guest [ARGUMENT OF PYTEST...]."""
+"""Run the tests of suite/ in a guest; results in build/can_guest. python -m tests.can_guest [ARGUMENT OF PYTEST...]."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REPORT = "junit.xml"
 TIME_LIMIT_S = 3000.0
 """Limit for the whole suite in the guest, which takes a minute on an idle machine."""
 WITHIN = "ANALOGRIG_CAN_GUEST"
-"""Set in the guest, where alone the tests are safe: they take interfaces down and disturb the bus."""
+"""Variable that is set in the guest. The tests take interfaces down and disturb the bus: elsewhere they are unsafe."""
 
 _NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
 _ENVIRONMENT = {
@@ -40,7 +40,7 @@ _PYTEST = (
 
 
 def run_suite(results: Path, arguments: Sequence[str] = (), console: IO[bytes] | None = None) -> int:
-    """Pytest's status; its report is then in ``results``.
+    """Run pytest in the guest and return its status. Its report is in ``results``.
 
     :raises GuestError: it did not come to an end.
     """
@@ -58,14 +58,14 @@ def run_suite(results: Path, arguments: Sequence[str] = (), console: IO[bytes] |
 
 
 def _compile() -> None:
-    """Let Python compile here what it would compile in the guest, ten times as slowly and at every run."""
+    """Compile the Python sources on the host. The guest would compile them at every run, ten times as slowly."""
     command = [*map(str, _PYTEST), "--collect-only", "-q"]
     environment = {**_ENVIRONMENT, "PATH": os.environ.get("PATH", "")}
     subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, check=False)  # what fails will fail there
 
 
 def throughput_in_guest() -> dict[str, float]:
-    """Samples per second over SocketCAN; emulated, so slower than any real machine; none where there is no guest."""
+    """Samples per second over SocketCAN in the guest, slower than on a real machine. Empty if there is no guest."""
     if guest.lacking() is not None:
         return {}
     report = "throughput.json"

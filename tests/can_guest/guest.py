@@ -1,14 +1,13 @@
-"""One run of the guest: boots in three seconds, runs a command on the files of this computer, is gone.
+"""Run one command in a guest, on the files of this computer. The guest boots in three seconds.
 
-    kernel   Debian's own (linux.py), without a boot loader; what it starts with is made here: ``init``, a shell script,
-             with busybox, modules, and the command
+    kernel   Debian's own (linux.py), without a boot loader. Its first files are made here: ``init``, a shell script,
+             busybox, modules and the command
     CAN      vcan0, classic and FD; can0 to can2, Kvaser PCI controllers (SJA1000) on one bus at 500 kbit/s
-    files    this computer's, not to be written to, over 9p; /run is memory; /run/results is a folder of the caller's
-    results  what the command leaves in /run/results; its status in /run/results/status; what it prints, on the console
+    files    this computer's, read-only, over 9p; /run is memory; /run/results is a folder of the caller's
+    results  files of the command in /run/results, its status in /run/results/status, its output on the console
 
 QEMU emulates every instruction: a program takes ten to twenty times as long as outside. It runs below a tether
-(harness/analogrig/devices/child.py), so that it ends with whoever started it, and may not run for longer than it was
-given.
+(harness/analogrig/devices/child.py), so that it ends with its parent process and within its time limit.
 """
 
 from __future__ import annotations
@@ -30,22 +29,22 @@ NEEDED = (QEMU, "ip", "guest kernel")
 """Tools of tests/tools.py. The guest runs the host's `ip`."""
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 RESULTS = Path("/run/results")
-"""As the guest sees it."""
+"""Folder of results, as seen by the guest."""
 MEMORY = "1G"
 CONTROLLERS = 3
 
 _KERNEL_OPTIONS = "console=ttyS0 quiet panic=-1 clocksource=acpi_pm no_timer_check mitigations=off"
-"""What the kernel measures at boot is wrong where the machine is busy. With the processor's own counter, time went
-thrice as fast. The check of the timer counts its ticks in a short while, and panics when too few have come."""
+"""Options with fixed clocks: the kernel measures clocks wrongly at boot on a busy machine. With the processor's own
+counter, time went three times as fast. The timer check counts ticks for a short time and panics if there are few."""
 _INIT = Path(__file__).parent / "init"
 
 
 class GuestError(Exception):
-    """The guest did not come to the end of its command, and why."""
+    """The guest did not finish its command."""
 
 
 def lacking() -> str | None:
-    """What this computer lacks to run a guest, with the cure."""
+    """Missing prerequisites of a guest, with the cure."""
     missing = tools.missing(NEEDED)
     return tools.reason(missing) if missing else None
 
@@ -59,7 +58,7 @@ def run(
     time_limit_s: float,
     console: IO[bytes] | None = None,
 ) -> int:
-    """Run a command in a guest of its own, in a folder of this computer; returns its status.
+    """Run a command in a guest of its own, in a folder of this computer, and return its status.
 
     What the command puts into /run/results is then in ``results``. What it prints goes to ``console``, or where this
     program prints.
@@ -131,7 +130,7 @@ def _until_it_ends(qemu: Sequence[str | Path], time_limit_s: float, console: IO[
 
 
 def _memory() -> dict[str, tuple[int, bytes]]:
-    """Modes and contents of the files that the guest starts with."""
+    """Modes and contents of the first files of the guest."""
     modules = {f"modules/{path.name}": (0o644, path.read_bytes()) for path in sorted(MODULES.iterdir())}
     return {
         "init": (0o755, _INIT.read_bytes()),

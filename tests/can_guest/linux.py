@@ -1,7 +1,7 @@
-"""Debian's own kernel for the guest: its files alone, out of its package, for any user and without installing it.
+"""Extract Debian's kernel for the guest from its package, without installing it.
 
-python -m tests.can_guest.linux writes build/can_guest/linux: vmlinux, unpacked, which QEMU starts in half the time; the
-modules in the order in which they are loaded; busybox, which loads them. The kernel for clouds has no CAN.
+python -m tests.can_guest.linux writes build/can_guest/linux: vmlinux, unpacked, since QEMU starts it in half the time;
+the modules in load order; busybox, which loads them. The kernel for clouds has no CAN.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ BUSYBOX = FOLDER / "busybox"
 MODULES = FOLDER / "modules"
 
 META_PACKAGE = "linux-image-amd64"
-"""What it depends on is the newest kernel of this Debian."""
+"""Meta-package, which depends on the newest kernel of this Debian."""
 WANTED = ("virtio_pci", "9pnet_virtio", "9p", "can_raw", "vcan", "kvaser_pci", "sch_netem")
-"""The host's files; the sockets; an interface without hardware, one with; a queue that fills."""
+"""Modules for the host's files, sockets, a virtual interface, a controller, and a queue that fills."""
 XZ = b"\xfd7zXZ\0"
 
 KERNEL_FILES = re.compile(
     r"\./boot/vmlinuz-.*|"
     r"\./(?:usr/)?lib/modules/[^/]*/kernel/(?:drivers/(?:virtio|net/can)|fs/(?:9p|fscache|netfs)|net/(?:9p|can|sched))/.*\.ko"
 )
-"""Where those are, and what they depend on."""
+"""Folders of those modules and of their dependencies."""
 
 
 class LinuxError(Exception):
-    """There is no kernel for the guest, and why."""
+    """There is no kernel for the guest."""
 
 
 def vmlinux(bz_image: bytes) -> bytes:
-    """The kernel that is packed in a bzImage (Documentation/x86/boot.rst: setup_sects, payload_offset, payload_length).
+    """Kernel packed in a bzImage (Documentation/x86/boot.rst: setup_sects, payload_offset, payload_length).
 
     :raises LinuxError: it is not packed with xz, as Debian's is.
     """
@@ -54,7 +54,7 @@ def vmlinux(bz_image: bytes) -> bytes:
 
 
 def needed_by(module: bytes) -> list[str]:
-    """The modules that a module says it depends on.
+    """Modules that a module depends on.
 
     :raises LinuxError: it says nothing, so it is none.
     """
@@ -65,7 +65,7 @@ def needed_by(module: bytes) -> list[str]:
 
 
 def in_order(wanted: Iterable[str], modules: Mapping[str, bytes]) -> list[str]:
-    """All modules that are needed, each after those that it depends on.
+    """Modules to load, each after its dependencies.
 
     :raises LinuxError: the package has no such module.
     """
@@ -79,7 +79,7 @@ def in_order(wanted: Iterable[str], modules: Mapping[str, bytes]) -> list[str]:
 
 
 def newest_kernel() -> str:
-    """The package that the meta-package depends on.
+    """Package that the meta-package depends on.
 
     :raises LinuxError: apt knows of none.
     """
@@ -91,7 +91,7 @@ def newest_kernel() -> str:
 
 
 def unpack(deb: Path, names: re.Pattern[str]) -> dict[str, bytes]:
-    """The files of a package whose whole names match, by their last names."""
+    """Files of a package whose full names match, by their base names."""
     with (
         subprocess.Popen(["dpkg-deb", "--fsys-tarfile", deb], stdout=subprocess.PIPE) as program,
         tarfile.open(fileobj=program.stdout, mode="r|") as archive,
@@ -104,7 +104,7 @@ def unpack(deb: Path, names: re.Pattern[str]) -> dict[str, bytes]:
 
 
 def fetch(folder: Path) -> None:
-    """Download the packages, and put what the guest needs of them into a new folder.
+    """Download the packages and extract the files for the guest into a new folder.
 
     :raises LinuxError: they cannot be had, or are not as expected.
     """
@@ -126,7 +126,7 @@ def fetch(folder: Path) -> None:
 
 
 def _module(name: str) -> str:
-    """As the kernel calls it, whose files may have hyphens."""
+    """Name of a module in the kernel; its file may have hyphens."""
     return name.replace("-", "_")
 
 

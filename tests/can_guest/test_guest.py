@@ -1,4 +1,4 @@
-"""The guest, from outside: it runs the tests of suite/, and whatever becomes of it, nothing of it is left."""
+"""Guest: it runs the tests of suite/, and leaves no process behind, however it ends."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_guest_that_does_not_end_in_time_is_ended(tmp_path: Path) -> None:
 
 @needs_guest
 def test_guest_ends_with_whoever_started_it(tmp_path: Path) -> None:
-    """Be it by SIGKILL."""
+    """Also after SIGKILL."""
     command = ["sh", "-c", "echo up; sleep 1000"]
     words = f"guest.run({command}, Path('.'), folder=Path('/'), environment={{}}, time_limit_s={BOOT_S})"
     program = f"from pathlib import Path; from tests.can_guest import guest; {words}"
@@ -96,7 +96,7 @@ def test_what_is_lacking_is_named_with_the_cure(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_suite_is_not_collected_outside_the_guest() -> None:
-    """It would take down the interfaces of a machine that has some."""
+    """Outside the guest it would take down the interfaces of this machine."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "pytest_timeout"]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     suite = ROOT / "tests/can_guest/suite"

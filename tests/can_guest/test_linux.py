@@ -1,4 +1,4 @@
-"""The kernel of the guest, out of its package."""
+"""Kernel of the guest from its package."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from tests.can_guest.linux import LinuxError, in_order, needed_by, vmlinux
 
 
 def module(*needs: str) -> bytes:
-    """With what modinfo reads in one."""
+    """Module with the section that modinfo reads."""
     return b"\x7fELF license=GPL\0depends=" + ",".join(needs).encode() + b"\0name=it\0"
 
 
 def bz_image(payload: bytes) -> bytes:
-    """As Documentation/x86/boot.rst describes it: a boot sector, two of set-up, and further on the payload."""
+    """Image as in Documentation/x86/boot.rst: a boot sector, two of set-up, then the payload."""
     image = bytearray(3 * 512 + 100)
     image[0x1F1] = 2
     image[0x248:0x250] = (100).to_bytes(4, "little") + len(payload).to_bytes(4, "little")

@@ -1,4 +1,4 @@
-"""How fast samples go over SocketCAN in the guest. Runs inside; writes /run/results/throughput.json."""
+"""Measure samples per second over SocketCAN. Runs in the guest; writes /run/results/throughput.json."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLES = 600
 
 
 def rates() -> Iterator[tuple[str, float]]:
-    """From a process to another, by way of the kernel alone, and by way of two emulated controllers."""
+    """Measure from process to process, through the kernel alone and through two emulated controllers."""
     for way, fields in WAYS:
         bus = CanDevice(name="CAN", interface="socketcan", channel=VIRTUAL, device="host", **fields)
         yield f"CAN vcan in the guest (emulated), {way}", samples_per_s(bus, SAMPLES)

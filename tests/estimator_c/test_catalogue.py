@@ -110,7 +110,7 @@ def test_unchanged_file_is_left_alone(generate: ModuleType, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("BO_ 48 ", "BO_ 57 "),
+        ("BO_ 48 ", "BO_ 127 "),
         ("SG_ Force :", "SG_ Push :"),
         ("SG_ Force : 32|16@1+ (1,0)", "SG_ Force : 32|16@1+ (2,0)"),
         ("SG_ Force : 32|16@1+", "SG_ Force : 32|12@1+"),

@@ -87,6 +87,7 @@ class OpAmpModel:
 
 
 IDEAL = OpAmpModel()
+"""Op-amp without any limit: v+ = v-."""
 
 PRESETS: Mapping[str, OpAmpModel] = MappingProxyType(
     {

@@ -25,6 +25,7 @@ from analogrig_emulator.machine.two_mass import TWO_MASS
 PROGRAMS: Mapping[str, Program] = MappingProxyType(
     {program.name: program for program in (FRONT, SHOCK, BUMP_STOP, TWO_MASS)}
 )
+"""Programs by name."""
 
 BLOCK_SAMPLES = 32768
 """Default block, 1 MB: in smaller blocks the calls cost more than a quiet stretch."""

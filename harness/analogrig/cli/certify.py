@@ -1,4 +1,4 @@
-"""``analogrig certify``: whether a device raises false alarms rarely enough."""
+"""``analogrig certify``: test of a device's false-alarm rate against a limit."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def add(commands: Any) -> None:
         metavar="N",
         help="most alarms with which a test of fixed length passes (default: %(default)d)",
     )
-    command.add_argument("--sequential", action="store_true", help="stop as soon as the answer is certain")
+    command.add_argument("--sequential", action="store_true", help="stop as soon as the data decide at --confidence")
     command.add_argument(
         "--rare",
         type=int,
         nargs="?",
         const=_ESTIMATES,
         metavar="N",
-        help=f"estimate a rare rate from N branches with more noise (default: {_ESTIMATES})",
+        help=f"number of plays for a rare rate, at least 64 (default: {_ESTIMATES})",
     )
     command.add_argument(
         "--scenario", default="healthy", metavar=SCENARIO, help="scenario without changes (default: %(default)s)"

@@ -1,4 +1,4 @@
-"""``analogrig compare``: what has changed between two campaigns, or two folders of runs, beyond chance."""
+"""``analogrig compare``: significant differences between two campaigns, or two folders of runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``analogrig compare-rigs``: how far two rigs differ, in signals and in verdicts."""
+"""``analogrig compare-rigs``: differences between two rigs, in signals and in verdicts."""
 
 from __future__ import annotations
 

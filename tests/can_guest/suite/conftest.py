@@ -1,4 +1,4 @@
-"""These tests run in the guest alone: elsewhere they would disturb somebody's bus."""
+"""Skip outside the guest: the tests would disturb a real bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CAN interfaces of the guest: what the tests do to them, in the words of ip and tc, and the device on them."""
+"""CAN interfaces of the guest, their manipulation by ip and tc, and the device on them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from analogrig.devices.host import HOST_PROGRAM
 
 VIRTUAL = "vcan0"
 CONTROLLERS = ("can0", "can1", "can2")
-"""On one bus. Classic: an SJA1000 knows no CAN FD."""
+"""Interfaces on one bus. Classic CAN only: an SJA1000 has no CAN FD."""
 
 
 def state(interface: str) -> dict[str, Any]:
-    """All that the kernel says about it."""
+    """Details of an interface from the kernel."""
     told = subprocess.run(
         ["ip", "-details", "-json", "link", "show", interface], check=True, capture_output=True, text=True
     )
@@ -33,7 +33,7 @@ def set_link(interface: str, *words: str) -> None:
 
 @contextlib.contextmanager
 def down(interface: str) -> Iterator[None]:
-    """For a while."""
+    """Take an interface down within the context."""
     set_link(interface, "down")
     try:
         yield
@@ -43,7 +43,7 @@ def down(interface: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def queue(interface: str, *, limit_n: int, bitrate: int) -> Iterator[None]:
-    """For a while no more frames wait than ``limit_n``, and they leave at this rate."""
+    """Limit the queue to ``limit_n`` frames and the rate at which they leave, within the context."""
     device = ["dev", interface, "root"]
     subprocess.run(["tc", "qdisc", "add", *device, "netem", "limit", str(limit_n), "rate", f"{bitrate}bit"], check=True)
     try:
@@ -58,7 +58,7 @@ def socketcan(channel: str, **settings: Any) -> can.BusABC:
 
 @contextlib.contextmanager
 def device(*arguments: str) -> Iterator[Child]:
-    """The device as a process, on the interface and with the options that are its arguments."""
+    """Device as a process on an interface."""
     child = Child([HOST_PROGRAM, "--can", *arguments], "the device")
     try:
         assert child.first_line() == arguments[0]

@@ -1,4 +1,4 @@
-"""Runs over SocketCAN: the same bits as over a serial line, and what happens to the interface is told by name."""
+"""Runs over SocketCAN: the bits of a serial line; events of the interface are named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .test_port import FOREIGN
 
 SAMPLES = 120
 AT = 60
-"""The sample in whose course something happens."""
+"""Sample during which the event happens."""
 
 HERE, THERE, ELSEWHERE = CONTROLLERS
 ON_VIRTUAL = f"can:socketcan/{VIRTUAL}?device=host"
@@ -42,7 +42,7 @@ def play(dut: str, listener: Listener | None = None, **changes: Any) -> Run:
 
 
 def at_sample(act: Callable[[], object]) -> Listener:
-    """Acts when the harness sends the sample AT."""
+    """Link that acts when the harness sends the sample AT."""
 
     def listener(frame: can.Message) -> None:
         message = None if frame.is_rx else unpack(bytes((frame.arbitration_id,)) + frame.data)
@@ -54,7 +54,7 @@ def at_sample(act: Callable[[], object]) -> Listener:
 
 @pytest.fixture(scope="module")
 def expected() -> str:
-    """The hash of theta over a serial line."""
+    """Hash of theta over a serial line."""
     run = play("host")
     assert run.conditions.faults == ()
     return run.theta_hash()
@@ -93,7 +93,7 @@ def test_full_queue_is_waited_for(expected: str) -> None:
 
 
 def test_queue_that_never_empties_is_told() -> None:
-    """As that of a controller whose frames nobody acknowledges."""
+    """Such as the queue of a controller whose frames get no acknowledgement."""
     with (
         queue(VIRTUAL, limit_n=1, bitrate=8),
         pytest.raises(LinkError, match=r"socketcan/vcan0: nothing can be sent, the controller's queue has been full"),
@@ -102,7 +102,7 @@ def test_queue_that_never_empties_is_told() -> None:
 
 
 def test_frames_of_others_are_counted_and_change_nothing(expected: str) -> None:
-    """Ten of a third controller for each of ours; they are between those of the device too."""
+    """Ten frames of a third controller for each of ours, also between those of the device."""
     sent_n = 0
 
     def babble(frame: can.Message) -> None:
@@ -122,7 +122,7 @@ def test_frames_of_others_are_counted_and_change_nothing(expected: str) -> None:
 
 @pytest.mark.parametrize("channel", [VIRTUAL, HERE])
 def test_interface_that_goes_down_ends_the_run_with_its_name(channel: str) -> None:
-    """Pulled out, or taken down by somebody."""
+    """Unplugged, or taken down by another program."""
     with contextlib.ExitStack() as undone, device(VIRTUAL if channel == VIRTUAL else THERE):
         run = play(f"can:socketcan/{channel}", at_sample(lambda: undone.enter_context(down(channel))))
     (fault,) = run.conditions.faults
@@ -130,7 +130,7 @@ def test_interface_that_goes_down_ends_the_run_with_its_name(channel: str) -> No
 
 
 def test_bus_that_was_off_and_came_back_is_counted(expected: str) -> None:
-    """As a driver tells it; here another socket does. Nothing was lost meanwhile."""
+    """Error frames as a driver sends them, here from another socket. No frame is lost."""
     with socketcan(VIRTUAL) as driver:
         run = play(ON_VIRTUAL, at_sample(lambda: [driver.send(told) for told in (BUS_OFF, RESTARTED)]))
     assert run.conditions.faults == ()

@@ -1,4 +1,4 @@
-"""What the link relies on: the kernel's interfaces and python-can's view of them."""
+"""Assumptions of the link about the kernel's interfaces and python-can."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.harness.processes import LONG_S
 from .interfaces import CONTROLLERS, VIRTUAL, down, queue, socketcan, state
 
 MOMENT_S = 0.1
-"""For what shall not come."""
+"""Wait for a frame that must not come, in seconds."""
 BUS_OFF = 0x40
 """CAN_ERR_BUSOFF of include/uapi/linux/can/error.h."""
 
@@ -63,7 +63,7 @@ def test_controller_without_can_fd_refuses_its_frames() -> None:
 
 
 def test_error_frames_are_seen_with_their_class() -> None:
-    """As a driver gives them; here another socket does."""
+    """Error frames as a driver gives them, here from another socket."""
     bus_off = can.Message(arbitration_id=BUS_OFF, is_extended_id=False, is_error_frame=True, data=bytes(8))
     with socketcan(VIRTUAL) as bus, socketcan(VIRTUAL) as driver:
         driver.send(bus_off)
@@ -86,7 +86,7 @@ def test_interface_that_goes_down_fails_whoever_listens_and_whoever_sends(channe
 
 
 def test_full_queue_refuses_a_frame_at_once() -> None:
-    """So it is for the sender to wait."""
+    """The sender must therefore wait."""
     with socketcan(VIRTUAL) as bus, queue(VIRTUAL, limit_n=1, bitrate=8):
         bus.send(CLASSIC[0])  # takes 16 s and more
         with pytest.raises(can.CanOperationError) as raised:

@@ -1,4 +1,4 @@
-"""The device as a process on a SocketCAN interface (estimator_c/ports/host): what only a kernel can do to it."""
+"""Device as a process on a SocketCAN interface (estimator_c/ports/host): events that only a kernel can cause."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frame(message: Message) -> can.Message:
 
 
 class Harness:
-    """Who speaks with the device on a bus, as slowly as one likes."""
+    """Peer of the device on a bus, as slow as a test needs."""
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
@@ -54,7 +54,7 @@ class Harness:
         self._seq += 1
 
     def answers(self, last: type[Message], *, n: int = 1) -> list[Message]:
-        """What the device says, up to the last of so many of a kind."""
+        """Messages of the device, up to the last of so many of a kind."""
         heard: list[Message] = []
         while sum(isinstance(message, last) for message in heard) < n:
             came = self._bus.recv(LONG_S)
@@ -65,7 +65,7 @@ class Harness:
         return heard
 
     def play_block(self) -> list[Message]:
-        """Of which each sample is answered by all elements of the estimate, and a last word; from a new start."""
+        """Start a run and send one full block; return the answers up to the last Stepped."""
         for command in (Command.RESET, Command.START):
             self.send(Control, command, 1)
             self.answers(Controlled)
@@ -111,7 +111,7 @@ def test_device_ends_with_the_reason_when_its_interface_goes_down(interface: str
 
 
 def test_answers_wait_for_a_queue_that_is_full_and_go_out_in_order() -> None:
-    """Five elements and the last word about each of fourteen samples, into a queue of three."""
+    """Five elements and Stepped of each of fourteen samples, into a queue of three."""
     with device(VIRTUAL, "--fd"), socketcan(VIRTUAL, fd=True) as bus:
         talk = Harness(bus)
         quick = talk.play_block()
@@ -143,7 +143,7 @@ def test_frames_that_are_not_for_the_device_are_counted_and_passed_over() -> Non
 
 
 def test_frames_that_the_system_dropped_for_the_device_are_counted() -> None:
-    """None is taken while it is stopped."""
+    """The device takes no frame while it is stopped."""
     sent_n = 2000
     with device(VIRTUAL) as child, socketcan(VIRTUAL) as bus:
         (pid,) = children(child.tether_pid)
