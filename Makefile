@@ -118,11 +118,11 @@ $(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/
 no-firmware:
 	@echo "arm-none-eabi-gcc is absent, so no firmware is built: make tools"
 
-tools: ## install what the tests need from the operating system (apt, sudo if you are not root), and the guest's kernel
+tools: ## install the tools of the tests from the operating system (apt, sudo if you are not root), and the guest's kernel
 	@$(PYTHON) -m tests.tools install
 	@$(MAKE) --no-print-directory $(BUILD)/can_guest/linux
 
-fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, for FUZZ_S seconds each; what it finds stays in build/fuzz
+fuzz: $(PRODUCTS) ## libFuzzer over core, isolation and device, with sanitizers, FUZZ_S seconds each; findings stay in build/fuzz
 	@FUZZ_S=$(FUZZ_S) $(BIN)/python -m estimator_c.fuzz.fuzz $(BUILD)/fuzz
 
 fuzz-serve: $(PRODUCTS) ## hostile clients of analogrig serve, each kind for FUZZ_S seconds; the table of harness/docs/evidence/hostile-clients.md
@@ -195,7 +195,7 @@ lock: ## resolve requirements.lock again from pyproject.toml; needs uv
 	    uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --upgrade --no-annotate \
 	        --custom-compile-command "make lock" --extra test --output-file requirements.lock pyproject.toml -
 
-clean: ## remove what was built, but not the environment
+clean: ## remove build products, but not the environment
 	rm -rf $(BUILD) *.egg-info harness/analogrig/bin $(PRODUCTS)
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 
@@ -218,7 +218,7 @@ $(VENV)/.requirements: requirements.lock
 	    { echo "$(VENV) was not made by this Makefile: remove it, or make VENV=another" >&2; exit 1; }
 	@uv --version >/dev/null 2>&1 || $(PYTHON) -c 'import ensurepip' 2>/dev/null || \
 	    { echo "$(PYTHON) cannot make environments: apt-get install python3-venv" >&2; exit 1; }
-	@echo "making $(VENV) from requirements.lock, which takes a minute"
+	@echo "making $(VENV) from requirements.lock, which takes one to four minutes"
 	@rm -rf $(VENV) && mkdir $(VENV) && touch $(VENV)/.made-by-make
 	@if uv --version >/dev/null 2>&1; then \
 	    uv venv --quiet --allow-existing --python "$$(command -v $(PYTHON))" $(VENV) && \

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["AVR", "BUILDS", "CORTEX_M0", "CORTEX_M4F", "LEVELS", "Processor", "stack_bytes"]
+__all__ = ["AVR", "BUILDS", "CORTEX_M0", "CORTEX_M4F", "LEVELS", "Toolchain", "stack_bytes"]
 
 CORE = Path(__file__).parents[1] / "core"
 
@@ -25,23 +25,23 @@ FRAME = re.compile(r"^.*:([\w.]+)\t(\d+)\t(?:static|dynamic,bounded)$", re.MULTI
 
 
 @dataclass(frozen=True)
-class Processor:
-    """A processor and the compiler for it. Frames of avr-gcc include the return address."""
+class Toolchain:
+    """Processor and the compiler for it. Frames of avr-gcc include the return address."""
 
     name: str
     compiler: str
     flags: tuple[str, ...]
 
 
-CORTEX_M0 = Processor("M0", "arm-none-eabi-gcc", ("-mcpu=cortex-m0", "-mthumb"))
-CORTEX_M4F = Processor(
+CORTEX_M0 = Toolchain("M0", "arm-none-eabi-gcc", ("-mcpu=cortex-m0", "-mthumb"))
+CORTEX_M4F = Toolchain(
     "M4F", "arm-none-eabi-gcc", ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 )
-AVR = Processor("AVR", "avr-gcc", ("-mmcu=atmega328p",))
+AVR = Toolchain("AVR", "avr-gcc", ("-mmcu=atmega328p",))
 BUILDS = (CORTEX_M4F, CORTEX_M0, AVR)
 
 
-def stack_bytes(processor: Processor, level: str, folder: Path, *options: str, root: str = "est_step") -> int:
+def stack_bytes(processor: Toolchain, level: str, folder: Path, *options: str, root: str = "est_step") -> int:
     """Bytes of stack that a call of ``root`` needs; the compiler's files are left in ``folder``.
 
     :raises ValueError: the calls are recursive, or a frame has no fixed size.

@@ -85,10 +85,9 @@ else:
     def __getattr__(name: str) -> object:
         """Load a public name on first use."""
         import importlib
-        import importlib.metadata
 
         if name == "__version__":
-            found = importlib.metadata.version("analogrig")
+            found = importlib.import_module("analogrig.identity").version()
         elif name == "strategies":
             found = importlib.import_module("analogrig.testing.strategies")
         else:

@@ -200,11 +200,11 @@ def test_every_field_of_a_configuration_has_a_comment_with_its_unit_or_range() -
         (stack.CORTEX_M0, "-O0", 2400),
         (stack.AVR, "-O0", 1600),
     ],
-    ids=lambda value: value.name if isinstance(value, stack.Processor) else str(value),
+    ids=lambda value: value.name if isinstance(value, stack.Toolchain) else str(value),
 )
 @pytest.mark.tools("arm-none-eabi-gcc", "avr-gcc")
 def test_stack_of_a_step_is_what_the_header_says(
-    processor: stack.Processor, level: str, most: int, tmp_path: Path
+    processor: stack.Toolchain, level: str, most: int, tmp_path: Path
 ) -> None:
     assert 100 < stack.stack_bytes(processor, level, tmp_path) <= most
 

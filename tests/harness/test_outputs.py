@@ -356,6 +356,7 @@ def test_recording_that_is_played_is_refused_before_anything_moves(
     if beside:
         shutil.copytree(out, folder)
     (out.with_name("its.toml")).write_text(f"rig = 'recording:{folder / 'run.npz'}'\n")
+    (folder / "beside.toml").write_text("rig = 'recording:run.npz'\n")  # relative to the file
     before = contents(out), contents(folder)
     recording = str(folder / "run.npz")
     for words in (
@@ -363,6 +364,7 @@ def test_recording_that_is_played_is_refused_before_anything_moves(
         ["judge", recording],
         ["run", "--rig", f"recording:{recording}"],
         ["run", "--scenario", str(out.with_name("its.toml"))],
+        ["run", "--scenario", str(folder / "beside.toml")],
     ):
         assert main([*words, "--out", str(out)]) == 2
         assert "would overwrite the recording that is played; choose another folder" in capsys.readouterr().err

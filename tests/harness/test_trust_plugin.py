@@ -120,6 +120,22 @@ def test_what_a_file_names_as_rig_is_opened_in_pytest_only_if_it_is_allowed(
     check(user, bait, [*arguments_of(route, bait, user), *besides])
 
 
+def test_device_of_a_scenario_that_a_test_passes_on_is_opened_only_if_it_is_allowed(
+    user: pytest.Pytester, folder: Path, library: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bait = a_library(folder, monkeypatch, library)
+    scenario = scenario_of(bait, Path())
+    user.makepyfile(f"""
+        import pytest
+        from analogrig import Scenario
+
+        @pytest.mark.parametrize("hil_dut", [Scenario.load({scenario!r}).dut], indirect=True)
+        def test_it(hil_play):
+            hil_play("healthy")
+    """)
+    check(user, bait, [])
+
+
 @pytest.fixture
 def bait(
     user: pytest.Pytester,  # noqa: ARG001

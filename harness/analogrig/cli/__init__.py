@@ -129,7 +129,7 @@ class _Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, help="show the version and exit")
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
+        from analogrig.identity import version
 
-        show(f"analogrig {version('analogrig')}")
+        show(f"analogrig {version()}")
         parser.exit()

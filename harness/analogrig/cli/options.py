@@ -186,13 +186,15 @@ def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
     """Recordings and descriptions that the command line names, directly or by its scenario: none may be overwritten."""
     from analogrig.config import read_toml
     from analogrig.errors import AnalogrigError
+    from analogrig.trust import resolve_name
 
     given = vars(arguments)
     names = [str(given[key]) for key in ("file", "rig", "scenario", "dut") if given.get(key) is not None]
     scenario = Path(given.get("scenario") or "")
-    if scenario.suffix == ".toml" and not given.get("rig"):
-        with contextlib.suppress(AnalogrigError):  # whoever opens it will say what is wrong
-            names.append(str(read_toml(scenario).get("rig", "")))
+    if scenario.suffix == ".toml":
+        with contextlib.suppress(AnalogrigError):  # the command that loads it reports the error
+            table = read_toml(scenario)
+            names += [resolve_name(scenario, str(table[key])) for key in ("rig", "dut") if key in table]
     return tuple(Path(re.sub(r"(\.toml):.*$", r"\1", name.removeprefix("recording:"))) for name in names)
 
 

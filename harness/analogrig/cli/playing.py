@@ -171,7 +171,7 @@ def _play(
     """
     from dataclasses import replace
 
-    from analogrig.bench import Bench
+    from analogrig.bench import Bench, was_interrupted
     from analogrig.errors import ConfigurationError, RecordingError
     from analogrig.output import CAN_LOG
     from analogrig.recordings import WRITTEN, CanLog
@@ -195,7 +195,8 @@ def _play(
             except RecordingError as error:
                 faults = (*run.conditions.faults, output.reason(error))
                 run = replace(run, conditions=replace(run.conditions, faults=faults))
-            return _conclude(run.with_identity(identity), output, identity, arguments)
+            status = _conclude(run.with_identity(identity), output, identity, arguments)
+            return INTERRUPTED if was_interrupted(run) else status
 
 
 def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: argparse.Namespace) -> int:
@@ -203,7 +204,6 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
 
     :param identity: of this command.
     """
-    from analogrig.bench import was_interrupted
     from analogrig.errors import RecordingError
     from analogrig.judging.verdict import judge
     from analogrig.output import REPORT_FILE, RUN_FILE
@@ -232,7 +232,7 @@ def _conclude(run: Run, output: OutputFolder, identity: Identity, arguments: arg
         show(f"{summary(run, verdict)}\nreport: {output.page}\nrun:    {output.path / RUN_FILE}")
     if not verdict.valid:
         complain(f"INCONCLUSIVE: {verdict.reasons[0]}", INCONCLUSIVE)
-    return INTERRUPTED if was_interrupted(run) else STATUS[verdict.outcome]
+    return STATUS[verdict.outcome]
 
 
 def _as_json(run: Run, verdict: Verdict, identity: Identity, output: OutputFolder) -> dict[str, Any]:

@@ -81,20 +81,25 @@ class Option:
         parameter = None if callspec is None else callspec.params.get(self.name)
         if parameter is None:
             return self.of_session(item.config)
-        return Setting(str(parameter), f"parameter {self.name} of {item.nodeid}", "parameter")
+        return Setting(_name_of(parameter), f"parameter {self.name} of {item.nodeid}", "parameter")
 
     def of_fixture(self, request: pytest.FixtureRequest) -> Setting:
         """The value for a fixture: its parameter, else that of the session. A wrong value fails the test."""
         parameter = getattr(request, "param", None)
         setting = self.of_session(request.config)
         if parameter is not None:
-            setting = Setting(str(parameter), f"parameter {self.name} of {request.node.nodeid}", "parameter")
+            setting = Setting(_name_of(parameter), f"parameter {self.name} of {request.node.nodeid}", "parameter")
         complaint = self.complaint(setting.value)
         if parameter is not None and not isinstance(parameter, str | os.PathLike):
             complaint = f"must be a text or a path, not {parameter!r}"
         if complaint:
             pytest.fail(f"{setting.by}: {complaint}", pytrace=False)
         return setting
+
+
+def _name_of(parameter: object) -> str:
+    """Name that a parameter is; one that a file holds stays one, for ``analogrig.trust``."""
+    return parameter if isinstance(parameter, str) else str(parameter)
 
 
 def _folder_complaint(value: str) -> str:
