@@ -1,7 +1,7 @@
 """`make metrics`: figures of the structure and of the documents, of one commit or of several beside each other.
 
-python -m tests.metrics [--arrows] [COMMIT ...]; without a commit, of the files as they are. ``--arrows`` lists the
-imports between the folders of ``analogrig`` instead.
+python -m tests.metrics [--arrows | --write] [COMMIT ...]; without a commit, of the files as they are. ``--arrows``
+lists the imports between the folders of ``analogrig`` instead. ``--write`` writes the table to the evidence page.
 """
 
 from __future__ import annotations
@@ -19,8 +19,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
+PAGE = ROOT / "harness" / "docs" / "evidence" / "house.md"
+
 PARTS = ("harness", "emulator", "estimator_c", "tests")
 PRODUCT = PARTS[:3]
+
+NOW = "now"
+"""Name of the tree of the files as they are."""
 
 CODE = re.compile(r"\.(py|c|h|S|js|html|css|ld|dbc)$")
 """Files whose lines count as code."""
@@ -68,7 +73,7 @@ def read(commit: str | None) -> Tree:
     if commit is None:
         names = _git("ls-files").splitlines()
         texts = {name: (ROOT / name).read_bytes() for name in names if (ROOT / name).is_file()}
-        name = "now"
+        name = NOW
     else:
         names = _git("ls-tree", "-r", "--name-only", commit).splitlines()
         wanted = [each for each in names if CODE.search(each) or each.endswith((".md", ".toml"))]
@@ -253,12 +258,25 @@ def circles(found: Arrows) -> list[set[str]]:
     return [set(each) for each in sorted({frozenset(circle) for circle in of.values() if circle}, key=sorted)]
 
 
-def show_metrics(trees: Sequence[Tree]) -> None:
+def table(trees: Sequence[Tree], headings: Sequence[str]) -> str:
+    """Markdown table with a column of figures for each tree."""
     columns = [metrics(tree) for tree in trees]
-    print(f"| | {' | '.join(tree.name for tree in trees)} |")
-    print("|---" * (len(trees) + 1) + "|")
-    for name in columns[0]:
-        print(f"| {name} | {' | '.join(column[name] for column in columns)} |")
+    rows = [("", *headings), ("---",) * (len(trees) + 1)]
+    rows += [(name, *(column[name] for column in columns)) for name in columns[0]]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def write_page(trees: Sequence[Tree], page: Path = PAGE) -> None:
+    """Write the table of the trees to ``page``, with hash and date of each commit."""
+    headings = [
+        tree.name if tree.name == NOW else _git("log", "-1", "--format=%h, %cs", tree.name).strip() for tree in trees
+    ]
+    command = " ".join(["--write", *(tree.name for tree in trees if tree.name != NOW)])
+    page.write_text(
+        f'# Structure\n\nWritten by `make metrics ARGS="{command}"`. Each column is a commit, with its date.\n\n'
+        f"{table(trees, headings)}",
+        encoding="utf-8",
+    )
 
 
 def show_arrows(tree: Tree) -> None:
@@ -270,13 +288,15 @@ def show_arrows(tree: Tree) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    commits = [each for each in arguments if each != "--arrows"]
+    commits = [each for each in arguments if each not in ("--arrows", "--write")]
     trees = [read(commit) for commit in commits] or [read(None)]
     if "--arrows" in arguments:
         for tree in trees:
             show_arrows(tree)
+    elif "--write" in arguments:
+        write_page(trees)
     else:
-        show_metrics(trees)
+        print(table(trees, [tree.name for tree in trees]), end="")
 
 
 if __name__ == "__main__":

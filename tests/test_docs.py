@@ -37,6 +37,10 @@ MOST_WORDS, MOST_CELL_WORDS, MOST_COLUMNS = 25, 20, 100
 BLOCKS = re.compile(r"^ *```.*?^ *```|^:::.*?^::::$", re.MULTILINE | re.DOTALL)
 NO_PROSE = re.compile(r"^(?:\||#|!\[)[^\n]*$", re.MULTILINE)
 """Tables, headings and pictures."""
+LEAST_COMMANDS = 40
+LEAST_BLOCKS = {"toml": 7, "python": 5}
+"""Least numbers over all pages, by language."""
+WALKS = 4
 RUN_BY_ANOTHER_TEST = {"serve-the-emulator"}
 """Pages whose Python needs a server: tests/served/test_page.py."""
 SET_BY_THE_HARNESS = {"force_zero"}
@@ -64,6 +68,13 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert "--wire-faults" in page
     remote = re.compile(r'<(?:link|script|img)[^>]+(?:href|src)="https?://')
     assert not [path for path in (tmp_path / "site").rglob("*.html") if remote.search(path.read_text(encoding="utf-8"))]
+
+
+def test_blocks_of_the_pages_are_found() -> None:
+    """A page without blocks passes the tests below. A pattern that finds none must not."""
+    assert sum(len(list(commands(page))) for page in PAGES) >= LEAST_COMMANDS
+    found = {language: sum(len(blocks(page, language)) for page in PAGES) for language in LEAST_BLOCKS}
+    assert {language: n for language, n in found.items() if n < LEAST_BLOCKS[language]} == {}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -164,3 +175,20 @@ def test_every_page_of_a_key_is_written_from_the_dataclass_that_reads_it(tmp_pat
     for key in Scenario.__dataclass_fields__:
         assert key == "name" or f"`{key}`" in page
     assert config.names("scenarios")
+
+
+def test_architecture_lists_every_folder_and_module_once() -> None:
+    text = (DOCS / "background" / "architecture.md").read_text(encoding="utf-8")
+    listed = text.partition("harness/analogrig/\n")[2].partition("harness/analogrig_thesis/")[0].strip().splitlines()
+    names = [Path(word).stem for line in listed for word in re.split("  |(?<=/) ", line.strip())[0].split()]
+    package = ROOT / "harness" / "analogrig"
+    parts = [*package.glob("[a-z]*.py"), *(path.parent for path in package.glob("*/__init__.py"))]
+    assert sorted(names) == sorted(path.stem for path in parts)
+
+
+def test_walks_of_the_architecture_name_each_file_once() -> None:
+    text = (DOCS / "background" / "architecture.md").read_text(encoding="utf-8")
+    walks = [re.findall(r"^\d+\. `([^`\s]+/[^`\s]+)`", part, re.MULTILINE) for part in text.split("\n## ")]
+    walks = [walk for walk in walks if walk]
+    assert len(walks) == WALKS
+    assert [path for walk in walks for path in walk if not (ROOT / path).exists() or walk.count(path) > 1] == []

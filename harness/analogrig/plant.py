@@ -18,7 +18,7 @@ PARAMETERS = ("M", "B", "K")
 """Names of the physical parameters, in the order of every array of them."""
 
 MAX_SAMPLES = 10_000_000
-"""Largest number of samples. A run is kept in memory, about 70 bytes a sample."""
+"""Largest number of samples. A run is kept in memory; tests/harness/test_long_runs.py bounds its size."""
 
 MAX_CHANGES = 1_000
 """Largest number of changes, and of records, in a run. The bounds of each take milliseconds to compute."""

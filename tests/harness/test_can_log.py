@@ -611,9 +611,9 @@ def test_command_line_leaves_a_log_that_can_be_judged_and_replayed(
         assert main([*words, "--scenario", "thesis", "--out", str(tmp_path / "again")]) == 0
         assert digest in capsys.readouterr().out
     assert main(["judge", log]) == 2
-    assert "say --scenario" in capsys.readouterr().err
+    assert "name one with --scenario" in capsys.readouterr().err
     assert main(["replay", log, "--scenario", "thesis"]) == 2
-    assert "say --dut" in capsys.readouterr().err
+    assert "name one with --dut" in capsys.readouterr().err
 
 
 def test_log_that_is_played_stays_and_one_of_an_earlier_run_moves_aside(

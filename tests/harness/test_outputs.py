@@ -91,7 +91,7 @@ def test_device_that_does_not_answer_leaves_no_older_verdict(out: Path) -> None:
         (["run", "--dut", "inproc", "--can-log", "blf"], "device inproc is not on a CAN bus"),
         (["replay", "none.npz"], "none.npz"),
         (["judge", "none.npz"], "none.npz"),
-        (["judge", "none.log"], "say --scenario"),
+        (["judge", "none.log"], "name one with --scenario"),
     ],
 )
 def test_wrong_option_leaves_no_older_verdict(out: Path, words: list[str], reason: str) -> None:

@@ -264,7 +264,7 @@ def test_play_refuses_a_file_that_names_another_rig_or_device_than_plays_it(user
     refused = run(user)
     refused.assert_outcomes(failed=1)
     refused.stdout.fnmatch_lines(
-        ["*named: names emulator-0-10v, but emulator of the session would play it: say --hil-*"]
+        ["*named: names emulator-0-10v, but emulator of the session would play it: pass --hil-*"]
     )
     run(user, "--hil-rig", "emulator-0-10v", "--hil-dut", "inproc").assert_outcomes(passed=1)
     run(user, "--hil-rig", "emulator", "--hil-dut", "inproc").assert_outcomes(passed=1)  # the command line comes first

@@ -415,7 +415,7 @@ def test_rig_is_found_by_name_in_the_rigs_file(tmp_path: Path, monkeypatch: pyte
         assert rig.description()["plant"] == "shock"
     with open_rig("emulator") as rig:
         assert rig.description()["kind"] == "emulator"
-    with pytest.raises(ConfigurationError, match=r"holds 2 rigs: say .*:NAME, one of bench, shock"):
+    with pytest.raises(ConfigurationError, match=r"holds 2 rigs: name one as .*:NAME; there are bench, shock"):
         open_allowed(str(file))
     with pytest.raises(ConfigurationError, match=r"no rig is called 'bank' .* there are bench, shock, emulator"):
         open_allowed("bank")

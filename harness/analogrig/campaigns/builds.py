@@ -56,16 +56,24 @@ def of_device(device: DeviceDescription) -> str:
 
 
 def check_analogrig(planned: str) -> None:
-    """:raises ConfigurationError: the campaign was begun by another version. Its compilers may have been others: the
-    estimates are the same bits."""
+    """Check that this analogrig has the version of the one that began the campaign.
+
+    The compilers may differ: the estimates are the same bits.
+
+    :raises ConfigurationError: it has another.
+    """
     begun_by = planned.partition(" ")[0]
     if version() != begun_by:
         raise ConfigurationError(f"this worker has analogrig {version()}, the campaign was begun by {begun_by}")
 
 
 def check_device(device: DeviceDescription, planned: str) -> None:
-    """:raises ConfigurationError: its file is another than when the campaign was begun. Analogrig's own library and
-    program may come from other compilers: the estimates are the same bits."""
+    """Check that the device runs the file with which the campaign was begun.
+
+    Analogrig's own library and program may come from other compilers: the estimates are the same bits.
+
+    :raises ConfigurationError: it runs another.
+    """
     is_own = device.program is not None and device.program.is_relative_to(LIBRARY.parent)
     if not is_own and of_device(device) != planned:
         raise ConfigurationError(

@@ -103,7 +103,7 @@ class Question:
         return ""
 
     def _length_problem(self) -> str:
-        """Reason that nobody would live to see the end; empty if the test is short enough."""
+        """Reason that the test would take more than a year of playing; empty if it is short enough."""
         needed = poisson_mean(self.allowed, self.confidence) / self.far
         if needed <= BENCH_YEAR_N or (self.is_in_process and needed <= IN_PROCESS_YEAR_N):
             return ""
@@ -167,7 +167,7 @@ def certify(
     ``progress`` is called with the samples counted, the samples that may be needed, and the alarms counted.
 
     :raises ConfigurationError: the scenario cannot be played, or the device refuses its configuration.
-    :raises WorkerError, LinkError, DeviceError, RigError: they cannot be had or kept.
+    :raises WorkerError, LinkError, DeviceError, RigError: the workers, the link, the device or the rig failed.
     """
     if question.rare is not None:
         return _certify_rare(question, question.rare, workers)

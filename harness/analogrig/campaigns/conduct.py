@@ -67,7 +67,7 @@ def conduct(plan: Plan, workers: Workers, out: Path, progress: Callable[[Tally],
 
     :raises ConfigurationError: ``out`` or its journal hold something else, or a device refuses its configuration.
     :raises RecordingError: ``out`` cannot be written.
-    :raises WorkerError: the workers cannot be had or kept.
+    :raises WorkerError: the workers cannot be reached, or keep dying over a chunk.
     """
     if out.exists():
         return Results.load(out).of_plan(plan, out)

@@ -98,13 +98,13 @@ def _check_row(row: Any) -> None:
     if not all(type(count) is int and 0 <= count <= MAX_SAMPLES for count in rising) or rising != sorted(rising):
         raise ValueError("a row whose counts cannot be")
     if not all(map(_is_change, changes(row))):
-        raise ValueError("a change that is none")
+        raise ValueError("a change with values of the wrong types")
     if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
-        raise ValueError("errors that are none")
+        raise ValueError(f"errors that are not {len(PARAMETERS)} finite numbers")
     if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
-        raise ValueError("a text that is none")
+        raise ValueError("a text that is not a string")
     if not all(map(_is_number, row.get("drawn", {}).values())):
-        raise ValueError("a drawn value that is none")
+        raise ValueError("a drawn value that is not a finite number")
 
 
 def _is_number(value: object) -> bool:

@@ -57,7 +57,7 @@ def add_workers(command: argparse.ArgumentParser) -> None:
 
 
 def begin(arguments: argparse.Namespace) -> None:
-    """Let the processes that will play be made while this one finds out what; most likely there will be several."""
+    """Start the fork server of the workers, unless this command plays in one process or on a cluster."""
     from analogrig.campaigns.workers import prepare
 
     if not arguments.cluster and arguments.workers != 1 and len(os.sched_getaffinity(0)) > 1:
@@ -129,7 +129,7 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
     from analogrig.errors import ConfigurationError
 
     if alone and (arguments.cluster or (arguments.workers or 1) > 1):
-        raise ConfigurationError(f"{alone} is one device: it cannot be shared by several workers; say --workers 1")
+        raise ConfigurationError(f"{alone} is one device: several workers cannot share it; use --workers 1")
     if arguments.cluster:
         with contextlib.closing(Dask(arguments.cluster)) as cluster:
             yield cluster
@@ -143,7 +143,7 @@ def workers(arguments: argparse.Namespace, alone: str, useful: int) -> Iterator[
 
 
 def progress(plan: Plan) -> Callable[[Tally], None] | None:
-    """Callback that shows the progress of a plan; None if nobody watches."""
+    """Callback that shows the progress of a plan; None if standard error is no terminal."""
     line = open_progress_line()
     if line is None:
         return None

@@ -233,7 +233,7 @@ def load_capture(arguments: argparse.Namespace) -> Run:
         run = Run.load(arguments.file)
         return run if scenario is None else replace_scenario(run, scenario)
     if scenario is None:
-        raise ConfigurationError(f"{arguments.file}: a CAN log does not say what was played: say --scenario")
+        raise ConfigurationError(f"{arguments.file}: a CAN log does not name its scenario: name one with --scenario")
     with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
         return import_run(
             arguments.file,

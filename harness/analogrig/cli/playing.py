@@ -132,7 +132,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         from analogrig.rigs.recording import RecordingRig
 
         if arguments.dut is None and is_capture(arguments.file):
-            raise ConfigurationError(f"{arguments.file}: does not say which device it was: say --dut")
+            raise ConfigurationError(f"{arguments.file}: a CAN log does not name its device: name one with --dut")
         with RecordingRig.of(load_capture(arguments), arguments.file) as rig:
             conditions = rig.run.conditions
             device: Callable[..., Dut] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))

@@ -18,8 +18,8 @@ from analogrig.protocol.pace import Pace
 class Device(ABC):
     """Device under test, fed by ``Bench.play``; a context manager.
 
-    ``Dut`` is one behind a link, ``InProcessDevice`` one without messages. Methods raise LinkError or DeviceError if
-    the device fails. The properties of the link are those of a device that has none.
+    ``Dut`` is one behind a link, ``DirectDevice`` one without messages. Methods raise LinkError or DeviceError if the
+    device fails. The properties of the link are those of a device that has none.
     """
 
     def __init__(self, description: DeviceDescription) -> None:

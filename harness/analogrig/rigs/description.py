@@ -131,7 +131,9 @@ def _rig_tables(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:
 def _one_of(path: Path, table: Mapping[str, Any], wanted: str | None) -> tuple[Mapping[str, Any], str, Path]:
     rigs = _rig_tables(path, table)
     if wanted is None and len(rigs) > 1:
-        raise ConfigurationError(f"{path}: holds {len(rigs)} rigs: say {path}:NAME, one of {', '.join(rigs)}")
+        raise ConfigurationError(
+            f"{path}: holds {len(rigs)} rigs: name one as {path}:NAME; there are {', '.join(rigs)}"
+        )
     name = wanted or next(iter(rigs))
     if name not in rigs:
         raise ConfigurationError(f"{path}: holds no rig {name!r}: there are {', '.join(rigs)}")

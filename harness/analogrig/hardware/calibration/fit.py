@@ -402,7 +402,7 @@ class _Fit(NamedTuple):
     chi_square: float
     freedom: int
     covariance: Vector
-    """That of the unknowns but for the pots' settings, scaled up if noise does not explain the residuals."""
+    """Covariance of the unknowns but for the pots' settings, scaled up if noise does not explain the residuals."""
 
     def estimates(self) -> list[FittedValue]:
         errors = np.sqrt(np.diag(self.covariance)).tolist()

@@ -125,7 +125,7 @@ class Player:
             if named and not setting.is_explicit and named not in (setting.value, own["name"]):
                 pytest.fail(
                     f"{scenario.name}: names {named}, but {own['name']} of the session would play it:"
-                    f" say {option.flag} {named}, or have pytest collect the file with {SCENARIO_DIR.flag}",
+                    f" pass {option.flag} {named}, or have pytest collect the file with {SCENARIO_DIR.flag}",
                     pytrace=False,
                 )
 
