@@ -561,3 +561,10 @@ def test_counterexample_is_replaced_while_it_shrinks_and_ends_as_the_simplest(us
     assert tomllib.loads((left / "scenario.toml").read_text())["seed"] == 1000
     assert (left / "report.html").is_file()
     assert [path.name for path in left.parent.iterdir()] == [left.name], "something is left besides"
+
+
+def test_workers_pass_on_the_properties_of_a_device_that_a_file_names(user: pytest.Pytester) -> None:
+    """The name of a file's device is a str of its own class, which execnet refused: no test had a result."""
+    user.makeini("[pytest]\nhil_dut = inproc\n")
+    user.makepyfile(PLAYS.format(assertion="assert played.passes()"))
+    user.runpytest_subprocess("-n", "2").assert_outcomes(passed=1)

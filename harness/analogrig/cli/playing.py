@@ -52,7 +52,7 @@ def add_run(commands: Any) -> None:
         "play a scenario on a rig through a device, and judge the device's alarms",
         "run --seed 7",
         "run --scenario slow --dut inproc --out build/slow",
-        "run --rig emulator-0-10v --dut qemu-m4 --json",
+        "run --rig emulator-0-10v --dut inproc --out build/clipped --json",
     )
     add_what_to_play(command)
     add_dut(command, default=os.environ.get("ANALOGRIG_DUT", ""), shown="$ANALOGRIG_DUT, that of the scenario, or host")

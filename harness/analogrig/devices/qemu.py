@@ -89,7 +89,7 @@ class QemuDevice(EitherDevice):
         :raises LinkError: there is no such file.
         """
         if not self.program.is_file():
-            cure = "" if self.firmware else ": run `make firmware`, or set ANALOGRIG_FIRMWARE to its folder"
+            cure = "" if self.firmware else f": run `make firmware` in a clone, or name one: qemu-{self.core}:ELF"
             raise LinkError(f"there is no firmware {self.firmware or self.program}{cure}")
         return self.program
 

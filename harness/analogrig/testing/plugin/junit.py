@@ -42,9 +42,8 @@ def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
     conditions, verdict = played.run.conditions, played.verdict
     device = conditions.dut.get("identity", {})
     yield "seed", conditions.seed
-    yield "scenario", conditions.scenario["name"]
-    yield "rig", conditions.rig["name"]
-    yield "dut", conditions.dut["name"]
+    for key in ("scenario", "rig", "dut"):
+        yield key, str(getattr(conditions, key)["name"])  # a plain str: pytest-xdist passes on no subclass
     yield "firmware", device.get("firmware", "")
     yield "catalogue_hash", f"{device.get('catalogue_hash', 0):08x}"
     yield "commit", _commit()
