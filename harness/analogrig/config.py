@@ -285,7 +285,7 @@ def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
         return value
     if hint is float:
         if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_NUMBER:
-            return float(value)
+            return float(value) + 0.0  # -0.0 becomes 0.0, for generators of random numbers refuse it as a width
         raise ConfigurationError(f"{where}: must be a number within +-{MOST_NUMBER:g}, not {_quote(value)}")
     if hint is int and (isinstance(value, bool) or (isinstance(value, int) and abs(value) > MOST_INTEGER)):
         raise ConfigurationError(f"{where}: must be a whole number below 2^63, not {_quote(value)}")

@@ -18,6 +18,9 @@ from analogrig_emulator import PROGRAMS, Excitation
 
 MAX_RAMP_N = 100_000
 
+MAX_TRIES = 1000
+"""Largest number of seeds that a statement may try."""
+
 DEFAULT_SEED = 1995
 """Random seed if neither the user nor the scenario sets one."""
 
@@ -138,8 +141,8 @@ class Statement:
     """Name of the test, for information."""
 
     def __post_init__(self) -> None:
-        if self.tries < 1:
-            raise ValueError(f"tries must be at least 1, not {self.tries}")
+        if not 1 <= self.tries <= MAX_TRIES:
+            raise ValueError(f"tries must be in 1 .. {MAX_TRIES}, not {self.tries}")
 
 
 @dataclass(frozen=True)

@@ -96,7 +96,7 @@ def interruption(error: BaseException | None) -> KeyboardInterrupt | None:
     A module in C that is interrupted while it is imported raises an ImportError, caused by the interruption.
     """
     while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__
+        error = error.__cause__ or (error.__context__ if isinstance(error, ImportError) else None)
     return error
 
 

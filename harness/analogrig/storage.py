@@ -17,6 +17,8 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
 
     :raises RecordingError: it cannot be written; whatever stood at ``path`` before still does.
     """
+    if not path.name or (path.exists() and not path.is_file()):  # replaced by a file, /dev/null would serve nobody
+        raise RecordingError(f"{path}: cannot be written: it is a folder, or no regular file")
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         try:

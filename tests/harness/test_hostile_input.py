@@ -518,3 +518,51 @@ def test_line_without_end_of_a_log_is_read_in_parts(tmp_path: Path) -> None:
     frames = CapturedFrames(path)
     assert list(frames) == []
     assert frames.damaged
+
+
+def test_results_are_read_from_files_of_bounded_size_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`compare /dev/zero` grew until the system ended it; a FIFO was waited for without end."""
+    os.mkfifo(tmp_path / "fifo")
+    for name in ("/dev/zero", str(tmp_path / "fifo")):
+        assert main(["compare", name, name]) == 2
+        assert "not a" in capsys.readouterr().err
+
+
+def test_file_takes_the_place_of_a_file_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--out /dev/null` replaced the device of the whole machine, for root."""
+    os.mkfifo(tmp_path / "fifo.csv")
+    for words in (["netlist", "--out", str(tmp_path)], ["emulate", "--out", str(tmp_path / "fifo.csv")]):
+        assert main(words) == 2
+        assert capsys.readouterr().err.endswith("cannot be written: it is a folder, or no regular file\n")
+    assert (tmp_path / "fifo.csv").is_fifo()
+
+
+def test_working_directory_that_is_gone_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = Path.cwd()
+    (tmp_path / "gone").mkdir()
+    os.chdir(tmp_path / "gone")
+    try:
+        (tmp_path / "gone").rmdir()
+        assert main(["judge", "run.npz"]) == 2
+    finally:
+        os.chdir(before)
+    assert capsys.readouterr().err == "analogrig: the working directory is gone: change to one that exists\n"
+
+
+def test_rigs_file_of_another_program_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rigs.toml").write_text("[drill]\nx = 1\n")
+    assert main(["list", "rigs", "--json"]) == 0
+    assert "drill" not in capsys.readouterr().out
+
+
+def test_zero_with_a_minus_is_zero(tmp_path: Path) -> None:
+    """NumPy refuses it as the width of a range."""
+    shipped = Path(__file__).parents[2] / "fixtures/rigs/emulator.toml"
+    (tmp_path / "rig.toml").write_text(shipped.read_text().replace("offset_v = 0.003", "offset_v = -0.0"))
+    assert main(["run", "--rig", str(tmp_path / "rig.toml"), "--dut", "inproc", "--out", str(tmp_path / "out")]) in (
+        0,
+        1,
+    )

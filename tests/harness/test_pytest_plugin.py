@@ -568,3 +568,21 @@ def test_workers_pass_on_the_properties_of_a_device_that_a_file_names(user: pyte
     user.makeini("[pytest]\nhil_dut = inproc\n")
     user.makepyfile(PLAYS.format(assertion="assert played.passes()"))
     user.runpytest_subprocess("-n", "2").assert_outcomes(passed=1)
+
+
+def test_interrupted_play_ends_the_session(user: pytest.Pytester) -> None:
+    """A test that allows inconclusive plays passed, and the next ones ran."""
+    user.makepyfile("""
+        import os, signal, threading
+
+        def test_first(hil_play):
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+            while True:
+                hil_play("healthy", allow_inconclusive=True)
+
+        def test_second():
+            pass
+    """)
+    result = run_apart(user, "--hil-dut", "inproc")
+    assert result.ret == pytest.ExitCode.INTERRUPTED
+    assert "passed" not in result.stdout.str().splitlines()[-1]

@@ -196,3 +196,9 @@ def test_json_has_the_diagnosis_of_each_change() -> None:
     assert (tweak["diagnosis"]["named"], tweak["diagnosis"]["right"]) == ("K", True)
     (tweak,) = as_json(judge(made_run(LOADED, CHANGE, alarms=[404])))["tweaks"]
     assert tweak["diagnosis"] is None
+
+
+def test_verdict_is_neither_true_nor_false() -> None:
+    """``assert judge(run)`` would hold whatever the device does."""
+    with pytest.raises(TypeError, match="neither true nor false"):
+        bool(judge(made_run(np.zeros(10), [(0, FRONT)])))

@@ -95,9 +95,7 @@ def load_commands(path: Path) -> tuple[Identity, ...]:
         return ()
     other = RecordingError(f"{path}: is no file of identities of a campaign: remove it")
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise other
-        table = json.loads(path.read_bytes())
+        table = json.loads(config.read_bounded(path, MOST_BYTES))
         is_ours = (table["format"], table["version"]) == (FORMAT, FORMAT_VERSION)
         identities = tuple(config.build(Identity, each, str(path)) for each in table["played_by"])
     except OSError as error:

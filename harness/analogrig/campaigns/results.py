@@ -48,9 +48,9 @@ class Results:
     def load(cls, path: Path) -> Results:
         """:raises RecordingError: absent, or not the results of a campaign."""
         try:
-            if path.stat().st_size > MAX_FILE_BYTES:
-                raise RecordingError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
-            table = json.loads(path.read_bytes())
+            table = json.loads(config.read_bounded(path, MAX_FILE_BYTES))
+        except ConfigurationError as error:
+            raise RecordingError(str(error)) from error
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from error
         except (ValueError, RecursionError) as error:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from analogrig.config import MOST_NUMBER
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import ConfidenceSequence
 from analogrig.judging.verdict import ChangeVerdict, Verdict
@@ -99,7 +100,11 @@ def _check_row(row: Any) -> None:
         raise ValueError("a row whose counts cannot be")
     if not all(map(_is_change, changes(row))):
         raise ValueError("a change with values of the wrong types")
-    if len(row["errors"]) not in (0, len(PARAMETERS)) or not all(map(_is_number, row["errors"])):
+    if (
+        not isinstance(row["errors"], list)
+        or len(row["errors"]) not in (0, len(PARAMETERS))
+        or not all(map(_is_number, row["errors"]))
+    ):
         raise ValueError(f"errors that are not {len(PARAMETERS)} finite numbers")
     if not all(isinstance(text, str) for text in (row["theta"], row.get("why", ""))):
         raise ValueError("a text that is not a string")
@@ -108,7 +113,7 @@ def _check_row(row: Any) -> None:
 
 
 def _is_number(value: object) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+    return type(value) in (int, float) and abs(value) <= MOST_NUMBER  # type: ignore[arg-type]
 
 
 def _is_change(change: Change) -> bool:

@@ -58,6 +58,9 @@ _EXHAUSTED = {
 }
 """Advice for failures that any operation of the system can have, an import among them."""
 
+_MOST_CAUSE = 100
+"""Characters of an error that another library has worded; its end names the cause."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Every failure is one line on standard error."""
@@ -81,11 +84,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _explain(error: Exception) -> int:
     """Print in one line the error that ended a command; return the exit status."""
-    from analogrig.errors import AnalogrigError
-    from analogrig_emulator import EmulatorError
-
+    try:
+        from analogrig.errors import AnalogrigError
+        from analogrig_emulator import EmulatorError
+    except (ImportError, MemoryError, OSError):
+        cause = " ".join(str(error).split())[-_MOST_CAUSE:]
+        return complain(f"not enough memory, or an incomplete installation: {cause}", INCONCLUSIVE)
     if isinstance(error, AnalogrigError | EmulatorError):
         return complain(str(error), USAGE)
+    if isinstance(error, FileNotFoundError) and _is_working_directory_gone():
+        return complain("the working directory is gone: change to one that exists", USAGE)
     if "ANALOGRIG_DEBUG" in os.environ:
         raise error
     if isinstance(error, MemoryError):
@@ -94,6 +102,14 @@ def _explain(error: Exception) -> int:
         return complain(f"{error.strerror}: {_EXHAUSTED[error.errno]}", INCONCLUSIVE)
     what = " ".join(f"{type(error).__name__}: {error}".split())
     return complain(f"a fault of analogrig itself: {what} (ANALOGRIG_DEBUG=1 shows where)", INCONCLUSIVE)
+
+
+def _is_working_directory_gone() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109 - asks the operating system, as Path.cwd() does
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -24,6 +24,7 @@ class Device(ABC):
 
     def __init__(self, description: DeviceDescription) -> None:
         self._description = description
+        self._files = description.files()
 
     @property
     def name(self) -> str:
@@ -63,8 +64,8 @@ class Device(ABC):
         return self._description.as_table()
 
     def files(self) -> tuple[DeviceFile, ...]:
-        """Library, program or firmware that the device runs on this machine, if any."""
-        return self._description.files()
+        """Library, program or firmware that the device runs on this machine, if any, as it was when it was loaded."""
+        return self._files
 
     def __enter__(self) -> Self:
         return self

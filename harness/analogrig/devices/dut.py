@@ -46,6 +46,7 @@ from analogrig.errors import (
     LinkTimeout,
 )
 from analogrig.estimator_config import EstimatorConfig
+from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.exchange import Exchange, Packing, Replies, Stretch, most_answers
@@ -385,17 +386,25 @@ def _override(description: DeviceDescription, changes: Mapping[str, Any]) -> Dev
 
 def connect(description: DeviceDescription, listener: CanListener | None = None) -> Dut:
     """Open, identify and configure a device; errors as ``open_dut``."""
+    files = description.files()
     link = description.open()
     if listener is not None:
         link.listen(listener)
     dut = Dut(link, description)
     try:
+        _check_files(dut, files)
         dut.handshake()
         dut.configure()
     except BaseException:
         dut.close()
         raise
     return dut
+
+
+def _check_files(dut: Dut, before: tuple[DeviceFile, ...]) -> None:
+    """:raises DeviceError: a file of the device is not the one before it was opened."""
+    if dut.files() != before:
+        raise DeviceError(f"device {dut.name}: its file was replaced while it was loaded: start again")
 
 
 def _word(kind: type[enum.IntEnum], value: int) -> str:

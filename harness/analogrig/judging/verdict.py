@@ -182,6 +182,9 @@ class Verdict:
     doubtful_alarms: tuple[int, ...] = ()
     """Sample indices of the alarms that are false under some hypotheses only."""
 
+    def __bool__(self) -> bool:
+        raise TypeError('a verdict is neither true nor false: ask for verdict.outcome == "passed"')
+
     @property
     def valid(self) -> bool:
         """True if the run permits a verdict on the device."""

@@ -111,7 +111,8 @@ def _rigs_file() -> Path | None:
         if not Path(named).is_file():
             raise ConfigurationError(f"{RIGS_VARIABLE}: {named}: no such file")
         return Path(named)
-    return Path(RIGS_FILE) if Path(RIGS_FILE).is_file() else None
+    own = Path(RIGS_FILE)
+    return own if own.is_file() and "rig" in config.read_toml(own) else None  # another program's has no tables of rigs
 
 
 def _rig_tables(path: Path, table: Mapping[str, Any]) -> Mapping[str, Any]:

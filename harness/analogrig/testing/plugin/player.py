@@ -90,6 +90,7 @@ class Player:
     def __call__(
         self, scenario: str | Path | Scenario, seed: int | None = None, *, allow_inconclusive: bool = False
     ) -> Played:
+        from analogrig.bench import raise_if_interrupted
         from analogrig.errors import AnalogrigError
         from analogrig.scenario import DEFAULT_SEED, Scenario
         from analogrig.testing.counterexample import command_of
@@ -108,6 +109,7 @@ class Player:
         repeat = command_of(run, name, RIG.of(self.item).value, DUT.of(self.item).value)
         played = Played(run, repeat, functools.partial(self.note, seed=drawn))
         record_of(self.item).plays.append(played)
+        raise_if_interrupted(run)  # the session ends, as pytest ends at Ctrl-C
         if not played.verdict.valid and not allow_inconclusive:
             pytest.fail(f"INCONCLUSIVE: {played.verdict.reasons[0]}", pytrace=False)
         return played
