@@ -39,12 +39,14 @@ class _Handler:
         self._holds = 0
         self._held = ""
         """Name of the signal that waits for the end of ``hold_signals``."""
+        self.first = ""
+        """Name of the first signal."""
 
     def __call__(self, number: int, _: FrameType | None) -> None:
         now_s = time.monotonic()
         if self._first_s is None:
             self._first_s = now_s
-            self._held = signal.Signals(number).name
+            self._held = self.first = signal.Signals(number).name
             self._raise()
         elif now_s - self._first_s >= AGAIN_S:
             signal.signal(number, signal.SIG_DFL)
@@ -131,6 +133,8 @@ def signal_future() -> asyncio.Future[int]:
     for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
             loop.add_signal_handler(number, end, number.name)
+    if _handlers and _handlers[-1].first:  # what Interrupted is raised in may swallow it, such as a finalizer
+        end(_handlers[-1].first)
     return ended
 
 

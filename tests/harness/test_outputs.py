@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
@@ -24,7 +25,7 @@ from analogrig.errors import ConfigurationError, LinkClosed, RecordingError, Rig
 from analogrig.judging.verdict import judge
 from analogrig.output import NOT_ENDED, OutputFolder, previous_of
 from analogrig.run import Run
-from analogrig.signals import ENDING
+from analogrig.signals import ENDING, raise_signals, signal_future
 from tests.harness.processes import descendants, ends, with_default_signals
 
 LONG_S = 300.0
@@ -530,3 +531,19 @@ def test_names_of_logs_are_those_that_are_written() -> None:
     from analogrig.recordings import WRITTEN
 
     assert set(output_module.RUN_FILES) == {"run.npz", *(f"can.{suffix}" for suffix in WRITTEN)}
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_signal_that_a_finalizer_has_swallowed_ends_a_server() -> None:
+    """Python prints what a finalizer raises, and goes on: `serve` then waited for ever."""
+
+    class Finalized:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    async def serve() -> None:
+        Finalized()
+        await signal_future()
+
+    with raise_signals(), pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+        asyncio.run(asyncio.wait_for(serve(), LONG_S))
