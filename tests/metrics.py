@@ -11,6 +11,7 @@ import itertools
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -274,9 +275,40 @@ def write_page(trees: Sequence[Tree], page: Path = PAGE) -> None:
     command = " ".join(["--write", *(tree.name for tree in trees if tree.name != NOW)])
     page.write_text(
         f'# Structure\n\nWritten by `make metrics ARGS="{command}"`. Each column is a commit, with its date.\n\n'
-        f"{table(trees, headings)}",
+        f"{table(trees, headings)}"
+        + "".join(
+            f"\n## Levels at {name}\n\n{_LEVELS_TEXT}\n\n{drawing(tree)}"
+            for tree, name in zip(trees, headings, strict=True)
+        ),
         encoding="utf-8",
     )
+
+
+_LEVELS_TEXT = """Folders and modules of the package `analogrig`, or `harness` before. Each imports only from lines
+below its own."""
+
+
+def drawing(tree: Tree) -> str:
+    """The folders by level, the highest first, as a block of text; a circle stands in brackets."""
+    found = arrows(tree)
+    imports = {name: {b for a, b in found if a == name} for pair in found for name in pair}
+    rings = {name: frozenset(circle) for circle in circles(found) for name in circle}
+    groups = {rings.get(name, frozenset({name})) for name in imports}
+    level: dict[frozenset[str], int] = {}
+    while len(level) < len(groups):
+        for group in groups - level.keys():
+            below = {rings.get(b, frozenset({b})) for name in group for b in imports[name]} - {group}
+            if below <= level.keys():
+                level[group] = 1 + max((level[each] for each in below), default=0)
+    lines = []
+    for number in sorted(set(level.values()), reverse=True):
+        names = sorted(_ring(group) for group, own in level.items() if own == number)
+        lines += textwrap.wrap(f"{number:2}  {'  '.join(names)}", 98, subsequent_indent="    ", break_on_hyphens=False)
+    return "\n".join(["```text", *lines, "```", ""])
+
+
+def _ring(group: frozenset[str]) -> str:
+    return " ".join(sorted(group)) if len(group) == 1 else f"[{' '.join(sorted(group))}]"
 
 
 def show_arrows(tree: Tree) -> None:
