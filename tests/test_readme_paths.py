@@ -25,6 +25,7 @@ MADE_UP = {
         "bench.dbc",
         "bench.toml",
         "dut.toml",
+        "rig.toml",
         "mine.toml",
         "rigs.toml",
         "scenario.toml",
