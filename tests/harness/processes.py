@@ -49,11 +49,13 @@ def marked(mark: str) -> list[int]:
 
 
 def gone(mark: str) -> bool:
-    """True if all of them end in time."""
+    """True if all of them end in time: none is found twice in a row, for a process has no environment during exec()."""
     deadline_s = time.monotonic() + LONG_S
-    while marked(mark) and time.monotonic() < deadline_s:
-        time.sleep(0.01)
-    return not marked(mark)
+    looks = 0
+    while looks < 2 and time.monotonic() < deadline_s:
+        looks = 0 if marked(mark) else looks + 1
+        time.sleep(0.05)
+    return looks == 2
 
 
 def with_default_signals(*command: str | Path) -> list[str | Path]:
