@@ -566,3 +566,20 @@ def test_zero_with_a_minus_is_zero(tmp_path: Path) -> None:
         0,
         1,
     )
+
+
+def test_container_of_a_blf_log_that_expands_without_bound_is_refused(tmp_path: Path) -> None:
+    """A file of 3 MB took 3 GB."""
+    from can.io import blf
+
+    with blf.BLFWriter(str(tmp_path / "log.blf")) as _:
+        pass
+    header = (tmp_path / "log.blf").read_bytes()[: blf.FILE_HEADER_SIZE]
+    packed = zlib.compress(bytes(100_000_000))
+    container = blf.LOG_CONTAINER_STRUCT.pack(blf.ZLIB_DEFLATE, 100_000_000) + packed
+    size = blf.OBJ_HEADER_BASE_STRUCT.size + len(container)
+    base = blf.OBJ_HEADER_BASE_STRUCT.pack(b"LOBJ", blf.OBJ_HEADER_BASE_STRUCT.size, 1, size, blf.LOG_CONTAINER)
+    (tmp_path / "log.blf").write_bytes(header + base + container)
+    frames = CapturedFrames(tmp_path / "log.blf")
+    assert list(frames) == []
+    assert frames.end.endswith("a container expands to 32000000 bytes or more")

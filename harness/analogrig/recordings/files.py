@@ -7,10 +7,11 @@ import gc
 import io
 import logging
 import sys
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from analogrig.errors import RecordingError
 from analogrig.wording import number_of
@@ -83,6 +84,9 @@ READ = (*WRITTEN, "trc")
 """Formats that can be read, as file suffixes."""
 
 
+MOST_CONTAINER_BYTES = 32_000_000
+"""Bytes to which no container of a BLF file may expand; writers fill containers with 128 kB."""
+
 LONGEST_LINE = 4096
 """Characters of a line of a candump log that are read at once; a frame has at most 200."""
 
@@ -139,6 +143,8 @@ class CapturedFrames:
             file = io.TextIOWrapper(raw, "utf-8", "replace") if suffix in {".asc", ".trc"} else raw
             with silence_logger("asammdf"), silence_logger("can"), _silence_asammdf():
                 try:
+                    if suffix == ".blf":
+                        _check_containers(raw)
                     for frame in reader(file):
                         yield frame
                         n += 1
@@ -147,6 +153,27 @@ class CapturedFrames:
                     self.end = f"{self.path} is damaged after {number_of(n, 'frame')}: {cause}"
                 if self.end:
                     gc.collect()
+
+
+def _check_containers(raw: BinaryIO) -> None:
+    """Check that no container of a BLF file expands beyond the limit, and return to the start of the file.
+
+    :raises ValueError: one does; python-can would expand it whole.
+    """
+    from can.io import blf
+
+    raw.seek(blf.FILE_HEADER_STRUCT.unpack(raw.read(blf.FILE_HEADER_STRUCT.size))[1])
+    base = blf.OBJ_HEADER_BASE_STRUCT
+    while len(head := raw.read(base.size)) == base.size:
+        _, _, _, size, kind = base.unpack(head)
+        data = raw.read(max(0, size - base.size))
+        raw.read(size % 4)
+        if kind != blf.LOG_CONTAINER or data[:1] != bytes([blf.ZLIB_DEFLATE]):
+            continue
+        expanded = zlib.decompressobj().decompress(data[blf.LOG_CONTAINER_STRUCT.size :], MOST_CONTAINER_BYTES)
+        if len(expanded) == MOST_CONTAINER_BYTES:
+            raise ValueError(f"a container expands to {MOST_CONTAINER_BYTES} bytes or more")
+    raw.seek(0)
 
 
 @contextlib.contextmanager
