@@ -253,7 +253,7 @@ def test_hypothesis(number):
 def test_ours(dut, hil_play, hil_dut, mocker):
     dut.write("on the bench\\n")
     dut.expect_exact("on the bench", timeout=60)
-    assert hil_dut.handshake()
+    assert hil_dut.recover()
     assert hil_play("healthy", seed=3).stays_quiet()
 """
 

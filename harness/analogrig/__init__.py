@@ -18,7 +18,7 @@ The names in ``__all__`` are the public interface, and so are their documented m
 ``analogrig``, ``analogrig_emulator`` and ``analogrig_thesis`` is private: it may move or change in any version.
 
 =============  =========================================================================================
-play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Dut``, ``EstimatorConfig``
+play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Device``, ``EstimatorConfig``
 describe       ``Scenario``, ``Excitation``, ``Plant``, ``PlantChoice``, ``PotChange``, ``Expectations``
 judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``ChangeVerdict``, ``detectable``, ``write_report``
 test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_seed``, ``strategies``
@@ -35,7 +35,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.devices.dut import Dut, open_dut
+    from analogrig.devices.device import Device
+    from analogrig.devices.opening import open_dut
     from analogrig.errors import (
         AnalogrigError,
         ConfigurationError,
@@ -71,7 +72,8 @@ else:
         "analogrig.judging.information": "detectable",
         "analogrig.judging.verdict": "ChangeVerdict Verdict judge",
         "analogrig.plant": "Plant",
-        "analogrig.devices.dut": "Dut open_dut",
+        "analogrig.devices.device": "Device",
+        "analogrig.devices.opening": "open_dut",
         "analogrig.reporting.page": "write_report",
         "analogrig.rigs.description": "open_rig",
         "analogrig.rigs.rig": "Rig",
@@ -109,8 +111,8 @@ __all__ = [
     "ChangeVerdict",
     "Conditions",
     "ConfigurationError",
+    "Device",
     "DeviceError",
-    "Dut",
     "EmulatorError",
     "EstimatorConfig",
     "Excitation",

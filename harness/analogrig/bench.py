@@ -14,12 +14,12 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.datasheet import Datasheet
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
-from analogrig.devices.direct import DirectDevice
 from analogrig.errors import DeviceError, LinkError, RigError, TimeLimitReached
 from analogrig.links.wire import Clock
-from analogrig.protocol.exchange import RaisedAlarm, Replies, StatedDiagnosis, Stretch
 from analogrig.protocol.pace import Pace
 from analogrig.rigs.emulator import EmulatorRig, is_emulated
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
@@ -45,15 +45,16 @@ class _RunBuilder:
     The arrays are allocated for all samples asked. The operating system provides only the pages that are written.
     """
 
-    def __init__(self, samples_asked: int, parameters: int) -> None:
-        self._codes = np.empty((samples_asked, len(CHANNELS)), np.uint16)
-        self._clipped = np.empty((samples_asked, len(CHANNELS)), np.bool_)
-        self._theta = np.empty((samples_asked, parameters), np.float32)
-        self._innovation = np.empty(samples_asked, np.float32)
-        self._statistic = np.empty(samples_asked, np.float32)
-        self._flags = np.empty(samples_asked, np.uint8)
+    def __init__(self, samples_asked: int, sheet: Datasheet) -> None:
+        n = samples_asked
+        self._codes = np.empty((n, len(CHANNELS)), np.uint16)
+        self._clipped = np.empty((n, len(CHANNELS)), np.bool_)
+        self._theta = np.empty((n, sheet.theta_n), np.float32)
+        self._innovation = np.empty(n, np.float32) if sheet.innovation else np.zeros(n, np.float32)
+        self._statistic = np.empty(n, np.float32) if sheet.statistic else np.zeros(n, np.float32)
+        self._flags = np.empty(n, np.uint8)
         self._alarms: list[RaisedAlarm] = []
-        self._diagnoses: list[StatedDiagnosis] = []
+        self._diagnoses: list[ReportedDiagnosis] = []
         self.samples = 0
         self.records: list[int] = []
         """First samples of the records."""
@@ -65,15 +66,20 @@ class _RunBuilder:
         """Start a record with the next sample."""
         self.records.append(self.samples)
 
-    def add(self, block: Block, reply: Replies) -> None:
+    def add(self, block: Block, answers: Answers) -> None:
         """Append the answered samples of a block: all of them, unless the run ends here."""
-        answered = len(reply.flags)
+        answered = len(answers)
         to = slice(self.samples, self.samples + answered)
         self._codes[to] = block.codes[:answered]
         self._clipped[to] = block.clipped[:answered]
-        self._theta[to], self._innovation[to] = reply.theta, reply.innovation
-        self._statistic[to], self._flags[to] = reply.statistic, reply.flags
-        shifted = _shift_replies(self.records[-1], reply)
+        self._flags[to] = answers.flags
+        if answers.theta is not None:
+            self._theta[to] = answers.theta
+        if answers.innovation is not None:
+            self._innovation[to] = answers.innovation
+        if answers.statistic is not None:
+            self._statistic[to] = answers.statistic
+        shifted = answers.shifted(self.records[-1])
         self._alarms += shifted.alarms
         self._diagnoses += shifted.diagnoses
         self.samples += answered
@@ -102,19 +108,6 @@ class _RunBuilder:
             diagnosis_onset=np.array([diagnosis.onset for diagnosis in diagnoses], dtype=np.int64),
             diagnosis_extent=np.array([diagnosis.extent for diagnosis in diagnoses], dtype=np.float32),
         )
-
-
-def _shift_replies(first: int, reply: Replies) -> Replies:
-    """Replies with the device's sample indices, which start at 0 in each record, shifted by ``first``."""
-    if not first:
-        return reply
-    return dataclasses.replace(
-        reply,
-        alarms=tuple(dataclasses.replace(alarm, index=first + alarm.index) for alarm in reply.alarms),
-        diagnoses=tuple(
-            dataclasses.replace(each, index=first + each.index, onset=first + each.onset) for each in reply.diagnoses
-        ),
-    )
 
 
 def was_interrupted(run: Run) -> bool:
@@ -191,10 +184,10 @@ class Bench:
         until_s = self._clock() + self._time_limit_s
         performance = self.rig.perform(scenario, seed)
         pace, blocks = self._pace_blocks(performance)
-        self.dut.set_force_zero(performance.channels["force"].zero)
+        self.dut.prepare(performance.channels, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
-        builder = _RunBuilder(scenario.samples, self.dut.parameters)
+        builder = _RunBuilder(scenario.samples, self.dut.datasheet)
         faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
         conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
         return builder.build(conditions)
@@ -232,7 +225,7 @@ class Bench:
         except RigError as error:
             faults.append(str(error))
             with contextlib.suppress(DeviceError, LinkError):
-                self.dut.handshake()  # the device awaits samples; a handshake keeps this run out of the next one
+                self.dut.recover()  # the device awaits samples, which would reach it in the next run
         except (DeviceError, LinkError) as error:
             faults.append(str(error))
         except KeyboardInterrupt as error:
@@ -309,13 +302,13 @@ class Bench:
         sent: deque[Block] = deque()
         start = builder.records[-1]
 
-        def stretches() -> Iterator[Stretch]:
+        def samples_of_record() -> Iterator[Samples]:
             for block in blocks:
                 sent.append(block)
-                yield (block.first - start, *block.signals())
+                yield block.samples(start)
 
-        for reply in self.dut.play(stretches()):
-            builder.add(sent.popleft(), reply)
+        for answers in self.dut.play(samples_of_record()):
+            builder.add(sent.popleft(), answers)
             if self._progress is not None:
                 self._progress(builder.samples, samples)
 
@@ -325,13 +318,13 @@ def can_be_direct(rig: Rig, device: DeviceDescription) -> TypeGuard[EmulatorRig]
 
     The rig must be emulated, and the line must not alter the samples.
     """
-    return is_emulated(rig) and device.can_run_in_blocks
+    return is_emulated(rig) and "blocks" in device.capabilities
 
 
 def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bool = False) -> Bench:
     """Bench with the estimator in this process and whole blocks: the fastest way.
 
-    If ``can_be_direct``, the runs are those over the line to the bit, without what ``DirectDevice`` lacks.
+    If ``can_be_direct``, the runs are those over the line to the bit, without what needs messages.
 
     :param alarms_only: omit the estimates, which take half of the time: theta of the runs has no columns.
     :raises ConfigurationError: the estimator refuses its configuration.
@@ -340,4 +333,4 @@ def direct_bench(rig: EmulatorRig, device: DeviceDescription, *, alarms_only: bo
     # glibc returns freed memory to the system beyond a threshold that grows with the largest block freed. Without this
     # line every play would fault its pages in again, which takes a tenth of the time.
     np.empty(_RETAINED_BYTES, np.uint8)
-    return Bench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), DirectDevice(device, alarms_only=alarms_only))
+    return Bench(rig.in_blocks(DIRECT_BLOCK_SAMPLES), device.direct(alarms_only=alarms_only))

@@ -174,6 +174,16 @@ class EstimatorConfig:
             if value is not None:
                 yield Key[name.upper()], float(_WORDS[name].index(value) if name in _WORDS else value)
 
+    def changed(self, where: str, settings: Mapping[str, Any]) -> Self:
+        """The configuration with other values of some fields; ``where`` begins every error message.
+
+        :raises ConfigurationError: there is no such field, or the values are no valid configuration.
+        """
+        try:
+            return dataclasses.replace(self, **settings)
+        except (TypeError, ValueError) as error:
+            raise ConfigurationError(f"{where}: {error}") from error
+
     def check_ranges(self) -> None:
         """:raises ValueError: a setting is out of range in every build of the device."""
         for key, value in self.settings():

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analogrig import config
+from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.scenario import Expectations
@@ -38,7 +39,8 @@ class _Scenario:
 @dataclass(frozen=True)
 class _Device:
     name: str
-    estimator: EstimatorConfig
+    estimator: EstimatorConfig | None = None
+    datasheet: Datasheet | None = None
     kind: str = ""
     report_interval_n: int = 1
     most_lost_n: int = 0
@@ -49,9 +51,12 @@ class _Device:
         for name, least in (("report_interval_n", 1), ("most_lost_n", 0), ("assumed_n", 0)):
             if not least <= getattr(self, name) <= _MOST:
                 raise ValueError(f"{name} must be {least} to {_MOST}, not {getattr(self, name)}")
-        self.estimator.check_ranges()
-        if self.estimator.parameters > MAX_PARAMETERS:
-            raise ValueError(f"estimator: {self.estimator.parameters} parameters, of at most {MAX_PARAMETERS}")
+        if self.estimator is None and self.datasheet is None:
+            raise ValueError("the key 'estimator' or 'datasheet' is lacking")
+        if self.estimator is not None:
+            self.estimator.check_ranges()
+            if self.estimator.parameters > MAX_PARAMETERS:
+                raise ValueError(f"estimator: {self.estimator.parameters} parameters, of at most {MAX_PARAMETERS}")
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,8 @@ class _Line:
 
 def check_tables(
     where: str, *, scenario: Mapping[str, Any], rig: Mapping[str, Any], dut: Mapping[str, Any], line: Mapping[str, int]
-) -> EstimatorConfig:
-    """Settings of the recorded estimator, after a check of every key that a verdict reads; ``where`` leads errors.
+) -> Datasheet:
+    """Data sheet of the recorded device, after a check of every key that a verdict reads; ``where`` leads errors.
 
     :raises ConfigurationError: a key that is read later is missing or wrong.
     """
@@ -85,8 +90,8 @@ def check_tables(
         lacking = [key for key in needed if key not in settings]
         if lacking:
             raise ConfigurationError(f"{where}: dut: estimator: the key {lacking[0]!r} is lacking")
-    estimator: EstimatorConfig = _build_known(_Device, dut, f"{where}: dut").estimator
-    return estimator
+    _build_known(_Device, dut, f"{where}: dut")
+    return Datasheet.recorded(dut)
 
 
 def _build_known(cls: type[Any], table: Mapping[str, Any], where: str) -> Any:

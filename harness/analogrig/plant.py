@@ -7,12 +7,14 @@ the samples of a run.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from analogrig.datasheet import ModelOrders
 
 PARAMETERS = ("M", "B", "K")
 """Names of the physical parameters, in the order of every array of them."""
@@ -183,23 +185,22 @@ def _exponential(matrices: NDArray[np.float64], squarings: int) -> NDArray[np.fl
 
 
 def physical_parameters(
-    theta: NDArray[np.floating], estimator: Mapping[str, object], n_per_code: float, m_per_code: float, period_s: float
+    theta: NDArray[np.floating], model: ModelOrders, n_per_code: float, m_per_code: float, period_s: float
 ) -> NDArray[np.float64]:
     """M, B, K (n, 3) of estimates theta (n, p) in codes; NaN if a row describes no mass, damper and spring.
 
     The poles of A give B/M and K/M, the static gain gives K. Neither depends on the instant of an edge within a sample.
 
-    :param estimator: at least the orders ``na`` and ``nb`` of theta; all NaN unless ``na`` is 2.
+    :param model: meaning of theta; all NaN unless its ``na`` is 2.
     :param n_per_code: newtons per code of force.
     :param m_per_code: metres per code of displacement.
     :param period_s: problem time between samples.
     """
-    na, nb = int(str(estimator["na"])), int(str(estimator["nb"]))
-    if na != 2:
+    if model.na != 2:
         return np.full((len(theta), 3), np.nan)
     a1, a2 = (theta[:, i].astype(np.float64) for i in range(2))
     with np.errstate(all="ignore"):
-        gain = theta[:, 2 : 2 + nb].sum(axis=1, dtype=np.float64) / (1.0 + a1 + a2)
+        gain = theta[:, 2 : 2 + model.nb].sum(axis=1, dtype=np.float64) / (1.0 + a1 + a2)
         stiffness = n_per_code / (gain * m_per_code)
         poles = np.sqrt((a1 * a1 - 4.0 * a2).astype(np.complex128))
         logs = [np.log((-a1 + sign * poles) / 2.0) / period_s for sign in (1.0, -1.0)]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.catalogue import Change
+from analogrig.datasheet import Datasheet
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.estimator_config import EstimatorConfig
 from analogrig.header import check_tables
 from analogrig.identity import Identity
 from analogrig.plant import MAX_CHANGES, MAX_SAMPLES, Plant, Segment
@@ -50,6 +50,8 @@ LOST = 0x20
 """Flag of a sample, beside SteppedFlag: lost on the way to the device."""
 UNREPORTED = 0x40
 """Flag of a sample, beside SteppedFlag: the device reported no estimate, and theta repeats the previous row."""
+UNARMED = 0x80
+"""Flag of a sample, beside SteppedFlag: the device reported that its trigger was not armed."""
 
 _ARRAYS: dict[str, tuple[str, int]] = {
     "codes": ("uint16", 2),
@@ -131,7 +133,7 @@ class Conditions:
     rig: Mapping[str, Any]
     """Description of the rig, with its name."""
     dut: Mapping[str, Any]
-    """Device: name, kind, estimator settings, identity (firmware, catalogue hash, boot nonce)."""
+    """Device: name, kind, settings, data sheet, identity (firmware, catalogue hash, boot nonce)."""
     link: str
     counters: Mapping[str, int] = field(default_factory=dict)
     """Counters of the device at the end."""
@@ -148,7 +150,7 @@ class Conditions:
     line_s: float = 0.0
     """Transmission time of a lock-step run at the configured line speed; 0: no speed is configured."""
     line: Mapping[str, int] = field(default_factory=dict)
-    """Speed and packing of the line (``Dut.line``); empty if not recorded."""
+    """Speed and packing of the line (``Device.line``); empty if not recorded."""
     identity: Identity | None = None
     """Provenance; None if not recorded."""
 
@@ -171,13 +173,13 @@ class Run:
     clipped: NDArray[np.bool_]
     """(n, 4): the code is the limit of the range, not a measurement."""
     theta: NDArray[np.float32]
-    """(n, p): the estimate after each sample, in codes per code; order of est.h."""
+    """(n, p): the estimate after each sample, in codes per code; order of est.h. (n, 0) if it is not reported."""
     innovation: NDArray[np.float32]
-    """(n,) prediction errors in codes."""
+    """(n,) prediction errors in codes; zeros if they are not reported (``datasheet``)."""
     statistic: NDArray[np.float32]
-    """(n,): the trigger's statistic."""
+    """(n,): the trigger's statistic; zeros if it is not reported (``datasheet``)."""
     flags: NDArray[np.uint8]
-    """(n,): SteppedFlag of the device, with LOST and UNREPORTED."""
+    """(n,): SteppedFlag of the device, with LOST, UNREPORTED and UNARMED."""
     alarm_index: NDArray[np.int64]
     """(a,): sample index of each alarm."""
     alarm_kind: NDArray[np.uint8]
@@ -195,6 +197,11 @@ class Run:
     def samples(self) -> int:
         """Number of samples that were played."""
         return len(self.codes)
+
+    @property
+    def datasheet(self) -> Datasheet:
+        """Data sheet of the device."""
+        return Datasheet.recorded(self.conditions.dut)
 
     @property
     def missing(self) -> NDArray[np.bool_]:
@@ -250,11 +257,17 @@ class Run:
         return dataclasses.replace(self, conditions=dataclasses.replace(self.conditions, identity=identity))
 
     def theta_hash(self) -> str:
-        """SHA-256 over the little-endian float32 bits of every estimate, row by row."""
+        """SHA-256 over the little-endian float32 bits of every estimate, row by row; empty without estimates."""
+        if not self.theta.shape[1]:
+            return ""
         digest = hashlib.sha256()
         for first in range(0, self.samples, CHUNK_SAMPLES):
             digest.update(np.ascontiguousarray(self.theta[first : first + CHUNK_SAMPLES], dtype="<f4").data)
         return digest.hexdigest()
+
+    def alarm_hash(self) -> str:
+        """SHA-256 over the little-endian int64 sample indices of the alarms."""
+        return hashlib.sha256(np.ascontiguousarray(self.alarm_index, dtype="<i8").data).hexdigest()
 
     def save(self, path: Path) -> None:
         """Write the run to one file, atomically.
@@ -291,8 +304,8 @@ class Run:
         run._check_consistency(path)
         return run
 
-    def _estimator(self, path: Path) -> EstimatorConfig:
-        """Settings of the recorded estimator.
+    def _recorded_datasheet(self, path: Path) -> Datasheet:
+        """Data sheet of the recorded device.
 
         :raises RecordingError: a table of the header lacks a key that a verdict reads, or has a wrong one.
         """
@@ -356,7 +369,7 @@ class Run:
             and set(self.diagnosis_change.tolist()) <= set(Change) - {Change.UNDECIDED},
             "line": all(value > 0 for value in conditions.line.values()),
             "overloads": all(0 <= sample < n for sample in conditions.overloads.values()),
-            "estimator": self.theta.shape[1] == self._estimator(path).parameters,
+            "theta": self.theta.shape[1] == self._recorded_datasheet(path).theta_n,
         }
         wrong = [what for what, holds in checks.items() if not holds]
         if wrong:

@@ -14,7 +14,6 @@ from scipy.signal import butter, lfilter
 
 from analogrig.bench import Bench, raise_if_interrupted
 from analogrig.config import fixtures
-from analogrig.devices.dut import connect
 from analogrig.devices.host import HostDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.plant import AT_REST, Plant, SampledPlant, Segment
@@ -203,7 +202,7 @@ def _shipped_rig(name: str) -> Rig:
 
 def _play(rig_name: str, scenario: Scenario, config: EstimatorConfig) -> Run:
     device = HostDevice(name="host", exchange="block", estimator=config, timeout_s=TIMEOUT_S)
-    with _shipped_rig(rig_name) as rig, connect(device) as dut:
+    with _shipped_rig(rig_name) as rig, device.connect() as dut:
         return raise_if_interrupted(Bench(rig, dut).play(scenario, SEED))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import freqz, lfilter, lfiltic
 
+from analogrig.datasheet import ModelOrders
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import trajectory
@@ -261,8 +262,8 @@ class Samples:
         ceiling = None if config.ceiling is None else config.ceiling * unit
         fitted = dataclasses.replace(config, p0=config.p0 / shrunk**2, ceiling=ceiling)
         steps = Estimator(fitted).run(self.u * shrunk, self.y * shrunk)
-        theta, settings = steps.theta.astype(np.float64), dataclasses.asdict(config)
-        parameters = physical_parameters(theta, settings, self.n_per_unit, self.m_per_unit, PERIOD_S)
+        theta, model = steps.theta.astype(np.float64), ModelOrders.of_estimator(config.as_table())
+        parameters = physical_parameters(theta, model, self.n_per_unit, self.m_per_unit, PERIOD_S)
         return Track(theta, steps.innovation / shrunk, steps.statistic / unit, steps.alarms, parameters)
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from analogrig.bench import Bench
 from analogrig.devices.can import CanDevice
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import connect
 from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.qemu import FIRMWARE, QemuM4
@@ -23,6 +22,7 @@ from analogrig.protocol.pace import Pace
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario
 from tests.can_guest.__main__ import throughput_in_guest
+from tests.harness.fed import fed
 
 from .figure import Figure
 
@@ -71,10 +71,10 @@ def samples_per_s(description: DeviceDescription, samples: int) -> float:
     index = np.arange(samples)
     force = np.where((index // 50) % 2, 3900, 150).astype(np.uint16)
     displacement = (2000 + 3 * (index % 100)).astype(np.uint16)
-    with connect(description) as dut:
+    with description.connect() as dut:
         dut.start()
         start_s = time.perf_counter()
-        dut.feed(0, force, displacement, np.zeros(samples, bool))
+        fed(dut, 0, force, displacement, np.zeros(samples, bool))
         return samples / (time.perf_counter() - start_s)
 
 
@@ -88,7 +88,7 @@ def overruns(duration_s: float) -> Pace:
             return paces[-1]
 
     scenario = dataclasses.replace(Scenario.load("healthy"), samples=round(duration_s * 20_000))
-    with open_rig("emulator") as rig, connect(HostDevice(name="host", exchange="stream")) as dut:
+    with open_rig("emulator") as rig, HostDevice(name="host", exchange="stream").connect() as dut:
         Watched(rig, dut, real_time=1.0).play(scenario, seed=1)
     return paces[0]
 

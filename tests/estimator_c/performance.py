@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from analogrig.datasheet import ModelOrders
 from analogrig.plant import physical_parameters
 from tests.estimator_c.est_driver import LOCKED, MAY_SLIP, Estimator
 from tests.estimator_c.plants import (
@@ -133,7 +134,7 @@ def accuracy(estimator: Estimator, settings: Settings, trials: int, samples: int
     played = simulate((FRONT, FRONT), never, FULL, samples, seed=300)
     assert estimator.init(**settings)
     _, theta = estimator.watch(played.u, played.y)
-    model = {name: settings[name] for name in ("na", "nb")}
+    model = ModelOrders(int(str(settings["na"])), int(str(settings["nb"])))
     n_per_code, m_per_code = FRONT.force_range_n / CODES, DISPLACEMENT_RANGE_M / CODES
     found = physical_parameters(theta, model, n_per_code, m_per_code, PERIOD_S)
     truth = np.array([FRONT.mass_kg, FRONT.damping_n_s_per_m, FRONT.stiffness_n_per_m])

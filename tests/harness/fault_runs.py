@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from analogrig.bench import Bench
 from analogrig.catalogue import Configure, Control, Message, Sample, SampleBlock, SteppedFlag
 from analogrig.devices.can_nodes import MemoryBus
-from analogrig.devices.dut import Dut
+from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
 from analogrig.errors import AnalogrigError
@@ -38,11 +38,11 @@ from analogrig.links.faulty_bus import FaultyBus
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import DIRECTIONS, Direction, FaultyWire, WireFault, WireFaults
-from analogrig.protocol.exchange import Replies
 from analogrig.rigs.rig import Block, Hindsight, Performance, Rig
 from analogrig.run import CHANNELS, Channel, Run
 from analogrig.scenario import Scenario
 from analogrig_emulator import Excitation
+from tests.harness.fed import Fed, fed
 
 N = 60
 MOST_N = 480
@@ -196,11 +196,11 @@ def _kept(link: Link) -> int:
 
 
 def _play(link: Link, description: InprocDevice, case: Case) -> Played:
-    dut = Dut(link, description)
+    dut = CatalogueDevice(link, description)
     dut._talk._seq = case.first_seq
     scenario = Scenario(samples=case.samples, excitation=EXCITATION, name="faults")
     try:
-        dut.handshake()
+        dut.recover()
         dut.configure()
         run = Bench(SignalsRig(), dut).play(scenario, seed=0)
     except AnalogrigError as error:
@@ -212,15 +212,15 @@ def _play(link: Link, description: InprocDevice, case: Case) -> Played:
 
 
 @functools.lru_cache(maxsize=4096)
-def reference(samples: int, lost: tuple[int, ...]) -> Replies:
-    """Replies without any fault, with these samples declared missing."""
+def reference(samples: int, lost: tuple[int, ...]) -> Fed:
+    """Fed without any fault, with these samples declared missing."""
     missing = np.zeros(samples, bool)
     missing[list(lost)] = True
-    dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob", exchange="block", estimator=ESTIMATOR))
-    dut.handshake()
+    dut = CatalogueDevice(FramedLink(MemoryWire(1)), InprocDevice(name="bob", exchange="block", estimator=ESTIMATOR))
+    dut.recover()
     dut.configure()
     dut.start()
-    return dut.feed(0, FORCE[:samples], DISPLACEMENT[:samples], missing)
+    return fed(dut, 0, FORCE[:samples], DISPLACEMENT[:samples], missing)
 
 
 def _check_estimates(run: Run, case: Case) -> None:

@@ -18,7 +18,6 @@ from pathlib import Path
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.campaigns import plays
 from analogrig.campaigns.conduct import Tally, conduct, journal_of
 from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Chunk, Plan, one_worker_only, rig_table
@@ -29,8 +28,9 @@ from analogrig.campaigns.spec import CampaignSpec
 from analogrig.campaigns.workers import MOST_DEATHS, Processes, ThisProcess
 from analogrig.cli import main
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import Dut, connect, open_dut
+from analogrig.devices.device import Device
 from analogrig.devices.library import LIBRARY
+from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import AnalogrigError, ConfigurationError, LinkClosed, RecordingError, WorkerError
 from analogrig.judging.statistics import ConfidenceSequence
@@ -572,11 +572,13 @@ def test_device_of_several_cells_is_opened_once(tmp_path: Path, monkeypatch: pyt
     close_devices()
     opened = []
 
-    def connected(description: DeviceDescription) -> Dut:
+    connect = DeviceDescription.connect
+
+    def connected(description: DeviceDescription) -> Device:
         opened.append(description.name)
         return connect(description)
 
-    monkeypatch.setattr(plays, "connect", connected)
+    monkeypatch.setattr(DeviceDescription, "connect", connected)
     spec = "trials = 1\nsamples = 300\ndevices = ['host?exchange=block']\n[grid]\nnoise_lsb = [0.5, 1.0]\n"
     plan = planned(tmp_path, spec)
     for cell in range(2):
@@ -729,7 +731,7 @@ def test_trial_that_the_user_interrupts_on_a_line_is_no_result(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("analogrig.devices.dut.Dut.play", interrupted)
+        patched.setattr("analogrig.devices.catalogue_device.CatalogueDevice.play", interrupted)
         assert main(["campaign", str(tmp_path / "spec.toml"), "--out", str(out), "--workers", "1"]) == 130
     assert "interrupted: what is done is kept in" in capsys.readouterr().err
     assert journal_of(out).read_bytes().count(b"\n") == 1

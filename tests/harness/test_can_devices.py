@@ -19,9 +19,10 @@ from analogrig.bench import Bench
 from analogrig.catalogue import Counter
 from analogrig.cli import main
 from analogrig.devices.can import CanDevice
-from analogrig.devices.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.devices.device import Device
 from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import open_dut, reopen_dut
 from analogrig.devices.registry import describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.judging.verdict import judge
@@ -31,6 +32,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from tests.harness.fault_runs import DISPLACEMENT, ESTIMATOR, FORCE, N, reference
+from tests.harness.fed import catalogue, fed
 from tests.harness.firmware import needs_firmware
 from tests.harness.processes import children
 
@@ -136,7 +138,7 @@ def _configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_configured")
 def test_virtual_bus_of_the_configuration_has_the_device_of_this_process_on_it() -> None:
     with open_dut("can:") as dut:
-        assert dut.handshake().firmware == "LIBRARY"
+        assert catalogue(dut).recover().firmware == "LIBRARY"
 
 
 @pytest.mark.usefixtures("_configured")
@@ -183,7 +185,7 @@ THESIS = Scenario.load("thesis")
 
 
 def play(description: Any, *, seed: int = 1, scenario: Scenario = THESIS) -> Run:
-    with open_rig("emulator") as rig, connect(description) as dut:
+    with open_rig("emulator") as rig, description.connect() as dut:
         return Bench(rig, dut).play(scenario, seed)
 
 
@@ -220,30 +222,30 @@ def test_theta_is_that_of_a_serial_line(name: str) -> None:
     assert run.conditions.link_counters == {"frames_dropped": 0, "frames_foreign": 0, "error_frames": 0}
 
 
-def feed(dut: Dut) -> None:
+def feed(dut: Device) -> None:
     """N samples, answered as ever.
 
     :raises AssertionError: otherwise.
     """
     dut.start()
-    replies = dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+    replies = fed(dut, 0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
     assert np.array_equal(replies.theta, reference(N, ()).theta)
     dut.stop()
 
 
 @pytest.mark.parametrize("bitrate", [10_000, 1_000_000])
 def test_classic_frames_pass_an_slcan_adapter_of_any_bit_rate(bitrate: int) -> None:
-    with connect(HostDevice(name="bob", link="slcan", bitrate=bitrate, estimator=ESTIMATOR)) as dut:
+    with HostDevice(name="bob", link="slcan", bitrate=bitrate, estimator=ESTIMATOR).connect() as dut:
         feed(dut)
 
 
 def test_slcan_device_that_dies_is_told_for_what_it_is() -> None:
-    with connect(HostDevice(name="bob", link="slcan", estimator=ESTIMATOR)) as dut:
+    with HostDevice(name="bob", link="slcan", estimator=ESTIMATOR).connect() as dut:
         feed(dut)
         (pid,) = children(dut._talk.link.bus.child.tether_pid)  # type: ignore[attr-defined]
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(LinkClosed, match="^device bob: the device process ended with status -9"):
-            dut.identity()
+            catalogue(dut).identity()
 
 
 # ---- what a bus can carry
@@ -251,7 +253,7 @@ def test_slcan_device_that_dies_is_told_for_what_it_is() -> None:
 
 def test_real_time_that_does_not_fit_the_bus_is_refused_with_the_arithmetic() -> None:
     """At most 135 bits a frame (Davis et al. 2007): one there and eight back, 20,000 times a second, at 1 Mbit/s."""
-    with open_rig("emulator") as rig, connect(InprocDevice(name="bob", link="can", bitrate=1_000_000)) as dut:
+    with open_rig("emulator") as rig, InprocDevice(name="bob", link="can", bitrate=1_000_000).connect() as dut:
         with pytest.raises(ConfigurationError) as caught:
             Bench(rig, dut, real_time=1.0).play(THESIS, seed=1)
         assert str(caught.value) == (
@@ -264,10 +266,10 @@ def test_real_time_that_does_not_fit_the_bus_is_refused_with_the_arithmetic() ->
 
 
 def test_time_on_the_bus_is_that_of_all_frames() -> None:
-    with connect(InprocDevice(name="bob", link="can", bitrate=500_000, estimator=ESTIMATOR)) as dut:
+    with InprocDevice(name="bob", link="can", bitrate=500_000, estimator=ESTIMATOR).connect() as dut:
         dut.start()
-        dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
-        alarms = dut.status()["alarms"]
+        fed(dut, 0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+        alarms = catalogue(dut).status()["alarms"]
         frames = 9 * N + alarms + 1 + len(Counter)  # the question for the counters, and an answer for each
         assert 111 / 500_000 < dut.line_s / frames < 135 / 500_000
 
@@ -293,9 +295,9 @@ def test_traffic_of_others_is_counted_and_does_no_harm() -> None:
     thread = threading.Thread(target=babble)
     thread.start()
     try:
-        with connect(on_virtual("crowd")) as dut:
+        with on_virtual("crowd").connect() as dut:
             while not sent:
-                dut.identity()
+                catalogue(dut).identity()
             feed(dut)
             counters = dut.link_counters
     finally:
@@ -310,32 +312,32 @@ def test_device_does_not_count_what_it_said_itself_where_the_bus_shows_it() -> N
     name = f"can:udp_multicast/239.74.163.2?device=inproc&port={free_port()}"
     with open_dut(name, listener=heard.append) as dut:
         dut.start()
-        dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+        fed(dut, 0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
         assert dut.stop()["frames_foreign"] == 0
     assert sum(each.arbitration_id == 0x18 for each in heard) == N
 
 
 def test_two_devices_on_one_bus_are_found_out() -> None:
-    with connect(on_virtual("twins")), pytest.raises(LinkError):
-        connect(on_virtual("twins"))
+    with on_virtual("twins").connect(), pytest.raises(LinkError):
+        on_virtual("twins").connect()
 
 
 def test_two_harnesses_on_one_bus_are_found_out() -> None:
-    with connect(on_virtual("rivals")) as dut, can.Bus(interface="virtual", channel="rivals") as other:
+    with on_virtual("rivals").connect() as dut, can.Bus(interface="virtual", channel="rivals") as other:
         other.send(can.Message(arbitration_id=0x30, is_extended_id=False, data=bytes((99, 0, 0, 0, 0, 0, 0, 0))))
         with pytest.raises(LinkError, match="another node uses the harness's identifiers"):
-            dut.identity()
+            catalogue(dut).identity()
 
 
 def test_runs_on_virtual_buses_without_a_name_do_not_meet() -> None:
     with open_dut("can:virtual") as one, open_dut("can:virtual") as other:
         assert one.link_name != other.link_name
-        assert one.handshake().boot_nonce != other.handshake().boot_nonce
+        assert catalogue(one).recover().boot_nonce != catalogue(other).recover().boot_nonce
 
 
 def test_bus_without_a_device_is_told_with_how_it_was_opened() -> None:
     with pytest.raises(LinkError) as caught:
-        connect(on_virtual("desert", device="none"))
+        on_virtual("desert", device="none").connect()
     assert str(caught.value) == (
         "device bob: no Hello in answer to Identify within 1 s (last message: none); the bus was opened as"
         " can:virtual/desert: is the device on it, at the same bit rate?"
@@ -346,7 +348,7 @@ def test_listener_hears_the_handshake_and_the_samples() -> None:
     heard: list[can.Message] = []
     with open_dut("can:virtual", listener=heard.append) as dut:
         dut.start()
-        dut.feed(0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
+        fed(dut, 0, FORCE[:N], DISPLACEMENT[:N], np.zeros(N, bool))
     assert heard[0].arbitration_id == 0x30 and not heard[0].is_rx
     assert sum(each.arbitration_id == 0x18 and not each.is_rx for each in heard) == N
     assert sum(each.arbitration_id == 0x21 and each.is_rx for each in heard) == N

@@ -9,7 +9,7 @@ import pytest
 
 from analogrig.catalogue import Estimate, Hello, Identify, Sample, SampleBlock, Stepped, pack
 from analogrig.devices.can_nodes import MemoryBus
-from analogrig.devices.dut import Dut
+from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.links.can_link import CanLink
@@ -91,9 +91,9 @@ def test_block_is_a_frame_of_can_fd(line: CanLine | None, switches: bool) -> Non
 
 
 def test_block_on_a_classic_bus_is_refused_in_one_line() -> None:
-    dut = Dut(CanLink(MemoryBus(1)), InprocDevice(name="bob", link="can", exchange="block"))
+    dut = CatalogueDevice(CanLink(MemoryBus(1)), InprocDevice(name="bob", link="can", exchange="block"))
     with pytest.raises(ConfigurationError, match="^device bob: exchange: a block has 64 bytes, and a frame of classic"):
-        dut.handshake()
+        dut.recover()
 
 
 def test_messages_of_the_device_come_in_their_order(bus: Bus) -> None:

@@ -20,7 +20,7 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.catalogue import LAYOUTS, Command, Controlled, Hello, Key, Result, pack, unpack
 from analogrig.cli import main
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.judging.verdict import judge

@@ -22,7 +22,7 @@ from analogrig.campaigns.plays import Count
 from analogrig.campaigns.rows import Row
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError, RecordingError
 from analogrig.rigs.description import open_rig

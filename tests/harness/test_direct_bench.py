@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.bench import DIRECT_BLOCK_SAMPLES, Bench, can_be_direct, direct_bench
-from analogrig.devices.dut import open_dut
+from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.judging.verdict import judge
 from analogrig.rigs.description import open_rig
@@ -103,7 +104,7 @@ def test_plays_of_one_scenario_are_each_those_of_a_rig_of_its_own(rig_name: str)
 
 
 def test_device_whose_line_matters_is_not_played_without_it() -> None:
-    rig, device = emulator("emulator"), describe("inproc")
+    rig, device = emulator("emulator"), InprocDevice(name="bob")
     assert can_be_direct(rig, device)
     assert not can_be_direct(rig, dataclasses.replace(device, wire_faults="flip@0.001"))
     assert not can_be_direct(rig, dataclasses.replace(device, report_interval_n=10))

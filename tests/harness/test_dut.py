@@ -40,13 +40,15 @@ from analogrig.catalogue import (
     unpack_any,
 )
 from analogrig.devices.can_nodes import MemoryBus
+from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.child import ChildWire
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import Dut, connect, open_dut, reopen_dut
+from analogrig.devices.device import Device
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.host import HostDevice, host_wire
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
+from analogrig.devices.opening import open_dut, reopen_dut
 from analogrig.devices.registry import describe, from_table
 from analogrig.devices.serial import SerialDevice
 from analogrig.errors import (
@@ -63,8 +65,8 @@ from analogrig.links import frame
 from analogrig.links.can_link import CanLink
 from analogrig.links.link import CanListener, FramedLink, Link
 from analogrig.links.wire import VirtualClock
-from analogrig.protocol.exchange import Replies
 from analogrig.run import LOST
+from tests.harness.fed import Fed, fed
 from tests.harness.processes import children
 
 N = 400
@@ -86,24 +88,24 @@ def signals(n: int = N) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray
 FORCE, DISPLACEMENT, MISSING = signals()
 
 
-def feed(dut: Dut, first: int, end: int) -> Replies:
-    return dut.feed(first, FORCE[first:end], DISPLACEMENT[first:end], MISSING[first:end])
+def feed(dut: Device, first: int, end: int) -> Fed:
+    return fed(dut, first, FORCE[first:end], DISPLACEMENT[first:end], MISSING[first:end])
 
 
-def started(link: Link, **settings: Any) -> Dut:
-    dut = Dut(link, InprocDevice(name="bob", **settings))
-    dut.handshake()
+def started(link: Link, **settings: Any) -> CatalogueDevice:
+    dut = CatalogueDevice(link, InprocDevice(name="bob", **settings))
+    dut.recover()
     dut.configure()
     dut.start()
     return dut
 
 
 @pytest.fixture(scope="module")
-def reference() -> Replies:
+def reference() -> Fed:
     return feed(started(FramedLink(MemoryWire(1))), 0, N)
 
 
-def assert_same(one: Replies, other: Replies) -> None:
+def assert_same(one: Fed, other: Fed) -> None:
     for name in ("theta", "innovation", "statistic", "flags"):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
     assert (one.alarms, one.diagnoses) == (other.alarms, other.diagnoses)
@@ -112,24 +114,24 @@ def assert_same(one: Replies, other: Replies) -> None:
 # ---- replies
 
 
-def test_replies_are_one_row_a_sample(reference: Replies) -> None:
+def test_replies_are_one_row_a_sample(reference: Fed) -> None:
     shapes = {"theta": (N, 6), "innovation": (N,), "statistic": (N,), "flags": (N,)}
     assert {name: getattr(reference, name).shape for name in shapes} == shapes
     assert [getattr(reference, name).dtype.name for name in shapes] == ["float32"] * 3 + ["uint8"]
     assert np.array_equal((reference.flags & SteppedFlag.MISSING) != 0, MISSING)
 
 
-def test_theta_comes_to_the_system_that_made_the_samples(reference: Replies) -> None:
+def test_theta_comes_to_the_system_that_made_the_samples(reference: Fed) -> None:
     assert reference.theta[CHANGE_AT - 1, :4] == pytest.approx([-1.5, 0.54, 0.01, 0.02], abs=0.003)
 
 
-def test_alarm_tells_its_sample(reference: Replies) -> None:
+def test_alarm_tells_its_sample(reference: Fed) -> None:
     (alarm,) = reference.alarms
     assert CHANGE_AT <= alarm.index < CHANGE_AT + 20
     assert alarm.statistic == reference.statistic[alarm.index] > 11.5
 
 
-def test_diagnosis_tells_its_sample_and_the_onset(reference: Replies) -> None:
+def test_diagnosis_tells_its_sample_and_the_onset(reference: Fed) -> None:
     """Another gain with the same poles is a change of M, B and K alike."""
     ((alarm,), (said,)) = reference.alarms, reference.diagnoses
     assert alarm.index < said.index < N
@@ -138,14 +140,14 @@ def test_diagnosis_tells_its_sample_and_the_onset(reference: Replies) -> None:
 
 @pytest.mark.parametrize("kind", ["host", "inproc"])
 @pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
-def test_line_and_exchange_change_nothing(reference: Replies, kind: Any, exchange: Any) -> None:
-    with connect(from_table({"name": "bob", "kind": kind, "exchange": exchange}, "bob")) as dut:
+def test_line_and_exchange_change_nothing(reference: Fed, kind: Any, exchange: Any) -> None:
+    with from_table({"name": "bob", "kind": kind, "exchange": exchange}, "bob").connect() as dut:
         dut.start()
         assert_same(feed(dut, 0, N), reference)
 
 
 @pytest.mark.parametrize("exchange", ["sample", "block", "stream"])
-def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) -> None:
+def test_size_of_the_calls_changes_nothing(reference: Fed, exchange: str) -> None:
     dut = started(FramedLink(MemoryWire(1)), exchange=exchange)
     bounds = [0, 1, 1, 14, 29, 100, 257, N]
     parts = [feed(dut, first, end) for first, end in itertools.pairwise(bounds)]
@@ -153,7 +155,7 @@ def test_size_of_the_calls_changes_nothing(reference: Replies, exchange: str) ->
     assert [alarm for part in parts for alarm in part.alarms] == list(reference.alarms)
 
 
-def test_second_run_is_as_the_first(reference: Replies) -> None:
+def test_second_run_is_as_the_first(reference: Fed) -> None:
     dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, 123)
     dut.stop()
@@ -165,8 +167,8 @@ def test_alarms_beyond_sample_65535_are_counted_on() -> None:
     dut = started(FramedLink(MemoryWire(1)), exchange="block")
     rest = 65536 - 200
     still = np.zeros(rest, np.uint16)
-    dut.feed(0, still, still, np.ones(rest, bool))
-    replies = dut.feed(rest, FORCE, DISPLACEMENT, MISSING)
+    fed(dut, 0, still, still, np.ones(rest, bool))
+    replies = fed(dut, rest, FORCE, DISPLACEMENT, MISSING)
     assert [alarm.index - rest for alarm in replies.alarms if alarm.index - rest >= CHANGE_AT] != []
     assert all(rest <= alarm.index < rest + N for alarm in replies.alarms)
     assert replies.alarms[-1].index > 65536
@@ -189,10 +191,10 @@ def test_samples_that_come_again_are_the_callers_mistake() -> None:
 
 def test_arrays_of_different_lengths_are_the_callers_mistake() -> None:
     with pytest.raises(ValueError, match="shorter"):
-        started(FramedLink(MemoryWire(1))).feed(0, FORCE[:5], DISPLACEMENT[:4], MISSING[:5])
+        fed(started(FramedLink(MemoryWire(1))), 0, FORCE[:5], DISPLACEMENT[:4], MISSING[:5])
 
 
-def test_counters_tell_what_the_device_did(reference: Replies) -> None:
+def test_counters_tell_what_the_device_did(reference: Fed) -> None:
     dut = started(FramedLink(MemoryWire(1)))
     feed(dut, 0, N)
     counters = dut.stop()
@@ -206,18 +208,18 @@ def test_counters_tell_what_the_device_did(reference: Replies) -> None:
 # ---- opening
 
 
-def test_device_is_opened_by_name(reference: Replies) -> None:
+def test_device_is_opened_by_name(reference: Fed) -> None:
     for name in ("host", "inproc"):
         with open_dut(name) as dut:
             assert dut.name == name
-            assert dut.parameters == 6
+            assert dut.datasheet.theta_n == 6
             dut.start()
             assert_same(feed(dut, 0, N), reference)
 
 
 def test_recorded_device_is_the_same_again() -> None:
     description = InprocDevice(name="bob", exchange="block", estimator=EstimatorConfig(nb=2, nk=1, arl0=1e7))
-    with connect(description) as dut:
+    with description.connect() as dut:
         dut.start()
         first, record = feed(dut, 0, N), dict(dut.description())
     assert record["identity"]["firmware"] == "LIBRARY"
@@ -233,7 +235,7 @@ def test_own_file_may_say_everything(tmp_path: Path) -> None:
     )
     with open_dut(str(tmp_path / "mine.toml")) as dut:
         assert dut.name == "mine"
-        assert dut.parameters == 5
+        assert dut.datasheet.theta_n == 5
         assert dut.link_name == "memory"
 
 
@@ -258,14 +260,14 @@ def test_wrong_description_is_one_line(tmp_path: Path, text: str, complaint: str
 
 
 def test_stranger_is_refused_with_both_catalogues() -> None:
-    dut = Dut(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), InprocDevice(name="bob"))
+    dut = CatalogueDevice(FramedLink(MemoryWire(1, catalogue_hash=0xDEADBEEF)), InprocDevice(name="bob"))
     with pytest.raises(
         CatalogueMismatch, match=f"device bob: built from catalogue 0xdeadbeef, .*{CATALOGUE_HASH:#010x}"
     ):
-        dut.handshake()
+        dut.recover()
 
 
-def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> None:
+def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Fed) -> None:
     """The earlier harness was killed: answers are still under way, and the device is running."""
     link = FramedLink(MemoryWire(1))
     feed(started(link), 0, 100)
@@ -274,16 +276,16 @@ def test_handshake_finds_a_device_in_the_midst_of_a_run(reference: Replies) -> N
 
 
 def test_value_that_the_device_refuses_is_named_with_what_it_has() -> None:
-    dut = Dut(FramedLink(MemoryWire(1)), InprocDevice(name="bob"))
-    dut.handshake()
+    dut = CatalogueDevice(FramedLink(MemoryWire(1)), InprocDevice(name="bob"))
+    dut.recover()
     with pytest.raises(DeviceRefused, match=r"^device bob: nb = 7 was not applied: OUT_OF_RANGE, it has 3$"):
-        dut.configure(EstimatorConfig(nb=7))
+        dut.configure(nb=7)
 
 
 def test_running_device_cannot_be_configured_or_started() -> None:
     dut = started(FramedLink(MemoryWire(1)))
     with pytest.raises(DeviceRefused, match=r"^device bob: na = 2 was not applied: RUNNING, it has 2$"):
-        dut.configure(EstimatorConfig())
+        dut.configure()
     with pytest.raises(DeviceRefused, match="^device bob: START was refused: RUNNING$"):
         dut.start()
 
@@ -361,14 +363,14 @@ def repeat(message: Message) -> list[Message]:
     return [message, message]
 
 
-def with_missing(lost: Iterable[int]) -> Replies:
-    """Replies over a good line with these samples declared missing."""
+def with_missing(lost: Iterable[int]) -> Fed:
+    """Fed over a good line with these samples declared missing."""
     missing = MISSING.copy()
     missing[list(lost)] = True
-    return started(FramedLink(MemoryWire(1))).feed(0, FORCE, DISPLACEMENT, missing)
+    return fed(started(FramedLink(MemoryWire(1))), 0, FORCE, DISPLACEMENT, missing)
 
 
-def assert_same_but_for_the_loss(replies: Replies, lost: Sequence[int]) -> None:
+def assert_same_but_for_the_loss(replies: Fed, lost: Sequence[int]) -> None:
     assert np.flatnonzero(replies.flags & LOST).tolist() == list(lost)
     assert_same(dataclasses.replace(replies, flags=replies.flags & ~np.uint8(LOST)), with_missing(lost))
 
@@ -420,7 +422,7 @@ def test_number_that_is_none_is_said_to_be_the_devices(kind: type[Message], what
     for _ in range(2):
         with pytest.raises(DeviceError, match=said):
             feed(dut, 0, N)
-        dut.handshake()
+        dut.recover()
         dut.start()
 
 
@@ -497,7 +499,7 @@ def test_sample_that_comes_after_it_was_given_up_stays_lost(line: FaultyLink) ->
     assert counters["messages_repeated"] == counters["samples_lost"] == 1
 
 
-def test_command_that_comes_again_late_is_not_obeyed(line: FaultyLink, reference: Replies) -> None:
+def test_command_that_comes_again_late_is_not_obeyed(line: FaultyLink, reference: Fed) -> None:
     """A RESET after half of the configuration would leave the other half at its defaults."""
     kept: list[Message] = []
 
@@ -525,7 +527,7 @@ def test_command_that_the_device_obeys_again_is_told(line: FaultyLink) -> None:
         started(line)
 
 
-def test_sample_that_the_line_has_kept_since_the_run_before_is_not_taken(line: FaultyLink, reference: Replies) -> None:
+def test_sample_that_the_line_has_kept_since_the_run_before_is_not_taken(line: FaultyLink, reference: Fed) -> None:
     """It comes at the very moment when it would fit."""
     kept: list[Message] = []
 
@@ -545,7 +547,7 @@ def test_sample_that_the_line_has_kept_since_the_run_before_is_not_taken(line: F
 
 @pytest.mark.parametrize(("window", "room", "most"), [(4, 2, 2), (3, 200, 3), (4, 0, 1)])
 def test_no_more_blocks_are_on_their_way_than_the_device_can_hold(
-    line: FaultyLink, reference: Replies, window: int, room: int, most: int
+    line: FaultyLink, reference: Fed, window: int, room: int, most: int
 ) -> None:
     unanswered: list[int] = []
     most_unanswered = 0
@@ -601,20 +603,20 @@ def test_answer_that_is_lost_or_wrong_is_told(
 
 
 @pytest.mark.parametrize("kind", [Estimate, Stepped, Alarm])
-def test_repeated_answer_changes_nothing(line: FaultyLink, reference: Replies, kind: type) -> None:
+def test_repeated_answer_changes_nothing(line: FaultyLink, reference: Fed, kind: type) -> None:
     dut = started(line)
     line.from_device = lambda message: repeat(message) if isinstance(message, kind) else [message]
     assert_same(feed(dut, 0, N), reference)
 
 
-def test_repeated_sample_changes_nothing(line: FaultyLink, reference: Replies) -> None:
+def test_repeated_sample_changes_nothing(line: FaultyLink, reference: Fed) -> None:
     dut = started(line)
     line.to_device = lambda message: repeat(message) if isinstance(message, Sample) else [message]
     assert_same(feed(dut, 0, N), reference)
     assert dut.stop()["messages_repeated"] == N
 
 
-def test_repeated_everything_changes_nothing(line: FaultyLink, reference: Replies) -> None:
+def test_repeated_everything_changes_nothing(line: FaultyLink, reference: Fed) -> None:
     line.to_device = line.from_device = repeat
     dut = started(line)
     assert_same(feed(dut, 0, N), reference)
@@ -631,11 +633,11 @@ def test_dead_line_is_told_from_a_lost_sample(line: FaultyLink) -> None:
 
 def test_nobody_at_the_line_is_told(line: FaultyLink) -> None:
     line.to_device = lose
-    dut = Dut(line, InprocDevice(name="bob"))
+    dut = CatalogueDevice(line, InprocDevice(name="bob"))
     with pytest.raises(
         LinkTimeout, match=r"^device bob: no Hello in answer to Identify within 2 s \(last message: none\)$"
     ):
-        dut.handshake()
+        dut.recover()
 
 
 def test_device_that_misses_the_first_call_is_called_again(line: FaultyLink) -> None:
@@ -656,12 +658,12 @@ def test_babbling_device_ends_at_the_deadline(line: FaultyLink, message: Message
     """Good messages without end, numbered as they should be or repeated, but never an answer."""
     ticks = iter(range(10_000))
     line.clock = lambda: next(ticks) / 100  # type: ignore[assignment]
-    dut = Dut(line, InprocDevice(name="bob"))
+    dut = CatalogueDevice(line, InprocDevice(name="bob"))
     for numbered in (True, False):
         seq = iter(i % 256 if numbered else 7 for i in range(10_000))
         line.receive = lambda _timeout_s, seq=seq: message._replace(seq=next(seq))  # type: ignore[misc, method-assign]
         with pytest.raises(LinkTimeout, match="no Hello"):
-            dut.handshake()
+            dut.recover()
 
 
 # ---- faults of the device
@@ -696,8 +698,8 @@ def test_reset_after_the_last_sample_is_told_at_stop(line: FaultyLink) -> None:
 
 
 def test_value_that_is_applied_otherwise_is_refused(line: FaultyLink) -> None:
-    dut = Dut(line, InprocDevice(name="bob"))
-    dut.handshake()
+    dut = CatalogueDevice(line, InprocDevice(name="bob"))
+    dut.recover()
     line.from_device = lambda message: [message._replace(value=9.5) if isinstance(message, Configured) else message]
     with pytest.raises(DeviceRefused, match="na = 2 was not applied: APPLIED, it has 9.5"):
         dut.configure()
@@ -711,18 +713,18 @@ def test_result_without_a_name_is_told_by_its_number(line: FaultyLink) -> None:
 
 
 @pytest.fixture
-def host() -> Iterator[tuple[Dut, int]]:
+def host() -> Iterator[tuple[CatalogueDevice, int]]:
     """A device that is a process, and its number."""
     wire = host_wire()
-    dut = Dut(FramedLink(wire), HostDevice(name="host", timeout_s=2.0))
-    dut.handshake()
+    dut = CatalogueDevice(FramedLink(wire), HostDevice(name="host", timeout_s=2.0))
+    dut.recover()
     dut.configure()
     dut.start()
     yield dut, children(wire.child.tether_pid)[0]
     dut.close()
 
 
-def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[Dut, int]) -> None:
+def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[CatalogueDevice, int]) -> None:
     dut, pid = host
     feed(dut, 0, 82)
     os.kill(pid, signal.SIGKILL)
@@ -730,7 +732,7 @@ def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[D
         feed(dut, 82, N)
 
 
-def test_process_that_hangs_in_the_run_is_told(host: tuple[Dut, int]) -> None:
+def test_process_that_hangs_in_the_run_is_told(host: tuple[CatalogueDevice, int]) -> None:
     dut, pid = host
     feed(dut, 0, 82)
     os.kill(pid, signal.SIGSTOP)
@@ -755,7 +757,7 @@ def test_silent_serial_line_is_told_with_its_baud_rate() -> None:
     """Loop back: what is heard is the call itself."""
     description = SerialDevice(name="bob", url="loop://", baud=9600, timeout_s=0.05)
     with pytest.raises(LinkTimeout, match="no Hello .*; the line was opened at 9600 baud$"):
-        connect(description)
+        description.connect()
 
 
 def test_description_is_plain_and_frozen() -> None:

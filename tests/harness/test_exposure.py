@@ -9,7 +9,7 @@ import pytest
 
 from analogrig.bench import Bench, direct_bench
 from analogrig.catalogue import SteppedFlag
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.devices.registry import describe
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import judge

@@ -13,7 +13,7 @@ import pytest
 import analogrig
 
 PUBLIC = """
-    AnalogrigError Bench ChangeVerdict Conditions ConfigurationError DeviceError Dut EmulatorError EstimatorConfig
+    AnalogrigError Bench ChangeVerdict Conditions ConfigurationError Device DeviceError EmulatorError EstimatorConfig
     Excitation Expectations Finding LinkError LinkTimeout Plant PlantChoice Play Played PotChange RecordingError Rig
     RigError Run Scenario Verdict __version__ detectable judge open_dut open_rig rate_below strategies with_some_seed
     write_report

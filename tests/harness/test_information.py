@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 from scipy.signal import cont2discrete
 
+from analogrig.datasheet import ModelOrders
 from analogrig.judging import information
 from analogrig.plant import AT_REST, Plant, SampledPlant, physical_parameters
 from tests.harness.runs import made_run
@@ -37,7 +38,7 @@ def test_theta_of_the_exact_discretisation_gives_the_plant(plant: Plant) -> None
     n_per_code, m_per_code = 0.7, 5e-5
     gains = numerator * n_per_code / m_per_code
     theta = np.array([[*denominator[1:], *gains, 3.0]], dtype=np.float64)
-    read = physical_parameters(theta, {"na": 2, "nb": 3}, n_per_code, m_per_code, 0.01)
+    read = physical_parameters(theta, ModelOrders(2, 3), n_per_code, m_per_code, 0.01)
     assert read[0] == pytest.approx([m, b, k], rel=1e-6)
 
 
@@ -47,7 +48,7 @@ def test_theta_of_the_exact_discretisation_gives_the_plant(plant: Plant) -> None
     ids=["zero", "unstable", "negative gain", "nan"],
 )
 def test_implausible_theta_gives_nan(theta: list[float]) -> None:
-    assert np.isnan(physical_parameters(np.array([theta], np.float32), {"na": 2, "nb": 3}, 1.0, 1e-4, 0.01)).all()
+    assert np.isnan(physical_parameters(np.array([theta], np.float32), ModelOrders(2, 3), 1.0, 1e-4, 0.01)).all()
 
 
 def test_information_of_a_stiffness_change_under_a_settled_load() -> None:

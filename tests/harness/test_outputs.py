@@ -132,7 +132,7 @@ def test_run_that_fails_later_keeps_what_it_has(out: Path, fault: Exception, mon
     def play(*_: object) -> Iterator[object]:
         raise fault
 
-    monkeypatch.setattr("analogrig.devices.dut.Dut.play", play)
+    monkeypatch.setattr("analogrig.devices.catalogue_device.CatalogueDevice.play", play)
     assert main(["run", "--dut", "inproc", "--out", str(out)]) == 3
     assert verdict(out)["outcome"] == page_outcome(out) == "inconclusive"
     assert Run.load(out / "run.npz").conditions.faults == (str(fault),)

@@ -14,7 +14,7 @@ import pytest
 
 from analogrig import config
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.hardware.instrument import InputRecord, Instrument
 from analogrig.hardware.ni_daqmx import NiDaqmx
 from analogrig.hardware.real import RealRig

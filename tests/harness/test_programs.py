@@ -13,7 +13,7 @@ import pytest
 from analogrig import cli
 from analogrig.bench import Bench
 from analogrig.cli import options
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.judging import information
 from analogrig.judging.verdict import as_json, judge

@@ -17,8 +17,8 @@ import analogrig.reporting  # these two for the runs in this process, which forg
 import analogrig.testing.properties.experiments  # noqa: F401
 from analogrig import cli, config
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
 from analogrig.devices.host import host_child
+from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario, Statement
@@ -389,7 +389,7 @@ import os, pytest
 
 @pytest.mark.parametrize("n", range(4))
 def test_on_the_device(n, hil_dut):
-    assert hil_dut.handshake()
+    assert hil_dut.recover()
     print(f"<{os.environ['PYTEST_XDIST_WORKER']}>")
 
 @pytest.mark.parametrize("n", range(4))

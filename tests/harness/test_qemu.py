@@ -17,9 +17,10 @@ import pytest
 from analogrig.bench import Bench
 from analogrig.config import names
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import Dut, connect, reopen_dut
+from analogrig.devices.device import Device
 from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import reopen_dut
 from analogrig.devices.qemu import QemuDevice, QemuM4
 from analogrig.devices.registry import KINDS, describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
@@ -40,7 +41,7 @@ LONGEST = 450
 
 
 def play(description: DeviceDescription, scenario: Scenario) -> Run:
-    with open_rig("emulator") as rig, connect(description) as dut:
+    with open_rig("emulator") as rig, description.connect() as dut:
         return Bench(rig, dut).play(scenario, seed=11)
 
 
@@ -92,7 +93,7 @@ def test_shortened_scenarios_still_have_alarms() -> None:
 def test_firmware_says_which_it_is_and_every_boot_has_its_number(core: str) -> None:
     nonces = set()
     for _ in range(2):
-        with connect(describe(f"qemu-{core}")) as dut:
+        with describe(f"qemu-{core}").connect() as dut:
             identity = dut.description()["identity"]
             assert identity["firmware"] == f"QEMU_{core.upper()}"
             nonces.add(identity["boot_nonce"])
@@ -113,10 +114,10 @@ def new_qemu(before: set[int]) -> int:
 
 
 @pytest.fixture
-def started() -> Iterator[tuple[Dut, int]]:
+def started() -> Iterator[tuple[Device, int]]:
     """A device that is about to run, and the number of the QEMU that it runs in."""
     before = set(descendants(os.getpid()))
-    with connect(QemuM4(name="bob", timeout_s=TIMEOUT_S)) as dut:
+    with QemuM4(name="bob", timeout_s=TIMEOUT_S).connect() as dut:
         pid = new_qemu(before)
         dut.start()
         yield dut, pid
@@ -124,12 +125,12 @@ def started() -> Iterator[tuple[Dut, int]]:
         assert not Path(f"/proc/{pid}").exists()
 
 
-def run(dut: Dut) -> Run:
+def run(dut: Device) -> Run:
     with open_rig("emulator") as rig:
         return Bench(rig, dut).play(shortened("healthy"), seed=1)
 
 
-def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Dut, int]) -> None:
+def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Device, int]) -> None:
     dut, pid = started
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(LinkClosed, match=r"^device bob: QEMU \(mps2-an386\) ended with status -9"):
@@ -145,12 +146,12 @@ def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
     os.kill(pid, signal.SIGSTOP)
     timer = threading.Timer(2.0 * TIMEOUT_S, os.kill, (pid, signal.SIGCONT))
     timer.start()
-    with Dut(link, description) as dut:
-        assert dut.handshake().firmware == "QEMU_M4"
+    with catalogue(device) as dut:
+        assert dut.recover().firmware == "QEMU_M4"
     timer.join()
 
 
-def test_qemu_that_hangs_is_told_and_ended(started: tuple[Dut, int]) -> None:
+def test_qemu_that_hangs_is_told_and_ended(started: tuple[Device, int]) -> None:
     dut, pid = started
     os.kill(pid, signal.SIGSTOP)
     with pytest.raises(LinkTimeout, match="^device bob: no .* within 2 s"):
@@ -161,7 +162,7 @@ def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> Non
     """Without a vector table the processor locks up."""
     (tmp_path / "nothing.elf").write_bytes(b"")
     with pytest.raises(LinkError, match=r"QEMU \(mps2-an386\) ended with status -6: qemu: fatal: Lockup"):
-        connect(describe(f"qemu-m4:{tmp_path}/nothing.elf"))
+        describe(f"qemu-m4:{tmp_path}/nothing.elf").connect()
 
 
 @pytest.mark.tools(GCC)
@@ -177,28 +178,28 @@ def test_hard_fault_is_told_in_the_words_of_the_firmware(tmp_path: Path) -> None
     paths = [f"-I{port}", f"-I{port / 'include'}", "-T", str(port / "mps2.ld"), str(tmp_path / "vectors.c")]
     subprocess.run([GCC, *options, *paths, *sources, "-lgcc", "-o", image], check=True)
     with pytest.raises(LinkClosed, match=r"QEMU \(mps2-an386\) ended with status \d+: analogrig: hard fault"):
-        connect(describe(f"qemu-m4:{image}"))
+        describe(f"qemu-m4:{image}").connect()
 
 
 def test_absent_firmware_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ANALOGRIG_FIRMWARE", str(tmp_path))
     with pytest.raises(LinkError, match=f"there is no firmware {tmp_path}/analogrig-m4.elf: run `make firmware`"):
-        connect(describe("qemu-m4"))
+        describe("qemu-m4").connect()
     with pytest.raises(LinkError, match=f"^there is no firmware {Path('my.elf').absolute()}$"):
-        connect(describe("qemu-m4:my.elf"))
+        describe("qemu-m4:my.elf").connect()
 
 
 def test_absent_qemu_is_named_with_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(LinkError, match="qemu-system-arm is not installed: apt-get install qemu-system-arm"):
-        connect(describe("qemu-m4"))
+        describe("qemu-m4").connect()
 
 
 def test_own_firmware_is_named_by_its_path_and_not_run_on_the_word_of_a_recording(tmp_path: Path) -> None:
     """It may ask QEMU for any file of this computer."""
     image = tmp_path / "my.elf"
     shutil.copyfile(FOLDER / "analogrig-m4.elf", image)
-    with connect(describe(f"qemu-m4:{image}")) as dut:
+    with describe(f"qemu-m4:{image}").connect() as dut:
         record = dict(dut.description())
     with pytest.raises(ConfigurationError, match=f"run.npz: the device boots the firmware {image}, which no file may "):
         reopen_dut(record, "run.npz")

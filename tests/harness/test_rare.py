@@ -19,7 +19,7 @@ from analogrig.campaigns.plan import rig_table
 from analogrig.campaigns.rare import PLAY_N, false_alarm_rate
 from analogrig.campaigns.workers import Processes, ThisProcess
 from analogrig.cli import main
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.catalogue_description import CatalogueDescription, has_snapshots
 from analogrig.devices.estimator import Estimator
 from analogrig.devices.registry import describe
 from analogrig.errors import ConfigurationError
@@ -40,8 +40,9 @@ def emulator() -> EmulatorRig:
     return rig
 
 
-def device(arl0: float) -> DeviceDescription:
+def device(arl0: float) -> CatalogueDescription:
     described = describe("inproc")
+    assert has_snapshots(described)
     return dataclasses.replace(described, estimator=dataclasses.replace(described.estimator, arl0=arl0))
 
 

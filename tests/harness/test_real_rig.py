@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigClosed, RigError, RigTimeout
 from analogrig.hardware.instrument import DialChange, PotBox
 from analogrig.hardware.real import LEAD_N, RealRig, split_records

@@ -9,8 +9,8 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import BLOCK_SAMPLES, Sample
+from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import Dut, connect
 from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
@@ -22,6 +22,7 @@ from analogrig.links.wire import VirtualClock
 from analogrig.rigs.description import open_rig
 from analogrig.run import UNREPORTED, Run
 from analogrig.scenario import Scenario
+from tests.harness.fed import fed
 
 PERIOD_S = 5e-5
 THESIS = Scenario.load("thesis")
@@ -29,7 +30,7 @@ SHORT = dataclasses.replace(THESIS, samples=600, tweaks=())
 
 
 def play(description: DeviceDescription, real_time: float | None = None, scenario: Scenario = SHORT) -> Run:
-    with open_rig("emulator") as rig, connect(description) as dut:
+    with open_rig("emulator") as rig, description.connect() as dut:
         return Bench(rig, dut, real_time=real_time).play(scenario, seed=5)
 
 
@@ -51,15 +52,15 @@ def test_no_sample_goes_out_before_the_machine_has_taken_it() -> None:
             sent_at.append(clock())
             super().write(sent)
 
-    dut = Dut(FramedLink(Watched(1, clock=clock)), InprocDevice(name="bob", exchange="stream"))
-    dut.handshake()
+    dut = CatalogueDevice(FramedLink(Watched(1, clock=clock)), InprocDevice(name="bob", exchange="stream"))
+    dut.recover()
     dut.configure()
     pace = dut.pace(PERIOD_S)
     dut.start(pace)
     sent_at.clear()
     codes = np.zeros(10 * BLOCK_SAMPLES, np.uint16)
     start_s = clock()
-    dut.feed(0, codes, codes, np.zeros(len(codes), bool))
+    fed(dut, 0, codes, codes, np.zeros(len(codes), bool))
     due_s = start_s + PERIOD_S * BLOCK_SAMPLES * np.arange(1, 11)
     assert sent_at == pytest.approx(due_s.tolist())
     assert (pace.messages, pace.overruns) == (10, 0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.judging.verdict import judge
 from analogrig.plant import Segment
 from analogrig.rigs.description import open_rig

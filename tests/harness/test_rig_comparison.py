@@ -12,7 +12,7 @@ from scipy import stats
 
 from analogrig.bench import Bench
 from analogrig.cli import main
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.hardware.rig_comparison import RigComparison, compare_rigs, signal_difference
 from analogrig.judging.statistics import mean_interval
 from analogrig.plant import Plant

@@ -17,10 +17,9 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import Sample, SampleBlock, unpack_any
-from analogrig.devices.dut import Dut
+from analogrig.devices.catalogue_device import CatalogueDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.library import MemoryWire
-from analogrig.devices.registry import describe
 from analogrig.errors import TimeLimitReached
 from analogrig.judging.verdict import judge
 from analogrig.links import frame
@@ -63,17 +62,17 @@ def has_samples(sent: bytes) -> bool:
     return any(isinstance(message, Sample | SampleBlock) for message in messages)
 
 
-def slow_dut(latency_s: float, exchange: ExchangeMode = "sample", window: int = 1) -> tuple[Dut, SlowWire]:
+def slow_dut(latency_s: float, exchange: ExchangeMode = "sample", window: int = 1) -> tuple[CatalogueDevice, SlowWire]:
     wire = SlowWire()
     wire.latency_s = latency_s
     description = InprocDevice(name="slow", timeout_s=2.0, exchange=exchange, window=window)
-    dut = Dut(FramedLink(wire), description)
-    dut.handshake()
+    dut = CatalogueDevice(FramedLink(wire), description)
+    dut.recover()
     dut.configure()
     return dut, wire
 
 
-def played(dut: Dut, wire: SlowWire, limit_s: float | None) -> Run:
+def played(dut: CatalogueDevice, wire: SlowWire, limit_s: float | None) -> Run:
     with open_rig("emulator") as rig:
         return Bench(rig, dut, time_limit_s=limit_s, clock=wire.clock).play(SCENARIO, 1)
 
@@ -131,10 +130,10 @@ def test_limit_ends_a_run_on_a_slow_rig() -> None:
 def test_limit_is_that_of_one_play() -> None:
     dut, wire = slow_dut(1.0)
     assert played(dut, wire, limit_s=5.5).samples == 5
-    dut.handshake()
+    dut.recover()
     assert played(dut, wire, limit_s=7.5).samples == 7
     wire.latency_s = 0.0
-    dut.handshake()
+    dut.recover()
     assert played(dut, wire, limit_s=None).conditions.faults == ()
 
 
@@ -204,8 +203,11 @@ def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def test_command_ends_at_its_limit_and_keeps_what_was_recorded(tmp_path: Path, slow: SlowServer, verb: str) -> None:
     what: tuple[str, ...] = ("--scenario", "thesis")
     if verb == "replay":
-        with open_rig("emulator") as rig, Dut(FramedLink(MemoryWire(1)), describe("inproc")) as dut:
-            dut.handshake()
+        with (
+            open_rig("emulator") as rig,
+            CatalogueDevice(FramedLink(MemoryWire(1)), InprocDevice(name="inproc")) as dut,
+        ):
+            dut.recover()
             dut.configure()
             Bench(rig, dut).play(SCENARIO, 1).save(tmp_path / "before.npz")
         what = (str(tmp_path / "before.npz"),)

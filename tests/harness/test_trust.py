@@ -34,7 +34,7 @@ from analogrig.campaigns.journal import Journal
 from analogrig.campaigns.plan import Plan
 from analogrig.campaigns.spec import CampaignSpec
 from analogrig.cli import main
-from analogrig.devices.dut import open_dut, reopen_dut
+from analogrig.devices.opening import open_dut, reopen_dut
 from analogrig.devices.registry import KINDS, describe, from_table, named_things
 from analogrig.errors import ConfigurationError
 from analogrig.hardware.instrument import DRIVERS

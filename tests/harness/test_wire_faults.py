@@ -175,7 +175,7 @@ def test_fault_that_would_hide_another_is_refused(text: str) -> None:
 
 def test_device_file_may_ask_for_faults(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text('kind = "inproc"\nwire_faults = "flip@to:81"\n')
-    assert describe(str(tmp_path / "bad.toml")).wire_faults == "flip@to:81"
+    assert describe(str(tmp_path / "bad.toml")).as_table()["wire_faults"] == "flip@to:81"
     (tmp_path / "bad.toml").write_text('kind = "inproc"\nwire_faults = "flop"\n')
     with pytest.raises(ConfigurationError, match=r"bad\.toml: .*'flop' is not KIND@to:FRAME"):
         describe(str(tmp_path / "bad.toml"))

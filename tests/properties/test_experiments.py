@@ -10,7 +10,6 @@ from typing import Any, cast
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.dut import connect
 from analogrig.devices.inproc import InprocDevice
 from analogrig.estimator_config import EstimatorConfig
 from analogrig.rigs.description import open_rig
@@ -52,7 +51,7 @@ def test_silence_of_a_device_that_could_raise_no_alarm_is_no_evidence(
     judge: Callable[[Play], Finding], settings: dict[str, Any], why: str
 ) -> None:
     device = InprocDevice(name="inproc", estimator=EstimatorConfig(**settings))
-    with open_rig("emulator") as rig, connect(device) as dut:
+    with open_rig("emulator") as rig, device.connect() as dut:
         finding = judge(cast(Play, Alone(Bench(rig, dut))))
     assert bool(finding) is not bool(settings)
     assert re.match(why, finding.why), finding.why

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from analogrig.bench import Bench
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.judging.statistics import Decision, SequentialTest
 from analogrig.rigs.description import open_rig
 from analogrig.scenario import Scenario

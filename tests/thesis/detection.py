@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.dut import connect, open_dut
 from analogrig.devices.inproc import InprocDevice
+from analogrig.devices.opening import open_dut
 from analogrig.judging.verdict import SegmentEstimate, Verdict, judge
 from analogrig.plant import PARAMETERS
 from analogrig.rigs.description import open_rig
@@ -58,7 +58,7 @@ def shipped_device_in_process() -> DeviceDescription:
 def detect(scenario_name: str, rig_name: str, seeds: Iterable[int]) -> Detection:
     """Play a shipped scenario on a shipped rig once for each seed."""
     scenario = Scenario.load(scenario_name)
-    with open_rig(rig_name) as rig, connect(shipped_device_in_process()) as dut:
+    with open_rig(rig_name) as rig, shipped_device_in_process().connect() as dut:
         bench = Bench(rig, dut)
         verdicts = [judge(bench.play(scenario, seed)) for seed in seeds]
     return Detection(

@@ -21,6 +21,8 @@ from analogrig.campaigns.plan import Case, device_of, open_table
 from analogrig.campaigns.plays import Count, close_devices, count_alarms
 from analogrig.campaigns.rare import LEAD_IN_N, Estimate, false_alarm_rate
 from analogrig.campaigns.workers import Workers
+from analogrig.datasheet import Datasheet
+from analogrig.devices.catalogue_description import has_snapshots
 from analogrig.errors import ConfigurationError
 from analogrig.judging.statistics import (
     ConfidenceSequence,
@@ -96,7 +98,7 @@ class Question:
             return f"confidence must be more than 0.5 and less than 1, not {self.confidence:g}"
         if not 0 <= self.allowed <= 1000:
             return f"allowed must be 0 to 1000, not {self.allowed}"
-        if self.device["estimator"]["trigger"] == "none":
+        if not self.datasheet.alarms:
             return "the device has no trigger: it raises no alarm, whatever comes"
         if self.scenario.tweaks:
             return "the scenario changes the plant, and this is about alarms while nothing changes"
@@ -119,7 +121,8 @@ class Question:
             return f"rare must be {LEAST_ESTIMATES} to {MOST_ESTIMATES} estimates, not {estimates}"
         if self.sequential:
             return "a rare rate is estimated, or alarms are waited for by a sequential test"
-        if self.scenario.excitation.clock == "free" and self.device["estimator"]["edge_instants"] != "anywhere":
+        edges = self.device.get("estimator", {}).get("edge_instants")
+        if self.scenario.excitation.clock == "free" and edges != "anywhere":
             return (
                 "of a generator on a clock of its own some instants of its edges are rare, and they are not drawn: wait"
                 ' for alarms, or set the device to edge_instants = "anywhere"'
@@ -132,6 +135,11 @@ class Question:
         if self.rare is not None:
             return max(1, self.rare // WORTH_A_WORKER_ESTIMATES)
         return max(1, self.design_n // WORTH_A_WORKER_N) if self.is_in_process else self.design_n
+
+    @functools.cached_property
+    def datasheet(self) -> Datasheet:
+        """Data sheet of the device."""
+        return device_of(self.device).known_datasheet()
 
     @functools.cached_property
     def is_in_process(self) -> bool:
@@ -222,7 +230,7 @@ def estimate_once(question: Question, seed: int) -> Estimate:
     """
     device = device_of(question.device)
     with open_table(question.rig) as rig:
-        if not can_be_direct(rig, device):
+        if not (can_be_direct(rig, device) and has_snapshots(device)):
             raise ConfigurationError(
                 f"certify: a rare rate is estimated within this process (inproc), not in {device.name}"
             )
@@ -248,7 +256,7 @@ def _run_n(question: Question, most: int) -> int:
     """Run length of which a whole number makes up a test of fixed length."""
     about = IN_PROCESS_RUN_N if question.is_in_process else BENCH_RUN_N
     runs = math.ceil(most / about)
-    return math.ceil(most / runs) + device_of(question.device).estimator.warm_up_n + LEAD_IN_N
+    return math.ceil(most / runs) + question.datasheet.warm_up_n + LEAD_IN_N
 
 
 def _at_the_end(question: Question, alarms: int, samples: int) -> Certificate:

@@ -17,7 +17,6 @@ from analogrig.campaigns.plays import close_devices, play_chunk
 from analogrig.campaigns.results import Results
 from analogrig.campaigns.rows import RATES, Row, counts
 from analogrig.campaigns.workers import Workers
-from analogrig.devices.dut import connect
 from analogrig.errors import DeviceError, LinkError
 from analogrig.judging.statistics import Decision
 
@@ -103,8 +102,8 @@ def unreachable(plan: Plan) -> dict[str, str]:
     found = {}
     for device in map(device_of, plan.devices):
         try:
-            if not device.is_in_process:
-                connect(device).close()
+            if "in-process" not in device.capabilities:
+                device.connect().close()
         except (LinkError, DeviceError) as error:
             found[device.name] = str(error)
     return found

@@ -252,7 +252,7 @@ def one_worker_only(*tables: Mapping[str, Any]) -> str:
 
 
 def _only_one(table: Mapping[str, Any]) -> str:
-    if "estimator" in table:
+    if "build" in table:
         return device_of(table).only_one
     return "" if "card" in table else str(table["name"])
 

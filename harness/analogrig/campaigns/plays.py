@@ -16,7 +16,6 @@ from analogrig.campaigns import builds
 from analogrig.campaigns.plan import Case, Cell, Chunk, Plan, device_of, open_table
 from analogrig.campaigns.rows import Row, row, row_of_none
 from analogrig.devices.device import Device
-from analogrig.devices.dut import connect
 from analogrig.errors import AnalogrigError, ConfigurationError, DeviceError, LinkError, RigError
 from analogrig.judging.exposure import exposure
 from analogrig.judging.verdict import invalid_reasons, judge
@@ -65,7 +64,7 @@ class _Benches(threading.local):
 
     def __init__(self) -> None:
         self._rigs: _Cache[Rig] = _Cache(open_table)
-        self._devices: _Cache[Device] = _Cache(lambda table: connect(device_of(table)))
+        self._devices: _Cache[Device] = _Cache(lambda table: device_of(table).connect())
         self._direct: _Cache[Bench | None] = _Cache(self._direct_bench)
 
     def _direct_bench(

@@ -20,7 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analogrig.devices.description import DeviceDescription
+from analogrig.answers import Samples
+from analogrig.datasheet import Datasheet
+from analogrig.devices.catalogue_description import CatalogueDescription
 from analogrig.devices.estimator import Estimator
 from analogrig.errors import ConfigurationError, DeviceError
 from analogrig.estimator_config import EstimatorConfig
@@ -85,7 +87,7 @@ class _Branches(NamedTuple):
 
 
 def false_alarm_rate(
-    rig: EmulatorRig, device: DeviceDescription, scenario: Scenario, seed: int, branches: int = BRANCHES_N
+    rig: EmulatorRig, device: CatalogueDescription, scenario: Scenario, seed: int, branches: int = BRANCHES_N
 ) -> Estimate:
     """Unbiased estimate of first alarms per sample of a warm estimator, from one play.
 
@@ -123,7 +125,7 @@ class _Climbs:
         self._settings = settings
         self._estimator = estimator
         (self._play,) = performance.blocks
-        self._signals = _estimator_inputs(self._play)
+        self._signals = _estimator_inputs(self._play.samples())
         self._noise_lsb = performance.channels["force"].noise_lsb
         self._rng = rng
         self._samples = 0
@@ -151,7 +153,8 @@ class _Climbs:
         self._samples += end
         numbers = np.isfinite(steps.innovation) & np.isfinite(steps.statistic)
         heard = ObservedRecord(self._signals[0][:end], steps.flags, numbers, steps.alarms)
-        if fault := record_exposure(heard, self._settings.as_table(), self._noise_lsb).lack_of_evidence:
+        sheet = Datasheet.of_estimator(self._settings.as_table())
+        if fault := record_exposure(heard, sheet, self._noise_lsb).lack_of_evidence:
             raise DeviceError(fault)
         alarms = steps.alarms[steps.alarms >= first]
         end = int(alarms[0]) + 1 if len(alarms) else end
@@ -198,14 +201,13 @@ class _Climbs:
         normals = self._rng.standard_normal((*index.shape, len(CHANNELS)))
         normals[:, :, _DISPLACEMENT] *= going.louder[:, None]
         codes, clipped = self._rig.sampler(self._rng).sample(volts, normals.reshape(volts.shape))
-        signals = _estimator_inputs(Block(0, volts, codes, clipped))
+        signals = _estimator_inputs(Block(0, volts, codes, clipped).samples())
         return [signal.reshape(index.shape)[:, 1:] for signal in signals], normals[:, 1:, _DISPLACEMENT]
 
 
-def _estimator_inputs(block: Block) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
-    """Estimator inputs of one block: force, displacement, and True for each sample that is not missing; (n,) each."""
-    force, displacement, missing = block.signals()
-    return force, displacement, ~missing
+def _estimator_inputs(samples: Samples) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
+    """Estimator inputs of a block: u, y and valid; (n,) each."""
+    return samples.u, samples.y, samples.valid
 
 
 def _first_true(found: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -57,7 +57,7 @@ def row(run: Run, verdict: Verdict, drawn: Mapping[str, float] | None = None) ->
         false_alarms=len(verdict.false_alarms),
         changes=[list(Change.of(tweak)) for tweak in verdict.tweaks],
         errors=_errors(verdict),
-        theta=verdict.theta_hash[:16],
+        theta=(verdict.theta_hash or verdict.alarm_hash)[:16],
     )
 
 

@@ -58,7 +58,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from analogrig.bench import Bench
-    from analogrig.devices.dut import open_dut
+    from analogrig.devices.opening import open_dut
     from analogrig.errors import ConfigurationError
     from analogrig.hardware.rig_comparison import RigComparison, compare_rigs
     from analogrig.rigs.description import open_rig

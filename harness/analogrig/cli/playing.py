@@ -36,7 +36,7 @@ from analogrig.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from analogrig.devices.dut import Dut
+    from analogrig.devices.device import Device
     from analogrig.identity import Identity
     from analogrig.judging.verdict import Verdict
     from analogrig.output import OutputFolder
@@ -119,7 +119,7 @@ def _add_play(command: argparse.ArgumentParser) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     with _output_folder(arguments) as output, open_what_to_play(arguments) as (rig, scenario, seed):
-        from analogrig.devices.dut import open_dut
+        from analogrig.devices.opening import open_dut
 
         device = functools.partial(open_dut, arguments.dut or scenario.dut or "host")
         return _play(rig, scenario, seed, device, output, arguments)
@@ -127,7 +127,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _replay(arguments: argparse.Namespace) -> int:
     with _output_folder(arguments) as output:
-        from analogrig.devices.dut import open_dut, reopen_dut
+        from analogrig.devices.opening import open_dut, reopen_dut
         from analogrig.errors import ConfigurationError
         from analogrig.rigs.recording import RecordingRig
 
@@ -135,7 +135,7 @@ def _replay(arguments: argparse.Namespace) -> int:
             raise ConfigurationError(f"{arguments.file}: a CAN log does not name its device: name one with --dut")
         with RecordingRig.of(load_capture(arguments), arguments.file) as rig:
             conditions = rig.run.conditions
-            device: Callable[..., Dut] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))
+            device: Callable[..., Device] = functools.partial(reopen_dut, conditions.dut, str(arguments.file))
             if arguments.dut:
                 device = functools.partial(open_dut, arguments.dut)
             return _play(rig, rig.scenario(), conditions.seed, device, output, arguments)
@@ -161,7 +161,7 @@ def _play(
     rig: Rig,
     scenario: Scenario,
     seed: int,
-    open_device: Callable[..., Dut],
+    open_device: Callable[..., Device],
     output: OutputFolder,
     arguments: argparse.Namespace,
 ) -> int:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote, urlencode
 
+from analogrig.devices.catalogue_description import FrameDevice
 from analogrig.devices.child import Child
-from analogrig.devices.description import FrameDevice
 from analogrig.devices.host import HOST_PROGRAM, host_child
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError

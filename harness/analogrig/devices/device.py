@@ -1,25 +1,30 @@
-"""Interface of a device under test: blocks of samples go in, replies come out."""
+"""Interface of a device under test: blocks of samples go in, answers come out."""
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
+from analogrig.answers import Answers, Samples
+from analogrig.datasheet import Datasheet
 from analogrig.devices.description import DeviceDescription
-from analogrig.errors import ConfigurationError
-from analogrig.estimator_config import EstimatorConfig
+from analogrig.errors import ConfigurationError, DeviceRefused
 from analogrig.identity import DeviceFile
-from analogrig.protocol.exchange import Replies, Stretch
 from analogrig.protocol.pace import Pace
+from analogrig.run import Channel
+
+if TYPE_CHECKING:
+    from analogrig.links.link import CanListener
 
 
 class Device(ABC):
     """Device under test, fed by ``Bench.play``; a context manager.
 
-    ``Dut`` is one behind a link, ``DirectDevice`` one without messages. Methods raise LinkError or DeviceError if the
-    device fails. The properties of the link are those of a device that has none.
+    ``start``, ``play`` and ``recover`` make a device. The other members have defaults, which suit a device without a
+    line, without settings and without counters. Callers ask ``datasheet`` for what it reports and its description for
+    its ``capabilities``, never for its class. Every method may raise LinkError (the device cannot be reached, or does
+    not answer in time) or DeviceError (it answers wrongly). The error names the device and, in ``play``, the sample.
     """
 
     def __init__(self, description: DeviceDescription) -> None:
@@ -28,44 +33,84 @@ class Device(ABC):
 
     @property
     def name(self) -> str:
+        """Name on the command line or in its file. It begins every error message."""
         return self._description.name
 
     @property
-    def link_name(self) -> str:
-        return "none"
-
-    @property
-    def link_counters(self) -> dict[str, int]:
-        """Counters of the line since it was opened, by name (``Link.counters``)."""
-        return {}
-
-    @property
-    def line_s(self) -> float:
-        """Time that the samples and answers of this run take at the line's speed [s]; 0.0 if it is unknown."""
-        return 0.0
-
-    @property
-    def line(self) -> dict[str, int]:
-        """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
-        return {}
-
-    @property
-    def estimator(self) -> EstimatorConfig:
-        """Configuration of its estimator."""
-        return self._description.estimator
-
-    @property
-    def parameters(self) -> int:
-        """Number of elements of theta."""
-        return self._description.estimator.parameters
+    def datasheet(self) -> Datasheet:
+        """Quantities that it reports and figures that are stated about it; final once ``recover`` has returned."""
+        return self._description.known_datasheet()
 
     def description(self) -> Mapping[str, Any]:
-        """Description in plain values, for the record."""
+        """Description in plain values, for the record; the device can be opened from it again (``recorded``)."""
         return self._description.as_table()
 
     def files(self) -> tuple[DeviceFile, ...]:
         """Library, program or firmware that the device runs on this machine, if any, as it was when it was loaded."""
         return self._files
+
+    # ----------------------------------------------------------------------------------------------------- before a run
+
+    @abstractmethod
+    def recover(self) -> object:
+        """Bring the device to a defined state, from any state; nothing from before can reach the next run.
+
+        A child process that has failed is started anew.
+        """
+
+    def configure(self, **settings: Any) -> None:
+        """Set the described settings, with ``settings`` instead of those of the same names, for the next runs.
+
+        :raises DeviceRefused: a setting was not applied; names it. A device without the capability ``configure``
+            refuses every setting.
+        """
+        if settings:
+            raise DeviceRefused(f"device {self.name}: has no setting {next(iter(settings))}")
+
+    def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: B027 - few devices need it
+        """Take the scales of the rig's channels, and the machine time between samples, before ``start``.
+
+        Messages that carry physical units need them, and so does the code of zero force.
+        """
+
+    def pace(self, period_s: float) -> Pace:  # noqa: ARG002
+        """Pace of a run in real time, with a sample every ``period_s``.
+
+        :raises ConfigurationError: the device cannot take samples at this rate.
+        """
+        raise ConfigurationError(f"device {self.name}: cannot be played in real time")
+
+    # ------------------------------------------------------------------------------------------------------------ a run
+
+    @abstractmethod
+    def start(self, pace: Pace | None = None) -> None:
+        """Begin a record, whose first sample has the index 0; the same samples then have the same answers.
+
+        :param pace: no sample is sent before it is due; by default each is sent at once.
+        """
+
+    @abstractmethod
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        """Feed blocks of samples without a pause, and yield the answers to each block, in order.
+
+        It may take several blocks before it yields. A sample lost on the way has the flag LOST, a missing one MISSING.
+
+        :raises LinkTimeout, LinkClosed, DeviceError: names the sample; the answers yielded before are valid.
+        :raises TimeLimitReached: after all answers that came in time; the last block may be answered in part.
+        """
+
+    def stop(self) -> Mapping[str, int]:
+        """End the record, and return the device's counters of it by name.
+
+        :raises DeviceError: the record is not valid, for example because the device was reset.
+        """
+        return {}
+
+    def limit(self, left_s: float) -> None:  # noqa: B027 - a device that answers at once has nothing to wait for
+        """Set a time limit ``left_s`` from now; ``math.inf`` removes it.
+
+        After it, every method that waits for the device raises ``TimeLimitReached``.
+        """
 
     def __enter__(self) -> Self:
         return self
@@ -73,48 +118,30 @@ class Device(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:  # noqa: B027 - without a link there is nothing to release
-        """Release the device, and end it if it was started for this."""
+    def close(self) -> None:  # noqa: B027 - a device in this process has nothing to release
+        """Release the device, and end it if it was started for this. May be called twice, and after any error."""
 
-    def limit(self, left_s: float) -> None:  # noqa: B027 - without a link there is nothing to wait for
-        """Set a time limit ``left_s`` from now; ``math.inf`` removes it.
+    # --------------------------------------------------------------------------------------------------------- its line
 
-        After it, every method that waits for the device raises ``TimeLimitReached``.
-        """
+    @property
+    def link_name(self) -> str:
+        """Name of the line: ``pty``, ``memory``; ``none`` without one."""
+        return "none"
 
-    @abstractmethod
-    def handshake(self) -> object:
-        """Bring the device to a defined state, from any state."""
+    @property
+    def link_counters(self) -> Mapping[str, int]:
+        """Counters of the line since it was opened, by name."""
+        return {}
 
-    @abstractmethod
-    def configure(self, estimator: EstimatorConfig | None = None) -> None:
-        """Set the configuration of the estimator; by default the described one."""
+    @property
+    def line_s(self) -> float:
+        """Time that the samples and answers of this record take at the line's speed [s]; 0.0 if it is unknown."""
+        return 0.0
 
-    def set_force_zero(self, code: float) -> None:
-        """Set the code that means zero force; errors as ``configure``."""
-        self.configure(dataclasses.replace(self.estimator, force_zero=code))
+    @property
+    def line(self) -> Mapping[str, int]:
+        """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
+        return {}
 
-    def pace(self, period_s: float) -> Pace:  # noqa: ARG002
-        """Pace of a run in real time, with a sample every ``period_s``.
-
-        :raises ConfigurationError: the device cannot take samples at this rate.
-        """
-        raise ConfigurationError(f"device {self.name}: has no line, and therefore no real time")
-
-    @abstractmethod
-    def start(self, pace: Pace | None = None) -> None:
-        """Begin a run, whose first sample has the index 0.
-
-        :param pace: no sample is sent before it is due; by default each is sent at once.
-        """
-
-    @abstractmethod
-    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        """Feed several stretches of samples without a pause, and yield the answers to each.
-
-        The device takes skipped indices as missing samples.
-        """
-
-    @abstractmethod
-    def stop(self) -> Mapping[str, int]:
-        """End the run, and return the device's counters of this run by name."""
+    def listen(self, listener: CanListener) -> None:  # noqa: B027 - few lines carry CAN frames
+        """Report all CAN frames to the listener from now on; a line without any ignores it."""

@@ -6,23 +6,25 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from analogrig.answers import Answers, RaisedAlarm, Samples
 from analogrig.catalogue import Trigger
-from analogrig.devices.description import DeviceDescription
+from analogrig.datasheet import Datasheet
+from analogrig.devices.catalogue_description import CatalogueDescription
 from analogrig.devices.device import Device
 from analogrig.devices.estimator import Estimator
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.protocol.exchange import RaisedAlarm, Replies, Stretch
 from analogrig.protocol.pace import Pace
+from analogrig.run import Channel
 
 
 class DirectDevice(Device):
-    """The estimator of a device whose ``can_run_in_blocks`` holds, without its line.
+    """Estimator of a device of our catalogue that has the capability ``blocks``, without its line.
 
-    Its answers are those of ``Dut`` to the bit. It lacks what other messages carry: the diagnoses, the flags RESTARTED
-    and IDLE, and the counters of messages.
+    Its answers are those of ``CatalogueDevice`` to the bit. It lacks what other messages carry: the diagnoses, the
+    flags RESTARTED and IDLE, and the counters of messages.
     """
 
-    def __init__(self, description: DeviceDescription, *, alarms_only: bool = False) -> None:
+    def __init__(self, description: CatalogueDescription, *, alarms_only: bool = False) -> None:
         """Load and configure the estimator.
 
         :param alarms_only: omit the estimates, which take half of the time: theta has no columns.
@@ -30,49 +32,57 @@ class DirectDevice(Device):
         :raises LinkError: the library was not built.
         """
         super().__init__(description)
+        self._description: CatalogueDescription = description
+        self._as_opened = description.estimator
         self._alarms_only = alarms_only
         self.configure()
 
     @property
-    def parameters(self) -> int:
-        return 0 if self._alarms_only else super().parameters
+    def datasheet(self) -> Datasheet:
+        return self._datasheet
 
     def description(self) -> Mapping[str, Any]:
         return self._table
 
-    def handshake(self) -> None:
+    def recover(self) -> None:
         self._estimator.restart()
 
-    def configure(self, estimator: EstimatorConfig | None = None) -> None:
-        if estimator is not None:
-            self._description = dataclasses.replace(self._description, estimator=estimator)
-        self._estimator = Estimator(self.estimator, library=self._description.estimator_library)
-        self._trigger = Trigger[self.estimator.trigger.replace("-", "_").upper()]
+    def configure(self, **settings: Any) -> None:
+        self._apply(self._as_opened.changed(f"device {self.name}", settings))
+
+    def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
+        zero = channels["force"].zero
+        if zero != self._description.estimator.force_zero:
+            self._apply(dataclasses.replace(self._description.estimator, force_zero=zero))
+
+    def _apply(self, estimator: EstimatorConfig) -> None:
+        self._description = dataclasses.replace(self._description, estimator=estimator)
+        self._estimator = Estimator(estimator, library=self._description.estimator_library)
+        self._trigger = Trigger[estimator.trigger.replace("-", "_").upper()]
         # Runs share the table: to write it anew for each takes as long as to play a thousand samples.
         self._table = self._description.as_table()
-
-    def set_force_zero(self, code: float) -> None:
-        if code != self.estimator.force_zero:
-            super().set_force_zero(code)
+        self._datasheet = Datasheet.recorded(self._table)
+        if self._alarms_only:
+            self._datasheet = dataclasses.replace(self._datasheet, theta_n=0, model=None)
+            self._table["datasheet"] = self._datasheet.as_table()
 
     def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
         self._estimator.restart()
 
-    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        for first, force, displacement, missing in stretches:
-            steps = self._estimator.run(force, displacement, ~missing, with_theta=not self._alarms_only)
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        for block in blocks:
+            steps = self._estimator.run(block.u, block.y, block.valid, with_theta=not self._alarms_only)
             indices = steps.alarms.tolist()
             statistics = steps.statistic[steps.alarms].tolist()
-            yield Replies(
+            yield Answers(
+                flags=steps.flags,
+                alarms=tuple(
+                    RaisedAlarm(block.first + index, self._trigger, statistic)
+                    for index, statistic in zip(indices, statistics, strict=True)
+                ),
                 theta=steps.theta,
                 innovation=steps.innovation,
                 statistic=steps.statistic,
-                flags=steps.flags,
-                alarms=tuple(
-                    RaisedAlarm(first + index, self._trigger, statistic)
-                    for index, statistic in zip(indices, statistics, strict=True)
-                ),
-                diagnoses=(),
             )
 
     def stop(self) -> Mapping[str, int]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from analogrig.devices.catalogue_description import EitherDevice
 from analogrig.devices.child import PROGRAMS, Child, ChildWire
-from analogrig.devices.description import EitherDevice
 from analogrig.errors import LinkError
 from analogrig.links.wire import PortWire
 

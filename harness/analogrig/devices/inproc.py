@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from analogrig.devices.description import EitherDevice
+from analogrig.devices.catalogue_description import EitherDevice
 from analogrig.devices.library import LIBRARY, MemoryWire
 from analogrig.links.wire import Wire
 from analogrig.trust import Thing, absolute_path

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from analogrig.devices.catalogue_description import EitherDevice
 from analogrig.devices.child import Child, ChildWire
-from analogrig.devices.description import EitherDevice
 from analogrig.errors import LinkError
 from analogrig.links.wire import DescriptorWire, Wire
 from analogrig.trust import Thing, absolute_path

@@ -9,21 +9,31 @@ from pathlib import Path
 from typing import Any
 
 from analogrig import config
-from analogrig.devices.can import CanDevice
 from analogrig.devices.description import DeviceDescription
-from analogrig.devices.host import HostDevice
-from analogrig.devices.inproc import InprocDevice
-from analogrig.devices.qemu import QemuM3, QemuM4, QemuM7
-from analogrig.devices.serial import SerialDevice
 from analogrig.errors import ConfigurationError
+from analogrig.kinds import Kinds
 from analogrig.trust import Thing, Trust, file_of, folder_of
+
+_FOUND_OUT = ("identity", "datasheet")
+"""Tables of a record that the device, once opened, adds to its description."""
 
 _ELF = b"\x7fELF"
 """First bytes of libraries, programs and firmware."""
 
-KINDS: Mapping[str, type[DeviceDescription]] = {
-    cls.kind: cls for cls in (HostDevice, InprocDevice, QemuM3, QemuM4, QemuM7, SerialDevice, CanDevice)
-}
+KINDS = Kinds(
+    DeviceDescription,
+    "analogrig.devices",
+    {
+        "host": "analogrig.devices.host:HostDevice",
+        "inproc": "analogrig.devices.inproc:InprocDevice",
+        "qemu-m3": "analogrig.devices.qemu:QemuM3",
+        "qemu-m4": "analogrig.devices.qemu:QemuM4",
+        "qemu-m7": "analogrig.devices.qemu:QemuM7",
+        "serial": "analogrig.devices.serial:SerialDevice",
+        "can": "analogrig.devices.can:CanDevice",
+    },
+)
+"""Description of each kind of device."""
 
 
 def describe(name: str) -> DeviceDescription:
@@ -81,11 +91,14 @@ def _check_not_compiled(name: str) -> None:
 
 
 def recorded(description: Mapping[str, Any]) -> DeviceDescription:
-    """Description from the record of ``Dut.description()``.
+    """Description from the record of ``Device.description()``.
 
     :raises ConfigurationError: it describes no device.
     """
-    return from_table({key: value for key, value in description.items() if key != "identity"}, "the recorded device")
+    kind = KINDS.get(str(description.get("kind")))
+    fields = frozenset(() if kind is None else kind.__dataclass_fields__)
+    table = {key: value for key, value in description.items() if key in fields or key not in _FOUND_OUT}
+    return from_table(table, "the recorded device")
 
 
 def from_table(table: Mapping[str, Any], where: str) -> DeviceDescription:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Self
 
-from analogrig.devices.description import ByteDevice
+from analogrig.devices.catalogue_description import ByteDevice
 from analogrig.errors import ConfigurationError
 from analogrig.links.wire import DEFAULT_BAUD, PortWire, Wire
 from analogrig.trust import Thing, absolute_port

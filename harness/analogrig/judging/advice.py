@@ -30,6 +30,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
     """Sentences of advice, the most severe first; empty if there is nothing to advise."""
     return (
         *_statement(run),
+        *_unjudged_quantities(verdict),
         *_assumed_settings(run),
         *_overloads(verdict),
         *_noise_setting(run),
@@ -39,6 +40,13 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
         *_undetectable_changes(verdict),
         *_implausible_estimates(verdict),
     )
+
+
+def _unjudged_quantities(verdict: Verdict) -> Iterator[str]:
+    if verdict.not_judged:
+        yield f"not judged, because the device does not report them: {', '.join(verdict.not_judged)}"
+    if verdict.cannot_tell:
+        yield f"the device's protocol does not show: {', '.join(verdict.cannot_tell)}"
 
 
 def _statement(run: Run) -> Iterator[str]:
@@ -75,8 +83,8 @@ def _overloads(verdict: Verdict) -> Iterator[str]:
 
 def _noise_setting(run: Run) -> Iterator[str]:
     measured = run.conditions.channels["displacement"].noise_lsb ** 2 + QUANTISATION_VARIANCE_LSB2
-    expected = float(run.conditions.dut["estimator"].get("noise_variance", np.inf))
-    if measured > NOISE_MARGIN * expected:
+    expected = run.datasheet.noise_variance
+    if expected is not None and measured > NOISE_MARGIN * expected:
         yield (
             f"the rig's noise has a variance of {measured:.2g} codes^2, the device is set for {expected:.2g}:"
             " expect false alarms; raise noise_variance"
@@ -87,7 +95,7 @@ def _edge_spacing(run: Run) -> Iterator[str]:
     excitation = _excitation(run)
     if excitation is None or excitation.clock == "card":
         return
-    if run.conditions.dut["estimator"].get("edge_instants") == "anywhere":
+    if run.conditions.dut.get("estimator", {"edge_instants": "anywhere"}).get("edge_instants") == "anywhere":
         return
     intervals = np.diff(_edge_instants(run, excitation))
     if len(intervals) and np.abs(intervals - np.round(intervals)).max() > MOST_EDGE_SHIFT:
@@ -98,9 +106,10 @@ def _edge_spacing(run: Run) -> Iterator[str]:
 
 
 def _warm_up(run: Run) -> Iterator[str]:
-    excitation, warm_up_n = _excitation(run), run.conditions.dut["estimator"].get("warm_up_n")
-    if excitation is None or warm_up_n is None:
+    excitation, sheet = _excitation(run), run.datasheet
+    if excitation is None or sheet.armed:
         return
+    warm_up_n = sheet.warm_up_n
     instants = _edge_instants(run, excitation)
     if len(instants) < WARM_UP_EDGES or instants[WARM_UP_EDGES - 1] >= warm_up_n:
         yield (
@@ -133,6 +142,8 @@ def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
 
 
 def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
+    if "estimates" in verdict.not_judged or "parameters" in verdict.not_judged:
+        return
     for segment in verdict.estimates:
         if segment.estimate is None:
             samples = f"{segment.start}-{segment.end - 1}"

@@ -7,15 +7,14 @@ equation, or without excitation. Zero alarms in such samples prove nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.catalogue import SteppedFlag
-from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, Run
+from analogrig.datasheet import Datasheet
+from analogrig.run import CHANNELS, CHUNK_SAMPLES, LOST, UNARMED, Run
 from analogrig.wording import number_of
 
 EDGE_NOISES = 9.0
@@ -40,8 +39,8 @@ class Exposure:
     """Samples before the first edge of the force, or more than ``idle_n`` after the last one."""
     non_finite: int
     """Samples without an alarm whose estimate, innovation or statistic was non-finite."""
-    estimator: Mapping[str, Any]
-    """Estimator settings of the device (``EstimatorConfig.as_table``)."""
+    datasheet: Datasheet
+    """Data sheet of the device."""
 
     @property
     def lack_of_evidence(self) -> str:
@@ -53,14 +52,16 @@ class Exposure:
 
     def _unarmed_reason(self) -> str:
         """Main reason that the trigger was never armed."""
-        if self.estimator.get("trigger") == "none":
+        sheet = self.datasheet
+        if not sheet.alarms:
             return "the device has no trigger"
+        if sheet.armed:
+            return "the device reported it armed in none"
         if 2 * self.unexcited <= self.samples:
-            return f"its warm-up takes {self.estimator.get('warm_up_n', 0)}"
-        edge_codes, idle_n = self.estimator.get("edge_codes", 0.0), self.estimator.get("idle_n", 0)
+            return f"its warm-up takes {sheet.warm_up_n}"
         return (
-            f"in {self.unexcited} it was not excited (no edge of the force of {edge_codes:g} codes, or none for"
-            f" {number_of(idle_n, 'sample')})"
+            f"in {self.unexcited} it was not excited (no edge of the force of {sheet.edge_codes:g} codes, or none for"
+            f" {number_of(sheet.idle_n, 'sample')})"
         )
 
 
@@ -80,7 +81,7 @@ class ObservedRecord:
 
 def exposure(run: Run) -> Exposure:
     """Exposure of a run: the sum over its records, each of which the device starts afresh."""
-    estimator, noise_lsb = run.conditions.dut["estimator"], run.conditions.channels["force"].noise_lsb
+    sheet, noise_lsb = run.datasheet, run.conditions.channels["force"].noise_lsb
     are_finite = np.isfinite(run.innovation) & np.isfinite(run.statistic)
     for column in run.theta.T:
         are_finite &= np.isfinite(column)
@@ -92,7 +93,7 @@ def exposure(run: Run) -> Exposure:
                 are_finite[start:end],
                 run.alarm_index[(run.alarm_index >= start) & (run.alarm_index < end)] - start,
             ),
-            estimator,
+            sheet,
             noise_lsb,
         )
         for start, end in run.records
@@ -100,24 +101,33 @@ def exposure(run: Run) -> Exposure:
     armed, unexcited, non_finite = (
         sum(getattr(part, name) for part in parts) for name in ("armed", "unexcited", "non_finite")
     )
-    return Exposure(run.samples, armed, unexcited, non_finite, estimator)
+    return Exposure(run.samples, armed, unexcited, non_finite, sheet)
 
 
-def record_exposure(record: ObservedRecord, estimator: Mapping[str, Any], noise_lsb: float) -> Exposure:
+def record_exposure(record: ObservedRecord, sheet: Datasheet, noise_lsb: float) -> Exposure:
     """Exposure of one record; ``noise_lsb`` is the noise of the force channel, rms in LSB."""
     known = (record.flags & _NOT_PROCESSED) == 0
-    edge_codes = float(estimator.get("edge_codes", 0.0))
-    if edge_codes:
-        edge_codes = max(edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
-    excited = _excitation_mask(record.force, known, edge_codes, int(estimator.get("idle_n", 0)))
+    excited = _excitation_mask(record.force, known, _least_edge(sheet, noise_lsb), sheet.idle_n)
     excited &= (record.flags & SteppedFlag.IDLE) == 0
-    watched = _beyond_hold_off(known & ((record.flags & SteppedFlag.GATHERING) == 0), record.alarms, estimator)
-    armed = watched & excited & record.are_finite & (estimator.get("trigger") != "none")
+    if sheet.armed:
+        watched = known & ((record.flags & UNARMED) == 0)
+        excited[:] = True
+    else:
+        equations = known & ((record.flags & SteppedFlag.GATHERING) == 0)
+        watched = _beyond_hold_off(equations, record.alarms, sheet)
+    armed = watched & excited & record.are_finite & sheet.alarms
     armed[record.alarms] = True
     non_finite = ~record.are_finite
     non_finite[record.alarms] = False  # an alarm is the required response to a non-finite estimate
     armed_n, unexcited_n, non_finite_n = (int(np.count_nonzero(each)) for each in (armed, ~excited, non_finite))
-    return Exposure(len(armed), armed_n, unexcited_n, non_finite_n, estimator)
+    return Exposure(len(armed), armed_n, unexcited_n, non_finite_n, sheet)
+
+
+def _least_edge(sheet: Datasheet, noise_lsb: float) -> float:
+    """Smallest step of the force that counts as an edge, in codes; 0.0 if the trigger needs none."""
+    if not sheet.edge_codes:
+        return 0.0
+    return max(sheet.edge_codes, EDGE_NOISES * math.hypot(noise_lsb, _QUANTISATION_LSB))
 
 
 def _excitation_mask(
@@ -140,13 +150,11 @@ def _excitation_mask(
     return excited
 
 
-def _beyond_hold_off(
-    equations: NDArray[np.bool_], alarms: NDArray[np.int64], estimator: Mapping[str, Any]
-) -> NDArray[np.bool_]:
+def _beyond_hold_off(equations: NDArray[np.bool_], alarms: NDArray[np.int64], sheet: Datasheet) -> NDArray[np.bool_]:
     """(n,): samples with an equation after warm-up and hold-off, both counted in equations."""
     count = np.cumsum(equations, dtype=np.int32)
-    watched = equations & (count > int(estimator.get("warm_up_n", 0)))
-    hold_off_n = int(estimator.get("hold_off_n", 0))
+    watched = equations & (count > sheet.warm_up_n)
+    hold_off_n = sheet.hold_off_n
     if hold_off_n and len(alarms):
         for first in range(0, len(count), CHUNK_SAMPLES):
             part = slice(first, min(first + CHUNK_SAMPLES, len(count)))

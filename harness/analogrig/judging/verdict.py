@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.catalogue import Change, SteppedFlag
+from analogrig.datasheet import Datasheet
 from analogrig.judging import information
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.plant import PARAMETERS, Segment, physical_parameters
@@ -174,9 +175,16 @@ class Verdict:
     arl0: float
     """Mean time between false alarms assumed by the bounds, in samples."""
     ceiling: float | None
-    """Alarm threshold of the trigger's statistic; None without a trigger."""
+    """Alarm threshold of the trigger's statistic; None without a trigger, or if it is not known."""
     missing_n: int
     theta_hash: str
+    """``Run.theta_hash``; empty if the device reports no estimate."""
+    alarm_hash: str = ""
+    """``Run.alarm_hash``."""
+    not_judged: tuple[str, ...] = ()
+    """Quantities that the device does not report, as noun phrases: nothing is judged by them."""
+    cannot_tell: tuple[str, ...] = ()
+    """Faults that the device's protocol leaves unnoticed, as noun phrases."""
     overloads: Mapping[str, int] = field(default_factory=dict)
     """First sample with a lit overload lamp, by amplifier."""
     doubtful_alarms: tuple[int, ...] = ()
@@ -207,8 +215,8 @@ def judge(run: Run) -> Verdict:
     :raises ConfigurationError: the recorded scenario has an invalid expectation.
     """
     expect = config.build(Expectations, run.conditions.scenario.get("expect", {}), "the recorded scenario: expect")
-    trigger = run.conditions.dut["estimator"]
-    level = float(trigger["ceiling"]) if trigger["trigger"] == "cusum" else math.log(expect.arl0)
+    sheet = run.datasheet
+    level = sheet.log_arl0(expect.arl0)
     results = _evaluate_hypotheses(run, expect, level)
     invalid = invalid_reasons(run, exposure(run), expect)
     outcome, reasons = _decide_outcome(results, expect)
@@ -222,19 +230,36 @@ def judge(run: Run) -> Verdict:
         doubtful_alarms=tuple(sorted(possible - certain)),
         estimates=_segment_estimates(run.with_change_instants(Segment.earliest)),
         arl0=math.exp(min(level, LARGEST_LEVEL)),
-        ceiling=None if trigger["trigger"] == "none" else float(trigger["ceiling"]),
+        ceiling=sheet.ceiling,
         missing_n=int(np.count_nonzero(run.missing)),
         theta_hash=run.theta_hash(),
+        alarm_hash=run.alarm_hash(),
+        not_judged=_unreported(sheet),
+        cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
     )
 
 
+def _unreported(sheet: Datasheet) -> tuple[str, ...]:
+    """Quantities that the device does not report."""
+    reported = {
+        "parameters" if sheet.theta_n else "estimates": sheet.theta_n > 0 and sheet.model is not None,
+        "innovations": sheet.innovation,
+        "the trigger's statistic": sheet.statistic,
+        "diagnoses": sheet.diagnoses,
+    }
+    return tuple(name for name, is_reported in reported.items() if not is_reported)
+
+
 def trajectory(run: Run, samples: Sequence[int] | slice = slice(None)) -> NDArray[np.float64]:
-    """Estimated M, B, K after each of ``samples``: (n, 3) float64; NaN if theta describes no mass, damper, spring."""
-    channels = run.conditions.channels
+    """Estimated M, B, K after each of ``samples``, (n, 3) float64; NaN if theta does not describe them."""
+    channels, model = run.conditions.channels, run.datasheet.model
+    theta = run.theta[samples]
+    if model is None or not theta.shape[1]:
+        return np.full((len(theta), len(PARAMETERS)), np.nan)
     return physical_parameters(
-        run.theta[samples],
-        run.conditions.dut["estimator"],
+        theta,
+        model,
         n_per_code=channels["force"].lsb,
         m_per_code=channels["displacement"].lsb,
         period_s=run.conditions.sample_period_problem_s,
@@ -279,6 +304,9 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
         "arl0": verdict.arl0,
         "missing": verdict.missing_n,
         "theta_hash": verdict.theta_hash,
+        "alarm_hash": verdict.alarm_hash,
+        "not_judged": list(verdict.not_judged),
+        "cannot_tell": list(verdict.cannot_tell),
         "overloads": dict(verdict.overloads),
     }
 

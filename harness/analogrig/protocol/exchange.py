@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     INDICES,
@@ -52,51 +52,7 @@ _NO_ELEMENT = -1
 _DECIDED = frozenset(Change) - {Change.UNDECIDED}
 
 Codes = tuple[int, int, bool]
-"""Force, displacement, and True if they are missing."""
-
-Stretch = tuple[int, NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]
-"""Index of the first sample, force, displacement, missing."""
-
-
-@dataclass(frozen=True)
-class RaisedAlarm:
-    """An alarm of the device."""
-
-    index: int
-    """Sample, counted from the start of the run without wrap-around."""
-    kind: int
-    """The trigger that raised it."""
-    statistic: float
-
-
-@dataclass(frozen=True)
-class StatedDiagnosis:
-    """A diagnosis of the device: the parameter that has changed."""
-
-    index: int
-    """Sample after which it was sent, counted, like ``onset``, from the start of the run without wrap-around."""
-    change: int
-    """Change of the catalogue."""
-    onset: int
-    """Most likely sample of the change; that of the alarm if several parameters have changed."""
-    extent: float
-    """Parameter after the change over that before; 1 if several have changed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Replies:
-    """Answers of the device to n samples, with p parameters."""
-
-    theta: NDArray[np.float32]
-    """(n, p): the estimate after each sample, in the order of est.h, in codes."""
-    innovation: NDArray[np.float32]
-    """(n,) codes"""
-    statistic: NDArray[np.float32]
-    """(n,): of the trigger."""
-    flags: NDArray[np.uint8]
-    """(n,): SteppedFlag, LOST, UNREPORTED."""
-    alarms: tuple[RaisedAlarm, ...]
-    diagnoses: tuple[StatedDiagnosis, ...]
+"""u, y, and False if they are missing."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +74,7 @@ def most_answers(samples: int, parameters: int) -> int:
     return samples * (parameters + 2) + 2
 
 
-class _PendingReplies:
+class _PendingAnswers:
     """Answers not yet taken, in lists: numpy takes as long for one number as for a hundred."""
 
     def __init__(self, width: int) -> None:
@@ -128,7 +84,7 @@ class _PendingReplies:
         self.statistics: list[float] = []
         self.flags: list[int] = []
         self.alarms: list[RaisedAlarm] = []
-        self.diagnoses: list[StatedDiagnosis] = []
+        self.diagnoses: list[ReportedDiagnosis] = []
         self._last_taken = (width * [0.0], 0.0)
 
     def repeat(self, flags: int, statistic: float | None = None) -> None:
@@ -141,11 +97,11 @@ class _PendingReplies:
         self.flags.append(flags)
         self.statistics.append(statistic)
 
-    def take(self, n: int, before: int) -> Replies:
+    def take(self, n: int, before: int) -> Answers:
         """Remove and return the first n samples, and the alarms and diagnoses before the index ``before``."""
         cut = n * self.width
         values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
-        out = Replies(
+        out = Answers(
             theta=values[:, :-1],
             innovation=values[:, -1],
             statistic=np.array(self.statistics[:n], dtype=np.float32),
@@ -185,7 +141,7 @@ class Exchange:
         self._check_device = check_device
         self._pace = pace
         self._elements = (*range(parameters), int(Element.INNOVATION), _NO_ELEMENT)
-        self._rows = _PendingReplies(parameters + 1)
+        self._rows = _PendingAnswers(parameters + 1)
         self._pending: deque[tuple[int, int]] = deque()
         """First sample and number of samples of each message that is not completely answered."""
         self._deadline_s = 0.0
@@ -201,20 +157,22 @@ class Exchange:
         self._timeouts = 0
         self._next_index = 0
 
-    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        """Send consecutive stretches of samples, and yield the answers to each.
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        """Send consecutive blocks of samples, and yield the answers to each.
 
         The device takes skipped indices as missing samples.
 
-        :raises LinkTimeout, LinkError, DeviceError: see ``Dut.feed``.
+        :raises LinkTimeout, LinkError, DeviceError: see ``CatalogueDevice.play``.
         :raises TimeLimitReached: after all answers that came in time.
         :raises ValueError: the arrays differ in length, or the samples have been sent before.
         """
         waiting: deque[tuple[int, int]] = deque()
         try:
-            for first, *arrays in stretches:
-                waiting.append((len(arrays[0]), first + len(arrays[0])))
-                self._enter(first, list(zip(*(array.tolist() for array in arrays), strict=True)))
+            for block in blocks:
+                waiting.append((len(block), block.first + len(block)))
+                self._enter(
+                    block.first, list(zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True))
+                )
                 while waiting and len(self._rows.flags) >= waiting[0][0]:
                     yield self._rows.take(*waiting.popleft())
             self._collect(0)
@@ -226,8 +184,8 @@ class Exchange:
             raise
         yield from self._take_rest(waiting)
 
-    def _take_rest(self, waiting: Iterable[tuple[int, int]]) -> Iterator[Replies]:
-        """Answers to the waiting stretches (samples, end); the last may be answered in part."""
+    def _take_rest(self, waiting: Iterable[tuple[int, int]]) -> Iterator[Answers]:
+        """Answers to the waiting blocks (samples, end); the last may be answered in part."""
         for n, end in waiting:
             answered = min(n, len(self._rows.flags))
             yield self._rows.take(answered, end - n + answered)
@@ -258,11 +216,11 @@ class Exchange:
     def _message(self, first: int, samples: Sequence[Codes]) -> Message:
         seq = self._talk.next_seq()
         if not self._packing.in_blocks:
-            force, displacement, missing = samples[0]
-            flags = self._run | (SampleFlag.MISSING if missing else 0)
-            return Sample(seq, flags, first % INDICES, force, displacement)
-        mask = sum(1 << i for i, (_, _, missing) in enumerate(samples) if missing)
-        codes = [code for force, displacement, _ in samples for code in (force, displacement)]
+            u, y, valid = samples[0]
+            flags = self._run | (0 if valid else SampleFlag.MISSING)
+            return Sample(seq, flags, first % INDICES, u, y)
+        mask = sum(1 << i for i, (_, _, valid) in enumerate(samples) if not valid)
+        codes = [code for u, y, _ in samples for code in (u, y)]
         codes += [0] * (2 * BLOCK_SAMPLES - len(codes))
         return SampleBlock(seq, self._run | len(samples), first % INDICES, mask, tuple(codes))
 
@@ -316,7 +274,7 @@ class Exchange:
         flags = message.flags & STEPPED_FLAGS
         if self._diagnosis is not None:
             onset = index_up_to(self._answered, self._diagnosis.onset_index)
-            stated = StatedDiagnosis(self._answered, self._diagnosis.change, onset, self._diagnosis.extent)
+            stated = ReportedDiagnosis(self._answered, self._diagnosis.change, onset, self._diagnosis.extent)
             self._rows.diagnoses.append(stated)
             self._diagnosis = None
         if self._next_element:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import os
-import pkgutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from analogrig import config
 from analogrig.errors import ConfigurationError
+from analogrig.kinds import Kinds
 from analogrig.rigs.recording import RecordingDescription
 from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.trust import Trust
 
-KINDS: Mapping[str, str] = {
-    "emulator": "analogrig.rigs.emulator:EmulatorDescription",
-    "real": "analogrig.hardware.wiring:RealDescription",
-}
-"""Subclass of ``RigDescription`` for each ``kind``, imported on use."""
+KINDS = Kinds(
+    RigDescription,
+    "analogrig.rigs",
+    {
+        "emulator": "analogrig.rigs.emulator:EmulatorDescription",
+        "real": "analogrig.hardware.wiring:RealDescription",
+    },
+)
+"""Description of each kind of rig."""
 
 DEFAULT_RIG = "emulator"
 """Rig used if neither the user nor the scenario names one."""
@@ -62,8 +66,7 @@ def from_table(table: Mapping[str, Any], where: str) -> RigDescription:
     :raises ConfigurationError: they describe no rig.
     """
     kind = config.convert(Literal[tuple(KINDS)], table.get("kind", "emulator"), f"{where}: kind")
-    described: type[RigDescription] = pkgutil.resolve_name(KINDS[kind])
-    return config.build(described, table, where)
+    return config.build(KINDS[kind], table, where)
 
 
 def _read(name: str) -> tuple[RigDescription, str, str]:

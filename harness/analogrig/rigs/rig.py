@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from analogrig.answers import Samples
 from analogrig.plant import Segment
 from analogrig.run import CHANNELS, Channel, missing_samples
 from analogrig.scenario import Scenario
@@ -44,9 +45,10 @@ class Block:
     record: int = 0
     """Number of the gap-free record that holds the block; nothing was sampled between two records."""
 
-    def signals(self) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.bool_]]:
-        """Samples as the device takes them: force, displacement, and True for each that is missing; (n,) each."""
-        return self.codes[:, _FORCE], self.codes[:, _DISPLACEMENT], missing_samples(self.clipped)
+    def samples(self, record_start: int = 0) -> Samples:
+        """Samples as the device takes them; ``record_start`` is the first sample of the record."""
+        u, y = self.codes[:, _FORCE], self.codes[:, _DISPLACEMENT]
+        return Samples(self.first - record_start, u, y, ~missing_samples(self.clipped))
 
 
 @dataclass(frozen=True)

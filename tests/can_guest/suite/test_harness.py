@@ -12,7 +12,7 @@ import pytest
 
 from analogrig.bench import Bench
 from analogrig.catalogue import LAYOUTS, Sample, unpack
-from analogrig.devices.dut import open_dut
+from analogrig.devices.opening import open_dut
 from analogrig.errors import LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run

@@ -24,7 +24,7 @@ from analogrig.testing.plugin.settings import DUT, HIL_PROFILE, RIG, RUNS_DIR, S
 
 if TYPE_CHECKING:
     from analogrig.bench import Bench
-    from analogrig.devices.dut import Dut
+    from analogrig.devices.device import Device
     from analogrig.rigs.rig import Rig
     from analogrig.testing.statement import Play
 
@@ -138,7 +138,7 @@ def _skip_unless_able(item: pytest.Item, rig: Rig, name: str) -> None:
 
 
 @pytest.fixture
-def hil_dut(request: pytest.FixtureRequest) -> Dut:
+def hil_dut(request: pytest.FixtureRequest) -> Device:
     """The device of --hil-dut, reset and configured as described."""
     devices.check_owner(request.node)
     setting = DUT.of_fixture(request)
@@ -147,7 +147,7 @@ def hil_dut(request: pytest.FixtureRequest) -> Dut:
 
 
 @pytest.fixture
-def hil_bench(request: pytest.FixtureRequest, hil_rig: Rig, hil_dut: Dut) -> Bench:
+def hil_bench(request: pytest.FixtureRequest, hil_rig: Rig, hil_dut: Device) -> Bench:
     """Bench of the rig and device of the session."""
     from analogrig.bench import Bench
 

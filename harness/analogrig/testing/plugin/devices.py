@@ -17,8 +17,7 @@ import pytest
 from analogrig.testing.plugin.settings import DUT, RIG
 
 if TYPE_CHECKING:
-    from analogrig.devices.dut import Dut
-    from analogrig.estimator_config import EstimatorConfig
+    from analogrig.devices.device import Device
     from analogrig.trust import Trust
 
 _FOLDER = "analogrig_owned"
@@ -32,37 +31,35 @@ _SPREADING = ("load", "worksteal")
 class Devices:
     """Devices of a session. They stay open until the session ends, and are reopened after a test has hung them."""
 
-    _open: dict[str, tuple[Dut, EstimatorConfig]] = field(default_factory=dict)
-    """Each with the settings of its description."""
+    _open: dict[str, Device] = field(default_factory=dict)
 
-    def lease(self, name: str, trust: Trust) -> Dut:
+    def lease(self, name: str, trust: Trust) -> Device:
         """Device that is reachable, reset and configured as described, in whatever state the last test left it.
 
         :raises AnalogrigError: it cannot be reached, or a file names it and it is not trusted.
         """
-        from analogrig.devices.dut import open_dut
+        from analogrig.devices.opening import open_dut
         from analogrig.devices.registry import describe, trusted
         from analogrig.errors import AnalogrigError
 
         only_one = trusted(name, trust).only_one
         if name in self._open:
-            dut, settings = self._open[name]
+            dut = self._open[name]
             try:
-                dut.handshake()
-                dut.configure(settings)
+                dut.recover()
+                dut.configure()
             except AnalogrigError:
                 self.release(name)
         if name not in self._open:
             for other in [each for each in self._open if only_one and describe(each).only_one == only_one]:
                 self.release(other)
-            dut = open_dut(name, allow=trust)
-            self._open[name] = dut, dut.estimator
-        return self._open[name][0]
+            self._open[name] = open_dut(name, allow=trust)
+        return self._open[name]
 
     def release(self, name: str) -> None:
         """Close the device ``name``, if it is open."""
         if name in self._open:
-            self._open.pop(name)[0].close()
+            self._open.pop(name).close()
 
     def close(self) -> None:
         for name in list(self._open):

@@ -104,7 +104,7 @@ class Player:
         run = run.with_identity(junit.session_identity(self.item.config, self.bench.dut.files()))
         if run.conditions.faults:  # nothing of it may reach the next play of this test
             with contextlib.suppress(AnalogrigError):
-                self.bench.dut.handshake()
+                self.bench.dut.recover()
         name = "" if isinstance(scenario, Scenario) else str(scenario)
         repeat = command_of(run, name, RIG.of(self.item).value, DUT.of(self.item).value)
         played = Played(run, repeat, functools.partial(self.note, seed=drawn))

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns.rare import false_alarm_rate
+from analogrig.devices.catalogue_description import CatalogueDescription, has_faults, has_snapshots
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
-from analogrig.devices.dut import Dut, connect
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.exposure import Exposure, exposure
@@ -154,6 +154,8 @@ def rare_false_alarms_rarer(
     ``analogrig.campaigns.rare`` estimates the rate.
     """
     rig, device = _in_this_process(play, "needs the estimator in this process")
+    if not has_snapshots(device):
+        pytest.skip(f"needs a device whose state can be saved, not {device.name}")
     if device.estimator.trigger != "cusum":
         pytest.skip(f"its rate is found for the trigger cusum, not {device.estimator.trigger}")
     rates = [false_alarm_rate(rig, device, scenario, seed + n, branches).rate for n in range(estimates)]
@@ -355,13 +357,17 @@ def alarms_keep_hold_off_and_warm_up(
 def _configure(play: Play, **settings: Any) -> None:
     """Configure the device until the next test."""
     dut = play.bench.dut
-    dut.configure(dataclasses.replace(dut.estimator, **settings))
+    if "configure" not in device_description(dut).capabilities:
+        pytest.skip(f"needs a device with settings, and {dut.name} has none")
+    dut.configure(**settings)
 
 
-def _fast_device(play: Play) -> DeviceDescription:
+def _fast_device(play: Play) -> CatalogueDescription:
     """Description of the device, if faults on its line cost little time; else the test is skipped."""
     device = device_description(play.bench.dut)
-    if not device.is_in_process and device.timeout_s > LONGEST_TIMEOUT_S:
+    if not has_faults(device):
+        pytest.skip(f"needs a device with faults on its line, not {device.name}")
+    if "in-process" not in device.capabilities and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
     return device
 
@@ -372,11 +378,11 @@ def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, fau
     bench, device = play.bench, _fast_device(play)
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
-            play = play.on(bench.rig, stack.enter_context(connect(dataclasses.replace(device, wire_faults=""))))
+            play = play.on(bench.rig, stack.enter_context(dataclasses.replace(device, wire_faults="").connect()))
         clean = _play_valid(play, scenario, seed).run
         again = RecordingRig.of(clean, Path("clean"))  # a real rig does not take the same samples twice
         try:
-            spoiled = stack.enter_context(connect(dataclasses.replace(device, wire_faults=faults)))
+            spoiled = stack.enter_context(dataclasses.replace(device, wire_faults=faults).connect())
             run = Bench(again, spoiled).play(again.scenario(), seed)
         except AnalogrigError as error:
             return Finding(holds=True, why=f"refused before the run: {error}")
@@ -398,9 +404,9 @@ def faults_among_the_samples_cost_no_more_than_samples(
     device = dataclasses.replace(_fast_device(play), wire_faults="")
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()
-    with connect(device) as alone:
+    with device.connect() as alone:
         without = _play_valid(play.on(play.bench.rig, alone), scenario, seed).run
-        for kind, faults in _cases(kinds, alone, without, each):
+        for kind, faults in _cases(kinds, device, without, each):
             run = _play_with_faults(
                 without, dataclasses.replace(device, wire_faults=faults, most_lost_n=scenario.samples)
             )
@@ -431,11 +437,11 @@ _START, _LATE_STARTS = "an order to start that comes again", 4
 """Repeated start orders, each in a run of its own: some come too late to be recognised as repetitions."""
 
 
-def _cases(kinds: Sequence[str], dut: Dut, run: Run, each: int) -> Iterator[tuple[str, str]]:
+def _cases(kinds: Sequence[str], device: CatalogueDescription, run: Run, each: int) -> Iterator[tuple[str, str]]:
     """Kinds and faults: ``each`` of a kind, evenly over a run on its own connection; and start orders repeated among
     the samples."""
-    first = 2 * len(list(dut.estimator.settings())) + _BEFORE_SAMPLES_N
-    messages = run.samples // dut.line["samples_per_message"]
+    first = 2 * len(list(device.estimator.settings())) + _BEFORE_SAMPLES_N
+    messages = run.samples // run.conditions.line["samples_per_message"]
     for kind in kinds:
         places = (first + (number + 1) * messages // (each + 1) for number in range(each))
         yield kind, ",".join([*(f"{kind}@to:{place}" for place in places), f"seed={run.conditions.seed}"])
@@ -449,7 +455,7 @@ def _replay_scenario(run: Run) -> Scenario:
 
 def _play_with_faults(without: Run, device: DeviceDescription) -> Run:
     """Play the same samples, which a real rig would not take twice, over a line with faults."""
-    with connect(device) as dut:
+    with device.connect() as dut:
         return Bench(RecordingRig.of(without, Path("without")), dut).play(
             _replay_scenario(without), without.conditions.seed
         )

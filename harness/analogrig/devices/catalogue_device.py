@@ -1,4 +1,4 @@
-"""Device under test: opening, handshake, configuration, samples in and estimates out.
+"""Device behind a link that carries our catalogue: handshake, configuration, samples in and answers out.
 
 The device sends nothing without a request. Any other message than the expected answer is an error.
 """
@@ -10,12 +10,11 @@ import enum
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from analogrig.answers import Answers, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
     CATALOGUE_HASH,
@@ -33,9 +32,8 @@ from analogrig.catalogue import (
     Result,
     Status,
 )
-from analogrig.devices.description import DeviceDescription
+from analogrig.devices.catalogue_description import CatalogueDescription
 from analogrig.devices.device import Device
-from analogrig.devices.registry import recorded, trusted
 from analogrig.errors import (
     CatalogueMismatch,
     ConfigurationError,
@@ -46,12 +44,11 @@ from analogrig.errors import (
     LinkTimeout,
 )
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.identity import DeviceFile
 from analogrig.links.link import CanListener, Link
 from analogrig.protocol.conversation import Conversation
-from analogrig.protocol.exchange import Exchange, Packing, Replies, Stretch, most_answers
+from analogrig.protocol.exchange import Exchange, Packing, most_answers
 from analogrig.protocol.pace import Pace, check_line
-from analogrig.trust import Trust
+from analogrig.run import Channel
 
 _HELLO_AGAIN_S = 0.25
 """Time after which the handshake is repeated: a board that resets when its port is opened misses the first request."""
@@ -71,16 +68,18 @@ class DeviceIdentity:
     """Number of blocks of samples that fit in its input buffer."""
 
 
-class Dut(Device):
-    """Device under test behind a link: configured by ``configure``, fed by ``Bench.play``, a context manager.
+class CatalogueDevice(Device):
+    """Device behind a link that carries our catalogue's messages.
 
     Methods raise LinkError if the link fails or the device does not answer in time, and DeviceError for a wrong answer.
     Every message names the device, the expected answer and the actual one.
     """
 
-    def __init__(self, link: Link, description: DeviceDescription) -> None:
+    def __init__(self, link: Link, description: CatalogueDescription) -> None:
         """Take over ``link``. Nothing is sent yet."""
         super().__init__(description)
+        self._description: CatalogueDescription = description
+        self._as_opened = description.estimator
         self._talk = Conversation(link, description.name, description.timeout_s)
         self._identity: DeviceIdentity | None = None
         self._run = secrets.randbelow(RUNS)
@@ -95,30 +94,35 @@ class Dut(Device):
 
     @property
     def link_counters(self) -> dict[str, int]:
-        """Counters of the line since it was opened, by name (``Link.counters``)."""
         return dict(self._talk.link.counters)
 
     @property
     def line_s(self) -> float:
-        """Time that the samples and answers of this run take at the line's speed [s]; 0.0 if it is unknown."""
         return self._talk.link.line_s - self._line_s
 
     @property
     def line(self) -> dict[str, int]:
-        """Bit rates of the line, if known, with ``samples_per_message`` and ``window`` of the packing."""
         line, packing = self._talk.link.line, self._packing()
         rates = {} if line is None else line.rates()
         return {**rates, "samples_per_message": packing.per_message, "window": packing.window}
 
-    def limit(self, left_s: float) -> None:
-        """Set a time limit ``left_s`` from now; ``math.inf`` removes it.
+    @property
+    def estimator(self) -> EstimatorConfig:
+        """Present configuration of its estimator."""
+        return self._description.estimator
 
-        After it, every method that waits for the device raises ``TimeLimitReached``.
-        """
+    @property
+    def parameters(self) -> int:
+        """Number of elements of theta."""
+        return self.estimator.parameters
+
+    def listen(self, listener: CanListener) -> None:
+        self._talk.link.listen(listener)
+
+    def limit(self, left_s: float) -> None:
         self._talk.limit_s = self._talk.clock() + left_s
 
     def description(self) -> Mapping[str, Any]:
-        """Description and identity in plain values, for the record."""
         table = self._description.as_table()
         return table if self._identity is None else {**table, "identity": dataclasses.asdict(self._identity)}
 
@@ -127,7 +131,7 @@ class Dut(Device):
 
     # ---------------------------------------------------------------------------------------- before and after the run
 
-    def handshake(self) -> DeviceIdentity:
+    def recover(self) -> DeviceIdentity:
         """Identify the device and reset it, in any state.
 
         :raises LinkTimeout: no answer came in time.
@@ -155,15 +159,21 @@ class Dut(Device):
         """
         return self._check_boot(self._request_identity(anew=True))
 
-    def configure(self, estimator: EstimatorConfig | None = None) -> None:
+    def configure(self, **settings: Any) -> None:
         """Set every field of the device's configuration, and check that each was applied.
 
-        :param estimator: the configuration; by default the described one.
+        :raises ConfigurationError: there is no such setting, or a value is out of its range.
         :raises DeviceRefused: a field was not applied; names the field, the value sent and the value set.
         """
-        if estimator is not None:
-            self._description = dataclasses.replace(self._description, estimator=estimator)
-        for key, value in self._description.estimator.settings():
+        self._apply(self._as_opened.changed(f"device {self.name}", settings))
+
+    def prepare(self, channels: Mapping[str, Channel], period_s: float) -> None:  # noqa: ARG002
+        """Set the code of zero force; errors as ``configure``."""
+        self._apply(dataclasses.replace(self.estimator, force_zero=channels["force"].zero))
+
+    def _apply(self, estimator: EstimatorConfig) -> None:
+        self._description = dataclasses.replace(self._description, estimator=estimator)
+        for key, value in estimator.settings():
             wanted = float(np.float32(value))  # as the device holds it
             answer = self._talk.ask(Configure(self._talk.next_seq(), key, wanted), Configured)
             if answer.key != key or answer.result != Result.APPLIED or answer.value != wanted:
@@ -311,100 +321,18 @@ class Dut(Device):
             input_blocks=firmware.input_blocks,
         )
 
-    # --------------------------------------------------------------------------------------------------------- samples
-
-    def feed(
-        self,
-        first_index: int,
-        force: NDArray[np.uint16],
-        displacement: NDArray[np.uint16],
-        missing: NDArray[np.bool_],
-    ) -> Replies:
-        """Send n consecutive samples (codes) and return the answers; all arrays are (n,).
-
-        The device takes skipped indices as missing samples.
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        """Feed blocks of samples without a pause, and yield the answers to each.
 
         :raises LinkTimeout: the device does not answer any more.
         :raises LinkError: the line failed, or lost a message of the device.
         :raises DeviceError: an answer is not the expected one, or the device was reset.
-        :raises ValueError: the arrays differ in length, or the samples have been fed before.
-        """
-        (replies,) = self.play([(first_index, force, displacement, missing)])
-        return replies
-
-    def play(self, stretches: Iterable[Stretch]) -> Iterator[Replies]:
-        """Feed several stretches of samples without a pause, and yield the answers to each; errors as ``feed``.
-
-        :raises TimeLimitReached: after yielding all answers that came in time, those of the last stretch in part.
+        :raises ValueError: arrays differ in length, samples have been fed before, or no run has been started.
+        :raises TimeLimitReached: after yielding all answers that came in time, those of the last block in part.
         """
         if self._exchange is None:
             raise ValueError("no run has been started")
-        return self._exchange.play(stretches)
-
-
-def open_dut(
-    name: str, *, allow: Trust | Iterable[str] = (), listener: CanListener | None = None, **changes: Any
-) -> Dut:
-    """Open a device by name: connected, configured and ready to start. Use it in a ``with`` statement.
-
-    :param name: ``host``, ``inproc[:LIBRARY]``, ``qemu-m4[:ELF]``, ``serial:URL``, ``can:INTERFACE/CHANNEL``, a shipped
-        name or a .toml file; ``?key=value`` appended to a name overrides fields of the description.
-    :param allow: libraries, firmware, ports and buses that a file may name (``analogrig.trust``).
-    :param listener: receives every frame of a CAN bus from its opening on.
-    :param changes: override fields of the description; None leaves a field as described.
-    :raises ConfigurationError: no such device, its description is wrong, or a file names what is not allowed.
-    :raises LinkError: the device cannot be reached.
-    :raises DeviceError: it refuses the configuration, or was built from another catalogue.
-    """
-    return connect(_override(trusted(name, Trust.of(allow)), changes), listener)
-
-
-def reopen_dut(
-    description: Mapping[str, Any],
-    file: str,
-    *,
-    allow: Trust | Iterable[str] = (),
-    listener: CanListener | None = None,
-    **changes: Any,
-) -> Dut:
-    """Open the device of a record of ``Dut.description()`` in ``file``; parameters and errors as ``open_dut``."""
-    described = recorded(description).placed(Path(file).parent)
-    Trust.of(allow).check(described.things, file)
-    return connect(_override(described, changes), listener)
-
-
-def _override(description: DeviceDescription, changes: Mapping[str, Any]) -> DeviceDescription:
-    """:raises ConfigurationError: a value is out of range, or this kind of device has no such field."""
-    wanted = {key: value for key, value in changes.items() if value is not None}
-    for key in wanted.keys() - {each.name for each in dataclasses.fields(description)}:
-        raise ConfigurationError(f"device {description.name}: a device of the kind {description.kind} has no {key}")
-    try:
-        return dataclasses.replace(description, **wanted)
-    except ValueError as error:
-        raise ConfigurationError(f"device {description.name}: {error}") from error
-
-
-def connect(description: DeviceDescription, listener: CanListener | None = None) -> Dut:
-    """Open, identify and configure a device; errors as ``open_dut``."""
-    files = description.files()
-    link = description.open()
-    if listener is not None:
-        link.listen(listener)
-    dut = Dut(link, description)
-    try:
-        _check_files(dut, files)
-        dut.handshake()
-        dut.configure()
-    except BaseException:
-        dut.close()
-        raise
-    return dut
-
-
-def _check_files(dut: Dut, before: tuple[DeviceFile, ...]) -> None:
-    """:raises DeviceError: a file of the device is not the one before it was opened."""
-    if dut.files() != before:
-        raise DeviceError(f"device {dut.name}: its file was replaced while it was loaded: start again")
+        return self._exchange.play(blocks)
 
 
 def _word(kind: type[enum.IntEnum], value: int) -> str:

@@ -1,0 +1,219 @@
+"""Descriptions of devices that exchange our catalogue's messages: common fields, and the two families of links."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
+
+from analogrig.datasheet import Datasheet
+from analogrig.devices.description import Capability, DeviceDescription
+from analogrig.devices.device import Device
+from analogrig.devices.library import LIBRARY
+from analogrig.errors import ConfigurationError
+from analogrig.estimator_config import EstimatorConfig
+from analogrig.links.line import CanLine, SerialLine
+from analogrig.links.link import FramedLink, Link
+from analogrig.links.wire import Wire
+from analogrig.links.wire_faults import FaultyWire, WireFaults
+
+if TYPE_CHECKING:  # importing python-can takes longer than all other imports together
+    from analogrig.links.can_bus import CanBus
+
+MOST_BAUD = 100_000_000
+MOST_BITRATE = 20_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class CatalogueDescription(DeviceDescription):
+    """Description of a device with our estimator's settings, behind a link that carries our catalogue's messages."""
+
+    starting_s: ClassVar[float] = 0.0
+    """Longest start-up time, added to the time-out of the handshake."""
+    is_in_process: ClassVar[bool] = False
+    """True if the device runs in this process, on a virtual clock: time-outs cost nothing, a crash ends the process."""
+    exchange: Literal["sample", "block", "stream"] = "sample"
+    """Samples go one at a time, in blocks, or in blocks without waiting for the answers to earlier ones. The answers
+    are the same. A line of 8-byte messages carries single samples even for ``stream``."""
+    window: int = 255
+    """For ``stream``: the largest number of unanswered sample messages, if the device can buffer them."""
+    report_interval_n: int = 1
+    """Samples between two reports of the estimate. Alarms are always reported."""
+    wire_faults: str = ""
+    """Faults of the line, in the notation of ``WireFaults.parse``."""
+    estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, most in (("window", 255), ("report_interval_n", 65535)):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} must be 1 to {most}, not {getattr(self, name)}")
+        try:
+            self.faults()
+        except ConfigurationError as error:
+            raise ValueError(str(error)) from error
+
+    @property
+    def capabilities(self) -> frozenset[Capability]:
+        always: frozenset[Capability] = frozenset({"configure", "faults", "identify", "pace"})
+        in_process: frozenset[Capability] = frozenset({"in-process"} if self.is_in_process else ())
+        blocks: frozenset[Capability] = frozenset({"blocks", "snapshot"} if self.can_run_in_blocks else ())
+        return always | in_process | blocks
+
+    def known_datasheet(self) -> Datasheet:
+        return Datasheet.of_estimator(self.estimator.as_table())
+
+    def open(self) -> Device:
+        from analogrig.devices.catalogue_device import CatalogueDevice
+
+        return CatalogueDevice(self.open_link(), self)
+
+    def direct(self, *, alarms_only: bool = False) -> Device:
+        from analogrig.devices.direct import DirectDevice
+
+        return DirectDevice(self, alarms_only=alarms_only)
+
+    @abstractmethod
+    def open_link(self) -> Link:
+        """Start the device, or connect to it.
+
+        :raises LinkError: it cannot be reached.
+        """
+
+    @abstractmethod
+    def fault_kinds(self) -> Collection[str]:
+        """Kinds of faults that its line can have."""
+
+    def faults(self) -> WireFaults | None:
+        """Faults of its line; None if there are none.
+
+        :raises ConfigurationError: the line has no such faults.
+        """
+        return WireFaults.parse(self.wire_faults, self.fault_kinds()) if self.wire_faults else None
+
+    def hint(self, link_name: str) -> str:  # noqa: ARG002
+        """Advice for a device that does not answer on the link of that name; may be empty."""
+        return ""
+
+    @property
+    def estimator_library(self) -> Path:
+        """Shared library with the device's estimator, to be run in this process."""
+        return LIBRARY
+
+    @property
+    def can_run_in_blocks(self) -> bool:
+        """True if ``estimator_library``, given whole blocks, yields what the device answers sample by sample."""
+        return False
+
+    def as_table(self) -> dict[str, Any]:
+        return super().as_table() | {"estimator": self.estimator.as_table()}
+
+
+def has_faults(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
+    """True if faults can be injected into the device's line."""
+    return "faults" in description.capabilities
+
+
+def has_snapshots(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
+    """True if the state of the device's estimator can be saved and restored."""
+    return "snapshot" in description.capabilities
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByteDevice(CatalogueDescription):
+    """A device behind a line of bytes."""
+
+    baud: int | None = None
+    """Baud rate of the line [bit/s]. If there is no real line, the run reports the time that this one would take."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.baud is not None and not 0 < self.baud <= MOST_BAUD:
+            raise ValueError(f"baud must be 1 to {MOST_BAUD}, not {self.baud}")
+
+    def open_link(self) -> Link:
+        faults = self.faults()
+        line = None if self.baud is None else SerialLine(self.baud)
+        return FramedLink(self.wire() if faults is None else FaultyWire(self.wire, faults), line)
+
+    def wire(self) -> Wire:
+        """Wire to the started device; errors as ``open_link``."""
+        raise NotImplementedError
+
+    def fault_kinds(self) -> Collection[str]:
+        return FaultyWire.KINDS
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameDevice(CatalogueDescription):
+    """A device on a CAN bus."""
+
+    bitrate: int | None = None
+    """Bit rate of the bus [bit/s]. If there is no real bus, the run reports the time that this one would take."""
+    data_bitrate: int | None = None
+    """Bit rate of the data phase of CAN FD [bit/s]; None if it is ``bitrate``."""
+    fd: bool = False
+    """True if bus and device support CAN FD, whose frames carry a block of samples."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("bitrate", "data_bitrate"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= MOST_BITRATE:
+                raise ValueError(f"{name} must be 1 to {MOST_BITRATE}, not {value}")
+        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
+            raise ValueError("data_bitrate is for CAN FD: set fd = true and bitrate as well")
+
+    def open_link(self) -> Link:
+        from analogrig.links.can_link import CanLink
+        from analogrig.links.faulty_bus import FaultyBus
+
+        faults = self.faults()
+        return CanLink(self.bus() if faults is None else FaultyBus(self.bus, faults))
+
+    def bus(self) -> CanBus:
+        """Bus with the started device; errors as ``open_link``."""
+        raise NotImplementedError
+
+    def line(self) -> CanLine | None:
+        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
+
+    def fault_kinds(self) -> Collection[str]:
+        from analogrig.links.faulty_bus import FaultyBus
+
+        return FaultyBus.KINDS
+
+
+@dataclass(frozen=True, kw_only=True)
+class EitherDevice(ByteDevice, FrameDevice):
+    """A device on this machine, behind bytes or CAN frames. ``link`` selects one; each kind carries CAN in its way."""
+
+    CAN: ClassVar[str] = "slcan"
+    link: str = "serial"
+
+    def __post_init__(self) -> None:
+        if self.link not in {"serial", self.CAN}:
+            raise ValueError(f"link must be 'serial' or {self.CAN!r}, not {self.link!r}")
+        super().__post_init__()
+        if self.is_serial and (self.fd or self.bitrate is not None):
+            raise ValueError(f"bitrate and fd are for a CAN bus: set link = {self.CAN!r}")
+        if not self.is_serial and self.baud is not None:
+            raise ValueError(f"baud is for a serial line, and link is {self.link!r}: set bitrate")
+
+    @property
+    def is_serial(self) -> bool:
+        return self.link == "serial"
+
+    def open_link(self) -> Link:
+        return ByteDevice.open_link(self) if self.is_serial else FrameDevice.open_link(self)
+
+    def fault_kinds(self) -> Collection[str]:
+        return ByteDevice.fault_kinds(self) if self.is_serial else FrameDevice.fault_kinds(self)
+
+    def slcan(self, port: str) -> dict[str, Any]:
+        """Configuration of python-can for slcan on a terminal. The devices there need no time after opening."""
+        rates = {"bitrate": self.bitrate, "data_bitrate": self.data_bitrate}
+        known = {key: value for key, value in rates.items() if value is not None}
+        return {"interface": "slcan", "channel": port, "fd": self.fd, "sleep_after_open": 0.0, **known}
