@@ -24,7 +24,8 @@ _MOST_SAMPLES = 2**31
 class ModelOrders:
     """Orders of the model whose parameters theta holds.
 
-    The model is y(k) = -a1 y(k-1) - ... + b0 u(k-nk) + b1 u(k-nk-1) + ... + offset; theta is a1 .. a_na, b0 .. b_(nb-1), c1 .. c_nc, offset, for u and y in codes (thesis, equation 4.1).
+    The model is y(k) = -a1 y(k-1) - ... + b0 u(k-nk) + b1 u(k-nk-1) + ... + offset, for u and y in codes. theta is
+    a1 .. a_na, b0 .. b_(nb-1), c1 .. c_nc, offset (estimator_c/core/est.h).
     """
 
     na: int

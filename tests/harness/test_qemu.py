@@ -27,6 +27,7 @@ from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTime
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
+from tests.harness.fed import catalogue
 from tests.harness.firmware import CORES, FOLDER, needs_firmware
 from tests.harness.processes import LONG_S, descendants
 
@@ -141,12 +142,12 @@ def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
     """A busy machine; here it is stopped for longer than the time-out of any answer."""
     before = set(descendants(os.getpid()))
     description = QemuM4(name="bob", timeout_s=TIMEOUT_S)
-    link = description.open()
+    opened = description.open()
     pid = new_qemu(before)
     os.kill(pid, signal.SIGSTOP)
     timer = threading.Timer(2.0 * TIMEOUT_S, os.kill, (pid, signal.SIGCONT))
     timer.start()
-    with catalogue(device) as dut:
+    with catalogue(opened) as dut:
         assert dut.recover().firmware == "QEMU_M4"
     timer.join()
 

@@ -43,7 +43,7 @@ class Device(ABC):
 
     def description(self) -> Mapping[str, Any]:
         """Description in plain values, for the record; the device can be opened from it again (``recorded``)."""
-        return self._description.as_table()
+        return {**self._description.as_table(), "datasheet": self.datasheet.as_table()}
 
     def files(self) -> tuple[DeviceFile, ...]:
         """Library, program or firmware that the device runs on this machine, if any, as it was when it was loaded."""
