@@ -135,7 +135,7 @@ def test_qemu_that_is_killed_is_told_with_its_status(started: tuple[Device, int]
     dut, pid = started
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(LinkClosed, match=r"^device bob: QEMU \(mps2-an386\) ended with status -9"):
-        dut.status()
+        catalogue(dut).status()
 
 
 def test_qemu_that_takes_its_time_to_start_is_waited_for() -> None:
@@ -156,7 +156,7 @@ def test_qemu_that_hangs_is_told_and_ended(started: tuple[Device, int]) -> None:
     dut, pid = started
     os.kill(pid, signal.SIGSTOP)
     with pytest.raises(LinkTimeout, match="^device bob: no .* within 2 s"):
-        dut.status()
+        catalogue(dut).status()
 
 
 def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> None:
