@@ -111,14 +111,14 @@ class CatalogueDescription(DeviceDescription):
         return super().as_table() | {"estimator": self.estimator.as_table()}
 
 
-def has_faults(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
-    """True if faults can be injected into the device's line."""
-    return "faults" in description.capabilities
+def has_our_estimator(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
+    """True if the device has the settings of ``EstimatorConfig``."""
+    return hasattr(description, "estimator")
 
 
 def has_snapshots(description: DeviceDescription) -> TypeGuard[CatalogueDescription]:
     """True if the state of the device's estimator can be saved and restored."""
-    return "snapshot" in description.capabilities
+    return has_our_estimator(description) and "snapshot" in description.capabilities
 
 
 @dataclass(frozen=True, kw_only=True)

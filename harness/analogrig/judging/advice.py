@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import Verdict
+from analogrig.judging.verdict import ESTIMATES, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -142,7 +142,7 @@ def _undetectable_changes(verdict: Verdict) -> Iterator[str]:
 
 
 def _implausible_estimates(verdict: Verdict) -> Iterator[str]:
-    if "estimates" in verdict.not_judged or "parameters" in verdict.not_judged:
+    if ESTIMATES in verdict.not_judged:
         return
     for segment in verdict.estimates:
         if segment.estimate is None:

@@ -42,6 +42,9 @@ Result = Literal["detected", "late", "missed", "unseeable", "undecided", "not ju
 """Result of one change. ``unseeable``: too little information to be detected. ``undecided``: the result depends on the
 instant, which is known only as an interval. ``not judged``: the change was not found in the samples."""
 
+ESTIMATES, STATISTIC, DIAGNOSES = "estimates of M, B, K", "the trigger's statistic", "diagnoses"
+"""Quantities in ``Verdict.not_judged`` that reports show elsewhere."""
+
 DIAGNOSABLE = {Change.MASS: "M", Change.DAMPING: "B", Change.STIFFNESS: "K", Change.SEVERAL: "several"}
 """Changes that a device can diagnose, with their names in verdicts."""
 
@@ -234,19 +237,19 @@ def judge(run: Run) -> Verdict:
         missing_n=int(np.count_nonzero(run.missing)),
         theta_hash=run.theta_hash(),
         alarm_hash=run.alarm_hash(),
-        not_judged=_unreported(sheet),
+        not_judged=unreported(sheet),
         cannot_tell=sheet.cannot_tell,
         overloads=dict(run.conditions.overloads),
     )
 
 
-def _unreported(sheet: Datasheet) -> tuple[str, ...]:
+def unreported(sheet: Datasheet) -> tuple[str, ...]:
     """Quantities that the device does not report."""
     reported = {
-        "parameters" if sheet.theta_n else "estimates": sheet.theta_n > 0 and sheet.model is not None,
+        ESTIMATES: sheet.theta_n > 0 and sheet.model is not None,
         "innovations": sheet.innovation,
-        "the trigger's statistic": sheet.statistic,
-        "diagnoses": sheet.diagnoses,
+        STATISTIC: sheet.statistic,
+        DIAGNOSES: sheet.diagnoses,
     }
     return tuple(name for name, is_reported in reported.items() if not is_reported)
 

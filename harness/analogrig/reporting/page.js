@@ -222,10 +222,12 @@
       pair(signals, ink, "Force on the suspension and its displacement", "force", "displacement"),
       ...(signals.velocity && signals.net_force
         ? [pair(signals, ink, "Velocity and net force", "velocity", "net_force")] : []),
-      estimate(signals, ink, "M", "Mass: estimate and truth", "kg"),
-      estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
-      estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
-      statistic(signals, ink),
+      ...(signals.M ? [ // otherwise the device reports no estimates
+        estimate(signals, ink, "M", "Mass: estimate and truth", "kg"),
+        estimate(signals, ink, "B", "Damping: estimate and truth", "N s/m"),
+        estimate(signals, ink, "K", "Stiffness: estimate and truth", "N/m"),
+      ] : []),
+      ...(signals.statistic ? [statistic(signals, ink)] : []),
     ].map((plot) => ({
       ...plot,
       place: document.getElementById("plots"),

@@ -225,13 +225,17 @@ def _points(run: Run, part: slice, size: int, measured: Sequence[int]) -> dict[s
     shown = condense(codes, size)
     bits = np.packbits(condense_clipping(codes, clipped, size), axis=1, bitorder="little")[:, 0]
     missing = missing_samples(run.clipped[part]).astype(np.uint8)
-    estimates = condense(trajectory(run, part).astype(np.float32), size)
+    reported: dict[str, NDArray[Any]] = {}
+    if run.datasheet.model is not None:
+        estimates = condense(trajectory(run, part).astype(np.float32), size)
+        reported |= {name: estimates[:, i] for i, name in enumerate(PARAMETERS)}
+    if run.datasheet.statistic:
+        reported["statistic"] = condense(run.statistic[part], size)
     return {
         **{CHANNELS[channel]: shown[:, i] for i, channel in enumerate(measured)},
         "clipped": bits,
         "missing": np.repeat(condense(missing, size)[1::2], 2) if size > 1 else missing,
-        **{name: estimates[:, i] for i, name in enumerate(PARAMETERS)},
-        "statistic": condense(run.statistic[part], size),
+        **reported,
     }
 
 

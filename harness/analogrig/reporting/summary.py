@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
+from analogrig.judging.verdict import (
+    ESTIMATES,
+    ChangeVerdict,
+    DiagnosisVerdict,
+    SegmentEstimate,
+    Verdict,
+    missing_text,
+)
 from analogrig.plant import UNITS
 from analogrig.protocol.bus_load import BusLoad, load_of
 from analogrig.run import Run
@@ -43,9 +50,11 @@ def summary(run: Run, verdict: Verdict) -> str:
         "bus": load and load_text(load),
     }
     lines += ["", *(f"  {name}: {text}" for name, text in facts.items() if text)]
-    lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
-    lines += [_segment_line(segment) for segment in verdict.estimates]
-    lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  theta hash {verdict.theta_hash}"]
+    if ESTIMATES not in verdict.not_judged:
+        lines += ["", "  samples        M [kg]  true M       B [N s/m]  true B       K [N/m]  true K"]
+        lines += [_segment_line(segment) for segment in verdict.estimates]
+    digest = f"theta hash {verdict.theta_hash}" if verdict.theta_hash else f"alarm hash {verdict.alarm_hash}"
+    lines += ["", *(f"  note: {sentence}" for sentence in advice(run, verdict)), f"  {digest}"]
     return "\n".join(lines)
 
 

@@ -7,7 +7,16 @@ from typing import Any
 
 from analogrig.identity import Identity
 from analogrig.judging.advice import advice
-from analogrig.judging.verdict import ChangeVerdict, DiagnosisVerdict, SegmentEstimate, Verdict, missing_text
+from analogrig.judging.verdict import (
+    DIAGNOSES,
+    ESTIMATES,
+    STATISTIC,
+    ChangeVerdict,
+    DiagnosisVerdict,
+    SegmentEstimate,
+    Verdict,
+    missing_text,
+)
 from analogrig.plant import PARAMETERS, UNITS
 from analogrig.protocol.bus_load import load_of
 from analogrig.reporting.markup import cell, heading, number, pairs, row, table, text
@@ -62,7 +71,8 @@ def conditions(run: Run, verdict: Verdict) -> str:
         ("Seed", context.seed),
         ("Samples", _samples(run, verdict)),
         ("Overload lamps", lamps_text(verdict.overloads)),
-        ("Theta hash", verdict.theta_hash),
+        ("Theta hash", verdict.theta_hash or "none: the device reports no estimates"),
+        ("Alarm hash", verdict.alarm_hash),
         *provenance(context.identity),
     ]
     return pairs("Scenario, rig and device", rows)
@@ -96,6 +106,8 @@ def tweaks(verdict: Verdict) -> str:
 def diagnoses(verdict: Verdict) -> str:
     """Table of the diagnoses, compared with the truth."""
     reported = [(tweak, tweak.diagnosis) for tweak in verdict.tweaks if tweak.diagnosis is not None]
+    if DIAGNOSES in verdict.not_judged:
+        return "<p>Not judged: the device does not report diagnoses.</p>"
     if not reported:
         return "<p>The device reported no diagnosis.</p>"
     caption = "Diagnoses of the device; delay and isolation bound in samples from the change"
@@ -117,12 +129,16 @@ def false_alarms(run: Run, verdict: Verdict) -> str:
     caption = f"{count:,} in {number_of(run.samples, 'sample', form=',')}" + (
         f"; the first {len(shown)} are listed" if count > len(shown) else ""
     )
+    if STATISTIC in verdict.not_judged:
+        return table(caption, heading(("Sample",)), (row([_zoom(index)]) for index in shown))
     rows = (row([_zoom(index), number(statistics.get(index))]) for index in shown)
     return table(caption, heading(("Sample",), ("Statistic",)), rows)
 
 
 def estimates(verdict: Verdict) -> str:
     """Table of M, B and K at the end of each segment, compared with the truth."""
+    if ESTIMATES in verdict.not_judged:
+        return "<p>Not judged: the device does not report estimates of them.</p>"
     if not verdict.estimates:
         return "<p>The rig does not know the truth about its plant.</p>"
     groups = [f'<th scope="colgroup" colspan="3">{name} [{text(UNITS[name])}]</th>' for name in PARAMETERS]

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from analogrig.judging.exposure import exposure
 from analogrig.judging.statistics import Design, upper_rate
-from analogrig.judging.verdict import ChangeVerdict, Verdict, judge
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, ChangeVerdict, Verdict, judge
 from analogrig.run import Run
 from analogrig.scenario import Statement
 from analogrig.testing.statement import Arguments, Finding, register, statement_of
@@ -109,6 +109,8 @@ class Played:
     @_statement
     def isolates(self) -> Finding:
         """Finding: every parameter diagnosed as changed has changed. A missing diagnosis is allowed."""
+        if DIAGNOSES in self.verdict.not_judged:
+            return Finding(holds=False, why="not judged: the device does not report diagnoses")
         judged = [tweak for tweak in self.verdict.tweaks if not tweak.unseen]
         said = [(tweak, tweak.diagnosis) for tweak in judged if tweak.diagnosis is not None]
         wrong = [f"{tweak.what} at {tweak.sample} was called {diagnosis.named}" for tweak, diagnosis in said
@@ -120,6 +122,8 @@ class Played:
     @_statement
     def estimates(self, within: float) -> Finding:
         """Finding: M, B and K at the end of every stretch have a relative error of at most ``within``."""
+        if ESTIMATES in self.verdict.not_judged:
+            return Finding(holds=False, why="not judged: the device does not report estimates of M, B, K")
         off = []
         for segment in self.verdict.estimates:
             if segment.estimate is None:

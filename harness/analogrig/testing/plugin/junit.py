@@ -49,6 +49,8 @@ def play_properties(played: Played) -> Iterator[tuple[str, Any]]:
     yield "commit", _commit()
     yield "outcome", verdict.outcome
     yield "theta_hash", verdict.theta_hash
+    yield "alarm_hash", verdict.alarm_hash
+    yield "not_judged", ", ".join(verdict.not_judged)
     yield "latency_n", " ".join(map(latency_property, verdict.tweaks))
     yield "bound_n", " ".join(str(tweak.bound_n) for tweak in verdict.tweaks)
     yield "false_alarms", len(verdict.false_alarms)

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from analogrig.bench import Bench, can_be_direct, direct_bench, raise_if_interrupted
 from analogrig.campaigns.rare import false_alarm_rate
-from analogrig.devices.catalogue_description import CatalogueDescription, has_faults, has_snapshots
+from analogrig.devices.catalogue_description import CatalogueDescription, has_our_estimator, has_snapshots
 from analogrig.devices.description import DeviceDescription
 from analogrig.devices.device import Device
 from analogrig.devices.registry import recorded
 from analogrig.errors import AnalogrigError, ConfigurationError
 from analogrig.judging.exposure import Exposure, exposure
 from analogrig.judging.statistics import Decision, SequentialTest, lower_rate, mean_bounds
-from analogrig.judging.verdict import judge
+from analogrig.judging.verdict import judge, unreported
 from analogrig.rigs.emulator import EmulatorRig
 from analogrig.rigs.recording import RecordingRig
 from analogrig.rigs.rig import Rig
@@ -54,6 +54,12 @@ _EVER = 1e9
 def device_description(dut: Device) -> DeviceDescription:
     """Description of the device in its present configuration."""
     return recorded(dut.description())
+
+
+def needs_reported(play: Play, quantity: str) -> None:
+    """Skip the test if the device does not report ``quantity``, one of ``analogrig.judging.verdict``."""
+    if quantity in unreported(play.bench.dut.datasheet):
+        pytest.skip(f"needs {quantity}, which {play.bench.dut.name} does not report")
 
 
 def is_playable(rig: Rig, scenario: Scenario) -> bool:
@@ -357,15 +363,15 @@ def alarms_keep_hold_off_and_warm_up(
 def _configure(play: Play, **settings: Any) -> None:
     """Configure the device until the next test."""
     dut = play.bench.dut
-    if "configure" not in device_description(dut).capabilities:
-        pytest.skip(f"needs a device with settings, and {dut.name} has none")
+    if not has_our_estimator(device_description(dut)):
+        pytest.skip(f"needs a device with the settings of EstimatorConfig, not {dut.name}")
     dut.configure(**settings)
 
 
-def _fast_device(play: Play) -> CatalogueDescription:
+def device_with_faults(play: Play) -> CatalogueDescription:
     """Description of the device, if faults on its line cost little time; else the test is skipped."""
     device = device_description(play.bench.dut)
-    if not has_faults(device):
+    if not has_our_estimator(device):
         pytest.skip(f"needs a device with faults on its line, not {device.name}")
     if "in-process" not in device.capabilities and device.timeout_s > LONGEST_TIMEOUT_S:
         pytest.skip(f"time-outs of {device.timeout_s:g} s take their time: --hil-dut inproc, or ?timeout_s=0.5")
@@ -375,7 +381,7 @@ def _fast_device(play: Play) -> CatalogueDescription:
 @experiment
 def faults_of_the_line_do_no_harm(play: Play, scenario: Scenario, seed: int, faults: str) -> Finding:
     """Finding: line faults leave the estimate unchanged, or the run is INCONCLUSIVE, or refused with the cause."""
-    bench, device = play.bench, _fast_device(play)
+    bench, device = play.bench, device_with_faults(play)
     with contextlib.ExitStack() as stack:
         if device.wire_faults:  # those with which it failed, when this is judged again
             play = play.on(bench.rig, stack.enter_context(dataclasses.replace(device, wire_faults="").connect()))
@@ -401,7 +407,7 @@ def faults_among_the_samples_cost_no_more_than_samples(
     The result equals, to the bit, a run in which the lost samples were declared missing. ``each`` faults of each
     passing kind are tried. ``least_valid`` of the kinds must leave a valid run.
     """
-    device = dataclasses.replace(_fast_device(play), wire_faults="")
+    device = dataclasses.replace(device_with_faults(play), wire_faults="")
     kinds = sorted(PASSING.intersection(device.fault_kinds()))
     valid: set[str] = set()
     with device.connect() as alone:

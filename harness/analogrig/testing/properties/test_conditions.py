@@ -12,7 +12,7 @@ from analogrig.judging.statistics import Design
 from analogrig.scenario import PlantChoice, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties.experiments import (
-    device_description,
+    device_with_faults,
     false_alarms_at_most,
     false_alarms_of_plants_rarer,
     faults_among_the_samples_cost_no_more_than_samples,
@@ -57,7 +57,7 @@ def test_samples_that_are_missing_are_no_change(hil_play: Play, seed: int) -> No
 def test_faults_of_the_line_leave_the_estimate_or_the_run_is_inconclusive(
     hil_play: Play, drawn: st.DataObject, seed: int
 ) -> None:
-    faults = drawn.draw(link_faults(sorted(device_description(hil_play.bench.dut).fault_kinds())), "faults of the line")
+    faults = drawn.draw(link_faults(sorted(device_with_faults(hil_play).fault_kinds())), "faults of the line")
     assert faults_of_the_line_do_no_harm(hil_play, SHORT, seed, faults)
 
 

@@ -12,12 +12,14 @@ import pytest
 from hypothesis import assume, given
 
 from analogrig.judging.information import detectable
+from analogrig.judging.verdict import DIAGNOSES
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Expectations, PotChange, Scenario
 from analogrig.testing.played import Played
 from analogrig.testing.properties.experiments import (
     changes_are_noticed_soon_and_rightly_named,
     is_playable,
+    needs_reported,
     single_changes_are_rightly_named,
 )
 from analogrig.testing.statement import Play, with_some_seed
@@ -100,6 +102,7 @@ def test_changes_are_noticed_soon_and_rightly_named(hil_play: Play) -> None:
 
 @pytest.mark.hil_needs("tweak", "excite")
 def test_a_single_change_is_rightly_named(hil_play: Play) -> None:
+    needs_reported(hil_play, DIAGNOSES)
     assert single_changes_are_rightly_named(
         hil_play,
         SINGLY,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import assume, given
 
+from analogrig.judging.verdict import ESTIMATES
 from analogrig.rigs.emulator import EmulatorDescription, EmulatorRig
 from analogrig.rigs.rig import Rig
 from analogrig.scenario import Scenario
@@ -13,6 +14,7 @@ from analogrig.testing.properties.experiments import (
     alarms_keep_hold_off_and_warm_up,
     answers_with_numbers,
     is_playable,
+    needs_reported,
     pause_does_no_harm,
 )
 from analogrig.testing.statement import Finding, Play, with_some_seed
@@ -42,6 +44,7 @@ def estimates(played: Played) -> Finding:
 @profile()
 @given(scenario=scenarios(most_changes=0), seed=seeds())
 def test_estimates_come_to_the_truth(hil_rig: Rig, hil_play: Play, scenario: Scenario, seed: int) -> None:
+    needs_reported(hil_play, ESTIMATES)
     assume(is_playable(hil_rig, scenario))
     assert with_some_seed(hil_play, scenario, seed, estimates)
 
