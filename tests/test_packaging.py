@@ -1,4 +1,4 @@
-"""What a user gets: a complete sdist, and a wheel that works in an empty environment, far from this checkout."""
+"""Packages for users: a complete sdist, and a wheel that works in an empty environment, far from this checkout."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_help_starts_at_once(environment: Path) -> None:
 
 
 def _processor_s(*command: str | Path) -> float:
-    """What a command takes of the processor: on a busy machine it takes longer, but no more."""
+    """Processor time of a command [s], which a busy machine does not increase."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     run(*command)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -160,7 +160,7 @@ def wanted() -> list[str]:
 
 
 def not_installed(packages: Iterable[str]) -> list[str]:
-    """Those that dpkg does not have."""
+    """Packages that dpkg does not have."""
     status = "--showformat=${db:Status-Status}"
     return [name for name in packages if _output("dpkg-query", "--show", status, name) != "installed"]
 

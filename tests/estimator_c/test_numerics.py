@@ -79,7 +79,7 @@ class WideFactors:
 
 
 class Wide(NamedTuple):
-    """What exact arithmetic makes of a record."""
+    """Result of exact arithmetic on a record."""
 
     theta: Extended
     """(n, p) after each sample."""
@@ -189,7 +189,7 @@ def test_prediction_at_any_order_and_scale_is_that_of_extended_precision(
 
 
 def test_a_c_is_taken_iff_its_zeros_are_inside_the_unit_circle(estimator: Estimator) -> None:
-    """Those closer to the circle than 0.02 are left out: double zeros there would filter the data into overflow."""
+    """Omit zeros closer to the circle than 0.02: double zeros there would filter the data into overflow."""
     for c1 in np.linspace(-2.3, 2.3, 47):
         for c2 in np.linspace(-1.2, 1.2, 25):
             radius = np.abs(np.roots([1.0, c1, c2])).max()
