@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from analogrig_thesis.double_precision import PlainEstimator
-from analogrig_thesis.models import ERROR, MEAN, PLAIN, Samples, Track, schemes, settling_n, square
+from analogrig_thesis.models import ERROR, MEAN, PLAIN, Track, schemes, settling_n, square
 from analogrig_thesis.texts import Chapter, Drawing, Facts, Mark, Signal, load_chapter
 
 N = 800
@@ -57,10 +57,10 @@ def reproduce_chapter() -> Chapter:
     """Figures, errata and claims of chapter 3; deterministic."""
     u, _, _, y = simulate_example().values()
     noise = np.random.default_rng(SEED).normal(0.0, NOISE, N)
-    first = Samples(u, respond(u, STEADY)).track(PLAIN_3)
+    first = SignalPair(u, respond(u, STEADY)).track(PLAIN_3)
     clean, noisy = (
         {key: samples.track(config) for key, config in SCHEMES.items()}
-        for samples in (Samples(u, y), Samples(u, respond(u, CHANGING, noise)))
+        for samples in (SignalPair(u, y), SignalPair(u, respond(u, CHANGING, noise)))
     )
     facts = {"clean": _qualities(clean), "noisy": _qualities(noisy)}
     spread = facts["noisy"]["spread"]
@@ -132,7 +132,7 @@ def _measure_convergence(facts: Facts, clean: Mapping[str, Track], first: Track,
             "reconverged_n": reconverged_n[ERROR],
             "spread_with_noise": noisy_spread[ERROR],
             "alarms": len(clean[ERROR].alarms),
-            "alarms_without_hold_off": len(Samples(u, respond(u, CHANGING)).track(eager).alarms),
+            "alarms_without_hold_off": len(SignalPair(u, respond(u, CHANGING)).track(eager).alarms),
         },
     }
 
@@ -141,10 +141,10 @@ def _measure_filters(u: Signal, noise: Signal) -> dict[str, Facts]:
     """Values behind the claims about the wind-up of P and the Kalman filter, by identifier."""
     silent, config = u.copy(), SCHEMES["forgetting"]
     silent[SILENT] = 0.0
-    errors = Samples(silent, respond(silent, STEADY, noise)).track(config).theta / STEADY - 1.0
+    errors = SignalPair(silent, respond(silent, STEADY, noise)).track(config).theta / STEADY - 1.0
     p = PlainEstimator(config).run(silent, respond(silent, STEADY))[1][:, 0]
     late = errors[300:600]
-    samples = Samples(u, respond(u, STEADY, noise))
+    samples = SignalPair(u, respond(u, STEADY, noise))
     plain = samples.track(PLAIN_3).theta
     walks = {f"{walk:g}": samples.track(dataclasses.replace(PLAIN_3, random_walk=walk)).theta for walk in WALKS}
     return {

@@ -28,7 +28,7 @@ from analogrig_thesis.models import (
     UNITS_PER_M,
     WARM_UP_N,
     Arx,
-    Samples,
+    SignalPair,
     Track,
     TrackQuality,
     assess,
@@ -170,7 +170,7 @@ def _least_squares_with_prior(u: Signal, y_m: Signal, p0: float) -> Arx:
 
 def _track(config: EstimatorConfig, u: Signal, y_m: Signal, scale: float = UNITS_PER_M) -> Track:
     """Run an estimator over displacements in metres times ``scale``."""
-    return Samples(u, y_m * scale, 1.0 / scale).track(config)
+    return SignalPair(u, y_m * scale, 1.0 / scale).track(config)
 
 
 def _scheme(key: str, ceiling: float, **changes: Any) -> EstimatorConfig:
@@ -355,7 +355,7 @@ def _least_outlier(simulation: Simulation, key: str, at: int) -> float:
     while high > 1.001 * low:
         size = math.sqrt(low * high)
         spoiled = clean + size * (np.arange(len(u)) == at)
-        low, high = (low, size) if len(Samples(u, spoiled).track(SCHEMES[key]).alarms) else (size, high)
+        low, high = (low, size) if len(SignalPair(u, spoiled).track(SCHEMES[key]).alarms) else (size, high)
     return high
 
 
@@ -366,7 +366,7 @@ def _extra_alarms_by_noise(simulation: Simulation, key: str) -> dict[str, dict[s
         found = []
         for seed in NOISE_SEEDS if rms else (0,):
             y = simulation.y * UNITS_PER_M + np.random.default_rng(seed).normal(0.0, rms, PROFILE_N)
-            single = Samples(u, y, 1.0 / UNITS_PER_M).track(config)
+            single = SignalPair(u, y, 1.0 / UNITS_PER_M).track(config)
             double = dataclasses.replace(single, alarms=PlainEstimator(config).run(u, y)[0])
             found.append([assess(each, PROFILE).extra_alarms for each in (single, double)])
         extra[f"{rms:g}"] = np.mean(found, axis=0).tolist()

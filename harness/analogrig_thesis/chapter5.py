@@ -34,7 +34,7 @@ from analogrig_thesis.models import (
     SHOCK,
     UNITS_PER_M,
     Arx,
-    Samples,
+    SignalPair,
     Track,
     TrackQuality,
     assess,
@@ -118,12 +118,12 @@ Sweeps = Mapping[str, Mapping[str, Sweep]]
 """Sweeps by data and name of the trigger."""
 
 
-def samples_of(run: Run) -> Samples:
+def samples_of(run: Run) -> SignalPair:
     """Codes of a recorded run."""
     return _as_samples(run.codes, run.conditions.channels)
 
 
-def play_alone(rig_name: str, scenario: Scenario, seed: int) -> Samples:
+def play_alone(rig_name: str, scenario: Scenario, seed: int) -> SignalPair:
     """Play a scenario on a rig without a device.
 
     :raises RigError: the rig failed.
@@ -134,9 +134,9 @@ def play_alone(rig_name: str, scenario: Scenario, seed: int) -> Samples:
     return _as_samples(codes, performance.channels)
 
 
-def _as_samples(codes: NDArray[np.uint16], channels: Mapping[str, Channel]) -> Samples:
+def _as_samples(codes: NDArray[np.uint16], channels: Mapping[str, Channel]) -> SignalPair:
     u, y = codes[:, :2].T.astype(np.float64)
-    return Samples(u, y, channels["displacement"].lsb, channels["force"].lsb)
+    return SignalPair(u, y, channels["displacement"].lsb, channels["force"].lsb)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class TrackedRun:
         return self.run.conditions.segments
 
     @cached_property
-    def codes(self) -> Samples:
+    def codes(self) -> SignalPair:
         """Codes of the run."""
         return samples_of(self.run)
 
@@ -217,17 +217,17 @@ def _filter(signal: Signal, order: int, cutoff_hz: float) -> Signal:
     return np.asarray(lfilter(*butter(order, 2.0 * cutoff_hz * PERIOD_S), signal))
 
 
-def filter_live(samples: Samples, order: int) -> Samples:
+def filter_live(samples: SignalPair, order: int) -> SignalPair:
     """Samples after a causal Butterworth filter, as in a live estimator."""
     u, y = (_filter(each - each[0], order, LIVE_CUTOFF_HZ) + each[0] for each in (samples.u, samples.y))
     return dataclasses.replace(samples, u=u, y=y)
 
 
-def filter_off_line(run: Run, cutoff_hz: float = CUTOFFS_HZ[0]) -> Samples:
+def filter_off_line(run: Run, cutoff_hz: float = CUTOFFS_HZ[0]) -> SignalPair:
     """Newtons and units of 0.1 um, filtered by order 2 and without their means (section 4.3)."""
     signals = run.channel("force"), run.channel("displacement") * UNITS_PER_M
     u, y = (_filter(each - each.mean(), 2, cutoff_hz) for each in signals)
-    return Samples(u, y, 1.0 / UNITS_PER_M)
+    return SignalPair(u, y, 1.0 / UNITS_PER_M)
 
 
 def filtered_schemes(run: Run, cutoff_hz: float = CUTOFFS_HZ[0]) -> dict[str, Track]:
@@ -376,12 +376,12 @@ def _batch_estimates(run: Run) -> Signal:
     codes, out = samples_of(run), np.empty((run.samples, 4))
     for start, end, _ in run.segments:
         # The first equation with nothing but the new plant in it begins two samples later.
-        theta = Samples(codes.u[start + 1 : end], codes.y[start + 1 : end]).track(BATCH).theta[-1]
+        theta = SignalPair(codes.u[start + 1 : end], codes.y[start + 1 : end]).track(BATCH).theta[-1]
         out[start:end] = Arx.scaled(theta, codes.b_scale)
     return out
 
 
-def _sweep(samples: Samples, segments: Sequence[Segment], plain: EstimatorConfig, unit: float) -> dict[str, Sweep]:
+def _sweep(samples: SignalPair, segments: Sequence[Segment], plain: EstimatorConfig, unit: float) -> dict[str, Sweep]:
     """Sweep of each trigger, by its name; ``unit`` is the least significant bit in units of the samples."""
     out: dict[str, Sweep] = {}
     for name, (key, absolute) in TRIGGERS.items():

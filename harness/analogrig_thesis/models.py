@@ -241,7 +241,7 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class SignalPair:
     """Force ``u`` and displacement ``y`` (n,), in codes of the card or in any other units."""
 
     u: Signal

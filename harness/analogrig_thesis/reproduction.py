@@ -28,7 +28,7 @@ from analogrig_thesis.chapter5 import (
     play_alone,
     play_circuit,
 )
-from analogrig_thesis.models import OURS, PROFILE, Samples, TrackQuality, assess
+from analogrig_thesis.models import OURS, PROFILE, TrackQuality, assess
 from analogrig_thesis.rendering import render
 from analogrig_thesis.texts import Chapter, Signal, Table
 
@@ -113,7 +113,7 @@ def compare(simulation: Simulation, circuit: CircuitRuns) -> Table:
     tests/thesis/cost.py.
     """
     noisy = circuit.noisy
-    ours = Samples(simulation.u, simulation.y * CODES_PER_M, 1.0 / CODES_PER_M).track(EstimatorConfig())
+    ours = SignalPair(simulation.u, simulation.y * CODES_PER_M, 1.0 / CODES_PER_M).track(EstimatorConfig())
     filtered = {key: assess(each, noisy.segments) for key, each in filtered_schemes(noisy.run).items()}
     del filtered["mean-of-magnitudes"]
     played: dict[str, list[TrackQuality]] = {}

@@ -26,7 +26,7 @@ _REMEMBERED = 64
 
 
 @dataclass(frozen=True)
-class Datasheet:
+class InstrumentDatasheet:
     """Properties that all instruments of a kind share, known without a connection."""
 
     rate_hz: float
@@ -126,7 +126,7 @@ class InputRecord:
 class Instrument(ABC):
     """Base class of the drivers. All methods may raise RigError, which names the instrument and what failed."""
 
-    datasheet: ClassVar[Datasheet]
+    datasheet: ClassVar[InstrumentDatasheet]
     name: str
     """Name for error messages."""
     pots: PotBox | None = None

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RigClosed, RigRefused, RigTimeout
-from analogrig.hardware.instrument import Datasheet, InputRecord, Instrument
+from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
 
 RATE_HZ = 20e3
@@ -35,7 +35,7 @@ invalid, inaccessible, not present."""
 class NiDaqmx(Instrument):
     """Card that takes each record as one finite task; it has no pots."""
 
-    datasheet = Datasheet(
+    datasheet = InstrumentDatasheet(
         rate_hz=RATE_HZ,
         record_n=100_000,
         bits=16,

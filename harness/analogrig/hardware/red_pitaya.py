@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analogrig.errors import ConfigurationError, RecordIncomplete, RecordStale, RigRefused, RigTimeout
-from analogrig.hardware.instrument import Datasheet, DialChange, InputRecord, Instrument, PotBox
+from analogrig.hardware.instrument import DialChange, InputRecord, Instrument, InstrumentDatasheet, PotBox
 from analogrig.hardware.scpi_connection import ScpiConnection
 from analogrig.links.wire import Clock
 from analogrig_emulator import Excitation
@@ -37,7 +37,7 @@ _EARLY_N = 1e-4
 class RedPitaya(Instrument):
     """Red Pitaya with records of 16,384 samples; it samples nothing while a record is read out."""
 
-    datasheet = Datasheet(
+    datasheet = InstrumentDatasheet(
         rate_hz=CLOCK_HZ / DECIMATION,
         record_n=BUFFER_N,
         bits=14,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from analogrig.config import check_range
 from analogrig.errors import ConfigurationError
-from analogrig.hardware.instrument import Datasheet, InputRecord, Instrument, find_driver
+from analogrig.hardware.instrument import InputRecord, Instrument, InstrumentDatasheet, find_driver
 from analogrig.hardware.pots import PotsDescription
 from analogrig.rigs.rig import CHANNEL_UNITS, Rig, RigDescription
 from analogrig.run import CHANNELS, MEASURED, Channel
@@ -61,7 +61,7 @@ class Input(Stage):
         check_range(self, "least_v", -_MOST_VOLTS, _MOST_VOLTS)
         check_range(self, "noise_lsb", 0.0, 1e5)
 
-    def ends_v(self, instrument: Datasheet) -> list[float]:
+    def ends_v(self, instrument: InstrumentDatasheet) -> list[float]:
         """Lowest and highest voltage at the computer within the range of the input."""
         return sorted(self.input_v(end_v) for end_v in instrument.ranges_v[self.range])
 
