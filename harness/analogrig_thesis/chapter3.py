@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from analogrig_thesis.double_precision import PlainEstimator
-from analogrig_thesis.models import ERROR, MEAN, PLAIN, Track, schemes, settling_n, square
+from analogrig_thesis.models import ERROR, MEAN, PLAIN, SignalPair, Track, schemes, settling_n, square
 from analogrig_thesis.texts import Chapter, Drawing, Facts, Mark, Signal, load_chapter
 
 N = 800

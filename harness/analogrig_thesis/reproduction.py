@@ -28,7 +28,7 @@ from analogrig_thesis.chapter5 import (
     play_alone,
     play_circuit,
 )
-from analogrig_thesis.models import OURS, PROFILE, TrackQuality, assess
+from analogrig_thesis.models import OURS, PROFILE, SignalPair, TrackQuality, assess
 from analogrig_thesis.rendering import render
 from analogrig_thesis.texts import Chapter, Signal, Table
 
