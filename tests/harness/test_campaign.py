@@ -301,7 +301,7 @@ def test_task_that_kills_every_worker_ends_the_campaign() -> None:
     ],
 )
 def test_device_of_which_there_is_only_one_takes_one_worker(name: str, only_one: str) -> None:
-    assert describe(name).only_one == one_worker_only(describe(name).as_table()) == only_one
+    assert describe(name).only_one == one_worker_only([], [describe(name).as_table()]) == only_one
 
 
 @pytest.mark.parametrize("device", ["inproc", "host"])
@@ -588,8 +588,8 @@ def test_device_of_several_cells_is_opened_once(tmp_path: Path, monkeypatch: pyt
 
 
 def test_rig_that_is_not_emulated_takes_one_worker() -> None:
-    assert one_worker_only(rig_table("red-pitaya"), describe("host").as_table()) == "red-pitaya"
-    assert one_worker_only(rig_table("emulator"), describe("host").as_table()) == ""
+    assert one_worker_only([rig_table("red-pitaya")], [describe("host").as_table()]) == "red-pitaya"
+    assert one_worker_only([rig_table("emulator")], [describe("host").as_table()]) == ""
 
 
 # ---------------------------------------------------------------------------------------------------- builds and files

@@ -366,7 +366,7 @@ def test_device_that_a_test_has_hung_is_there_again_for_the_next(user: pytest.Py
         from tests.harness.processes import descendants
 
         def test_first(hil_play, hil_dut):
-            hil_dut.configure(hil_dut.estimator.__class__(warm_up_n=33))
+            hil_dut.configure(warm_up_n=33)
             device = descendants(os.getpid())[-1]
             os.kill(device, signal.SIGSTOP)
             print("<stopped", device, ">")

@@ -246,15 +246,10 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
     return device
 
 
-def one_worker_only(*tables: Mapping[str, Any]) -> str:
+def one_worker_only(rigs: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]) -> str:
     """Name of the first rig or device that only one worker can use at a time; "" if there is none."""
-    return next(filter(None, map(_only_one, tables)), "")
-
-
-def _only_one(table: Mapping[str, Any]) -> str:
-    if "build" in table:
-        return device_of(table).only_one
-    return "" if "card" in table else str(table["name"])
+    single_rigs = ("" if "card" in table else str(table["name"]) for table in rigs)
+    return next(filter(None, (*single_rigs, *(device_of(table).only_one for table in devices))), "")
 
 
 def rig_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:

@@ -81,7 +81,7 @@ def _run(arguments: argparse.Namespace) -> int:
         move_aside(page)
     kept = f"what is done is kept in {journal_of(out)}, and the same command goes on from there"
     try:
-        with workers(arguments, one_worker_only(*plan.rigs, *plan.devices), len(list(plan.chunks()))) as crew:
+        with workers(arguments, one_worker_only(plan.rigs, plan.devices), len(list(plan.chunks()))) as crew:
             lacking = {} if out.exists() or arguments.cluster else unreachable(plan)
             if len(lacking) == len(plan.devices):
                 return complain(f"INCONCLUSIVE: no device can be had: {next(iter(lacking.values()))}", INCONCLUSIVE)

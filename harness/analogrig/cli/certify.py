@@ -88,7 +88,7 @@ def _run(arguments: argparse.Namespace) -> int:
         first_seed=arguments.seed,
     )
     try:
-        with workers(arguments, one_worker_only(question.rig, question.device), question.useful_workers) as crew:
+        with workers(arguments, one_worker_only([question.rig], [question.device]), question.useful_workers) as crew:
             answer = certify(question, crew, _progress())
     except (DeviceError, LinkError, RigError, WorkerError) as error:
         return complain(f"INCONCLUSIVE: {error}", INCONCLUSIVE)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from analogrig import config
 from analogrig.judging.information import QUANTISATION_VARIANCE_LSB2
-from analogrig.judging.verdict import ESTIMATES, Verdict
+from analogrig.judging.verdict import DIAGNOSES, ESTIMATES, Verdict
 from analogrig.run import Run
 from analogrig.wording import number_of
 from analogrig_emulator import TICKS_PER_SAMPLE, Excitation
@@ -43,7 +43,7 @@ def advice(run: Run, verdict: Verdict) -> tuple[str, ...]:
 
 
 def _unjudged_quantities(verdict: Verdict) -> Iterator[str]:
-    if verdict.not_judged:
+    if {*verdict.not_judged} - {DIAGNOSES}:  # many devices have no diagnoses, and lack nothing
         yield f"not judged, because the device does not report them: {', '.join(verdict.not_judged)}"
     if verdict.cannot_tell:
         yield f"the device's protocol does not show: {', '.join(verdict.cannot_tell)}"
