@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-/// analogrig-device: the device as a process of this computer, behind a pseudo-terminal or a serial device.
+/// analogrig-device: the device as a process of this computer, on a pseudo-terminal, a serial device, a TCP port or a CAN
+/// interface.
 ///
 /// The process ends with its standard input, so that it cannot outlive the process that started it.
 
@@ -10,11 +11,13 @@
 #include "serial_device.h"
 #include "slcan_device.h"
 #include "socket_can.h"
+#include "tcp.h"
 
 #include <errno.h>
 #include <fcntl.h>
 #include <inttypes.h>
 #include <poll.h>
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -25,29 +28,37 @@
 
 static const char usage_text[] =
     "usage: analogrig-device [--slcan] [--catalogue-hash HEX] [PATH]\n"
+    "       analogrig-device --listen tcp://[HOST]:PORT [--slcan] [--catalogue-hash HEX]\n"
     "       analogrig-device --can INTERFACE [--fd] [--catalogue-hash HEX]\n"
     "\n"
     "The analogrig estimator as a device on the serial device PATH (115200 8N1), or, without PATH, on a new\n"
-    "pseudo-terminal whose name is printed; or on a CAN interface of this computer. Ends when standard input ends.\n"
+    "pseudo-terminal whose name is printed; on a TCP port; or on a CAN interface of this computer. Ends when standard\n"
+    "input ends.\n"
     "\n"
-    "  --slcan               speak CAN as LAWICEL's adapters do, as if such a one were between it and the terminal\n"
+    "  --slcan               speak CAN as LAWICEL's adapters do, as if such a one were between it and the line\n"
+    "  --listen ADDRESS      serve one client after the other, each with a device that has just booted. Without HOST\n"
+    "                        on the loopback interface only; port 0 takes a free one. Prints the address when ready\n"
     "  --can INTERFACE       a SocketCAN interface, such as can0; --fd: it carries CAN FD. Prints its name when ready\n"
     "  --catalogue-hash HEX  pretend to be built from another message catalogue (for tests)\n"
     "  --version             print the version and the hash of the catalogue\n"
     "  --help                print this\n";
 
 typedef struct {
-    const char* path;
-    const char* interface;
-    bool        is_slcan;
-    bool        is_fd;
-    uint32_t    catalogue_hash;
+    const char*   path;
+    const char*   interface;
+    const char*   listen;  ///< as given
+    tcp_address_t address;
+    bool          is_slcan;
+    bool          is_fd;
+    uint32_t      catalogue_hash;
 } options_t;
 
 /// Line to the harness.
 static struct {
     int  fd;
-    bool is_socket;  ///< carries CAN frames; otherwise bytes
+    bool is_bus;     ///< carries CAN frames; otherwise bytes
+    bool is_tcp;     ///< its client may go at any time
+    bool has_ended;  ///< the client sends nothing more, but may still receive
     bool lost;       ///< errno holds the cause
 } line;
 
@@ -97,6 +108,13 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
         } else if ((strcmp(argv[i], "--can") == 0) && ((i + 1) < argc)) {
             i++;
             options->interface = argv[i];
+        } else if (strcmp(argv[i], "--listen") == 0) {
+            i++;
+            options->listen = (i < argc) ? argv[i] : "nothing";
+            if (!tcp_parse(options->listen, &options->address)) {
+                *status = refuse("not an address like tcp://127.0.0.1:4000", options->listen);
+                return false;
+            }
         } else if ((argv[i][0] == '-') || (options->path != NULL)) {
             *status = refuse("unexpected argument", argv[i]);
             return false;
@@ -105,8 +123,10 @@ static bool parse(const int argc, char* const argv[], options_t* const options, 
         }
     }
     const bool has_terminal = options->is_slcan || (options->path != NULL);
-    if (has_terminal && (options->interface != NULL)) {
-        *status = refuse("goes with no terminal", "--can");
+    if ((has_terminal || (options->listen != NULL)) && (options->interface != NULL)) {
+        *status = refuse("goes with no terminal and no port", "--can");
+    } else if ((options->path != NULL) && (options->listen != NULL)) {
+        *status = refuse("goes with no terminal", "--listen");
     } else if (options->is_fd && (options->interface == NULL)) {
         *status = refuse("goes with --can", "--fd");
     } else {
@@ -182,7 +202,7 @@ uint32_t port_boot_nonce(void) {
 }
 
 size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) {
-    if (line.is_socket) {
+    if (line.is_bus) {
         const ssize_t frames = socket_can_receive(line.fd, bytes, n, lost);
         if ((frames < 0) && !is_transient()) {
             lose(errno);
@@ -193,7 +213,9 @@ size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) 
     if (received > 0) {
         return (size_t)received;
     }
-    if (received == 0) {
+    if ((received == 0) && line.is_tcp) {
+        line.has_ended = true;
+    } else if (received == 0) {
         lose(EIO);  // end of file: the serial device is gone
     } else if (!is_transient()) {
         lose(errno);
@@ -204,7 +226,7 @@ size_t port_receive(uint8_t* const bytes, const size_t n, uint32_t* const lost) 
 }
 
 size_t port_transmit(const uint8_t* const bytes, const size_t n) {
-    const ssize_t sent = line.is_socket ? socket_can_transmit(line.fd, bytes, n) : write(line.fd, bytes, n);
+    const ssize_t sent = line.is_bus ? socket_can_transmit(line.fd, bytes, n) : write(line.fd, bytes, n);
     if ((sent < 0) && !is_transient()) {
         lose(errno);
     }
@@ -229,13 +251,13 @@ static bool has_hung_up(const short events) {
 #define WAIT_FOR_EVER (-1)
 
 bool port_idle(const bool wants_input, const bool has_output) {
-    const short   in     = wants_input ? POLLIN : 0;
+    const short   in     = (wants_input && !line.has_ended) ? POLLIN : 0;
     const short   out    = has_output ? POLLOUT : 0;
     struct pollfd fds[2] = {
         { .fd = STDIN_FILENO, .events = POLLIN },
         { .fd = line.fd, .events = (short)(in | out) },
     };
-    if (line.lost) {
+    if (line.lost || (line.has_ended && !has_output)) {
         return false;
     }
     if (poll(fds, 2, WAIT_FOR_EVER) < 0) {
@@ -248,31 +270,87 @@ bool port_idle(const bool wants_input, const bool has_output) {
         return false;
     }
     if (has_hung_up(fds[1].revents)) {
-        lose(line.is_socket ? socket_can_error(line.fd) : EIO);
+        lose(line.is_bus ? socket_can_error(line.fd) : EIO);
     }
     return !line.lost;
 }
 
-static int serve_terminal(const options_t* const options) {
+/// Boot the device and run it on the line of bytes until that is gone or standard input ends.
+static void serve_bytes(const options_t* const options) {
     static serial_device_t serial;
     static slcan_device_t  slcan;
-    const char* const      name = (options->path != NULL) ? options->path : "a pseudo-terminal";
-    line.fd                     = (options->path != NULL) ? open_serial(options->path) : open_terminal();
-    if (line.fd < 0) {
-        return fail("cannot open", name);
-    }
     if (options->is_slcan) {
         device_loop(&slcan_line, &slcan, ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
     } else {
         device_loop(&serial_line, &serial, ANALOGRIG_FIRMWARE_FIRMWARE_ID_HOST_CHOICE, options->catalogue_hash);
     }
+}
+
+static int serve_terminal(const options_t* const options) {
+    const char* const name = (options->path != NULL) ? options->path : "a pseudo-terminal";
+    line.fd                = (options->path != NULL) ? open_serial(options->path) : open_terminal();
+    if (line.fd < 0) {
+        return fail("cannot open", name);
+    }
+    serve_bytes(options);
     return line.lost ? fail("lost", name) : EXIT_SUCCESS;
+}
+
+/// Wait for the next client and make it the line. Return false if standard input has ended, or with line.lost.
+static bool await_client(const int listener) {
+    line.fd        = -1;
+    line.has_ended = false;
+    line.lost      = false;
+    while (line.fd < 0) {
+        struct pollfd fds[2] = {
+            { .fd = STDIN_FILENO, .events = POLLIN },
+            { .fd = listener, .events = POLLIN },
+        };
+        if ((poll(fds, 2, WAIT_FOR_EVER) < 0) && !is_transient()) {
+            lose(errno);
+            return false;
+        }
+        if (parent_is_gone(fds[0].revents)) {
+            return false;
+        }
+        if (fds[1].revents != 0) {
+            line.fd = tcp_accept(listener);
+            if ((line.fd < 0) && !is_transient() && (errno != ECONNABORTED)) {
+                lose(errno);
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+static int serve_clients(const options_t* const options) {
+    const char* reason = NULL;
+    char        address[TCP_TEXT_MAX];
+    const int   listener = tcp_listen(&options->address, &reason);
+    if (listener < 0) {
+        (void)fprintf(stderr, "analogrig-device: cannot listen on %s: %s\n", options->listen, reason);
+        return EXIT_FAILURE;
+    }
+    if (!tcp_print(listener, address) || (printf("%s\n", address) < 0) || (fflush(stdout) != 0)) {
+        return fail("cannot write", "standard output");
+    }
+    (void)signal(SIGPIPE, SIG_IGN);  // a client may go while it is answered
+    line.is_tcp = true;
+    while (await_client(listener)) {
+        serve_bytes(options);
+        (void)close(line.fd);
+        if (!line.lost && !line.has_ended) {
+            return EXIT_SUCCESS;  // standard input has ended
+        }
+    }
+    return line.lost ? fail("cannot accept a client on", address) : EXIT_SUCCESS;
 }
 
 static int serve_bus(const options_t* const options) {
     static can_device_t device;
-    line.fd        = socket_can_open(options->interface, options->is_fd);
-    line.is_socket = true;
+    line.fd     = socket_can_open(options->interface, options->is_fd);
+    line.is_bus = true;
     if (line.fd < 0) {
         return fail("cannot open the CAN interface", options->interface);
     }
@@ -290,5 +368,8 @@ int main(int argc, char* argv[]) {
     if (!parse(argc, argv, &options, &status)) {
         return status;
     }
-    return (options.interface != NULL) ? serve_bus(&options) : serve_terminal(&options);
+    if (options.interface != NULL) {
+        return serve_bus(&options);
+    }
+    return (options.listen != NULL) ? serve_clients(&options) : serve_terminal(&options);
 }

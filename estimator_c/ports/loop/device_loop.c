@@ -66,6 +66,7 @@ void device_loop(const device_line_t* const line,
                                          .boot_nonce     = port_boot_nonce(),
                                          .input_blocks   = input_blocks(line),
                                          .firmware_id    = firmware_id };
+    buffers                          = (buffers_t){ .input_from = 0U };
     line->init(state, &identity);
     bool more = true;
     while (more) {
