@@ -6,11 +6,13 @@ import contextlib
 import math
 import os
 import select
+import socket
 import time
 from collections.abc import Callable
 from typing import Protocol
 
 import serial
+from serial.urlhandler import protocol_socket
 
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 
@@ -144,9 +146,12 @@ class PortWire:
             raise LinkError(f"cannot open {url}: {_reason(error)}") from error
         except Exception as error:  # pyserial's URL handlers raise exceptions of any type
             raise ConfigurationError(f"{url}: not a serial port or URL that pyserial understands: {error}") from error
-        # Bypass pyserial on a plain descriptor: its read() and write() cost as much as a whole exchange.
-        is_plain = type(self._port) is serial.Serial
-        self._descriptor = DescriptorWire(self._port.fileno(), self.name) if is_plain else None
+        # Bypass pyserial on a descriptor: its read() and write() cost as much as a whole exchange, or ten on a socket.
+        handler: type = type(self._port)
+        has_descriptor = handler in (serial.Serial, protocol_socket.Serial)
+        self._descriptor = DescriptorWire(self._port.fileno(), self.name) if has_descriptor else None
+        if handler is protocol_socket.Serial:
+            _send_at_once(self._port.fileno())
 
     def write(self, sent: bytes) -> None:
         if self._descriptor is not None:
@@ -172,6 +177,12 @@ class PortWire:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._port.close()
+
+
+def _send_at_once(fd: int) -> None:
+    """Send small messages without waiting for the acknowledgement of earlier ones, which takes up to 40 ms."""
+    with socket.socket(fileno=os.dup(fd)) as line:
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def _reason(error: OSError) -> str:
