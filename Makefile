@@ -27,18 +27,22 @@ PYTHON_SOURCES := emulator harness estimator_c tests setup.py
 C_SOURCES := $(wildcard $(foreach folder,emulator/*/engine harness/*/* estimator_c/* estimator_c/ports/* estimator_c/ports/*/* tests/* tests/*/src,\
                  $(folder)/*.[ch]))
 
-# The firmware of the boards that QEMU emulates; the M0's runs on that of the M3.
-CORES := m0 m3 m4 m7
-FIRMWARE := $(CORES:%=$(BUILD)/firmware/analogrig-%.elf)
+# The firmware of the boards that QEMU emulates; the M0's runs on that of the M3. Also an STM32F405.
+BOARDS := m0 m3 m4 m7 f405
+FIRMWARE := $(BOARDS:%=$(BUILD)/firmware/analogrig-%.elf)
+M4F := -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16
 CPU_m0 := -mcpu=cortex-m0 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_BOARD_CHOICE
 CPU_m3 := -mcpu=cortex-m3 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M3_CHOICE
-CPU_m4 := -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M4_CHOICE
+CPU_m4 := $(M4F) -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M4_CHOICE
 CPU_m7 := -mcpu=cortex-m7 -mfloat-abi=hard -mfpu=fpv5-sp-d16 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M7_CHOICE
+CPU_f405 := $(M4F) -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_BOARD_CHOICE
+BOARD_f405 := stm32f405
+board = $(addprefix estimator_c/ports/,$(or $(BOARD_$*),mps2))
 FIRMWARE_FOLDERS := $(addprefix estimator_c/,core isolation device ports/loop ports/cortex_m)
 FIRMWARE_CFLAGS := -std=c99 -O2 -mthumb -ffreestanding -ffp-contract=off -ffunction-sections -DNDEBUG \
     -Wall -Wextra -Wdouble-promotion -Wno-type-limits -Werror $(FIRMWARE_FOLDERS:%=-I%) -Iestimator_c/ports/cortex_m/include \
     -I$(BUILD)/generated
-FIRMWARE_LDFLAGS := -nostdlib -nostartfiles -Wl,--gc-sections,-z,noexecstack -T estimator_c/ports/cortex_m/mps2.ld
+FIRMWARE_LDFLAGS := -nostdlib -nostartfiles -Wl,--gc-sections,-z,noexecstack -T estimator_c/ports/cortex_m/image.ld
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
@@ -103,16 +107,17 @@ kills: $(PRODUCTS) ## end commands by signals at random instants, 40 of each com
 can-guest: $(PRODUCTS) $(BUILD)/can_guest/linux ## CAN on real SocketCAN, in a Linux that QEMU emulates; ARGS="-k fd" goes to its pytest
 	@$(BIN)/python -m tests.can_guest $(ARGS)
 
-firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F and M7, into build/firmware; needs gcc-arm-none-eabi
+firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F, M7 and STM32F405, into build/firmware; needs gcc-arm-none-eabi
 	@arm-none-eabi-size $(FIRMWARE)
 
 $(BUILD)/firmware/analogrig-m0.elf: estimator_c/ports/cortex_m0/float.S
 
-$(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) estimator_c/ports/cortex_m/mps2.ld $(PRODUCTS)
+$(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) $(wildcard estimator_c/ports/*/*.ld) $(PRODUCTS)
 	@mkdir -p $(@D)
 	@command -v arm-none-eabi-gcc >/dev/null || \
 	    { echo "the firmware needs arm-none-eabi-gcc: apt-get install gcc-arm-none-eabi" >&2; exit 1; }
-	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) $(filter %.S,$^) $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c)) \
+	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) -L $(board) $(filter %.S,$^) \
+	    $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c) $(board)/*.c) \
 	    $(BUILD)/generated/*.c -lgcc -o $@
 
 no-firmware:

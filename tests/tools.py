@@ -76,7 +76,11 @@ class Built:
 
 BUILT = {
     "firmware": Built(
-        tuple(FIRMWARE / f"analogrig-{core}.elf" for core in ("m0", "m3", "m4", "m7")), "firmware", "arm-none-eabi-gcc"
+        (
+            *(FIRMWARE / f"analogrig-{board}.elf" for board in ("m0", "m3", "m4", "m7", "f405")),
+        ),
+        "firmware",
+        "arm-none-eabi-gcc",
     ),
     "guest kernel": Built((GUEST_LINUX / "vmlinux",), "build/can_guest/linux"),
 }

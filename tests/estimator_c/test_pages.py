@@ -16,29 +16,47 @@ ESTIMATOR = ROOT / "estimator_c"
 FOLDERS = [ESTIMATOR / folder for folder in ("core", "isolation", "device", "ports/loop")]
 CODECS = ROOT / "build" / "generated"
 
+UART = "volatile uint32_t UART_STATUS, UART_DATA, RANDOM;"
 REGISTERS = {
-    "a UART": "volatile uint32_t UART_STATUS, UART_DATA, RANDOM;",
+    "a UART": UART,
+    "DMA": f"{UART} uint32_t RX[6] = {{0, 1024}}, TX[6]; volatile uint32_t RX_CLEAR, TX_CLEAR;",
+    "an RTOS": f"{UART} volatile uint32_t UART_CONTROL;",
     "a CAN controller": "uint32_t CAN1[0x400 / 4]; volatile uint32_t RANDOM;",
 }
-PAGES = {
-    "a UART": ROOT / "harness/docs/howto/port-to-a-board.md",
-    "a CAN controller": ROOT / "harness/docs/howto/port-to-a-can-controller.md",
-}
+BOARD = ROOT / "harness/docs/howto/port-to-a-board.md"
+CAN_CONTROLLER = ROOT / "harness/docs/howto/port-to-a-can-controller.md"
 
 
-def example(page: Path) -> str:
-    """The one C program of a page."""
-    (program,) = re.findall(r"```c\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    return str(program)
+def programs(page: Path) -> list[str]:
+    """The C programs of a page."""
+    return re.findall(r"```c\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def port_of(name: str) -> str:
+    """The port of that name. DMA and RTOS replace functions of the port to a UART."""
+    uart, dma, rtos = programs(BOARD)
+    if name == "a CAN controller":
+        (program,) = programs(CAN_CONTROLLER)
+        return program
+    return {"a UART": uart, "DMA": replaced(uart, dma), "an RTOS": replaced(uart, rtos)}[name]
+
+
+def replaced(program: str, functions: str) -> str:
+    """The program with these functions instead of its own ones of the same names."""
+    for name in re.findall(r"^\w+ (port_\w+)\(", functions, re.MULTILINE):
+        program, count = re.subn(rf"^\w+ {name}\(.*?^}}\n", "", program, flags=re.DOTALL | re.MULTILINE)
+        assert count == 1, name
+    first, main = program.split("int main", 1)
+    return f"{first}{functions}\nint main{main}"
 
 
 def compiled(port: str, product: Path, *flags: str) -> Path:
     folder = product.parent
-    (folder / "port.c").write_text(example(PAGES[port]))
+    (folder / "port.c").write_text(port_of(port))
     (folder / "registers.c").write_text(f"#include <stdint.h>\n{REGISTERS[port]}\n")
     sources = [*folder.glob("*.c"), *(path for part in (*FOLDERS, CODECS) for path in part.glob("*.c"))]
     command = ["gcc", "-std=c99", "-ffp-contract=off", "-DNDEBUG", "-Wall", "-Wextra", "-Werror", *flags]
-    command += [f"-I{part}" for part in (*FOLDERS, CODECS)]
+    command += [f"-I{part}" for part in (folder, *FOLDERS, CODECS)]
     done = subprocess.run(
         [*command, *map(str, sources), "-o", str(product)], capture_output=True, text=True, check=False
     )
@@ -47,7 +65,7 @@ def compiled(port: str, product: Path, *flags: str) -> Path:
 
 
 def test_example_of_the_readme_compiles_and_runs(tmp_path: Path) -> None:
-    (tmp_path / "example.c").write_text(example(ESTIMATOR / "README.md"))
+    (tmp_path / "example.c").write_text(*programs(ESTIMATOR / "README.md"))
     product = tmp_path / "example"
     flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", f"-I{ESTIMATOR / 'core'}"]
     sources = [str(tmp_path / "example.c"), str(ESTIMATOR / "core" / "est.c")]
@@ -58,6 +76,216 @@ def test_example_of_the_readme_compiles_and_runs(tmp_path: Path) -> None:
 
 def test_port_to_a_uart_compiles_and_links(tmp_path: Path) -> None:
     assert compiled("a UART", tmp_path / "device").exists()
+
+
+# ---- DMA
+
+
+class Dma:
+    """The port to a DMA controller whose registers are memory. The test is the controller."""
+
+    def __init__(self, folder: Path) -> None:
+        self.c = ctypes.CDLL(str(compiled("DMA", folder / "port.so", "-shared", "-fPIC")))
+        self.c.port_receive.restype = self.c.port_transmit.restype = ctypes.c_size_t
+        self._ring = (ctypes.c_uint8 * 1024).in_dll(self.c, "dma_ring")
+        self._out = (ctypes.c_uint8 * 256).in_dll(self.c, "dma_out")
+        self._rx, self._tx = ((ctypes.c_uint32 * 6).in_dll(self.c, name) for name in ("RX", "TX"))
+        self.arrived = 0
+
+    def arrive(self, n: int, *, interrupts: bool = True) -> bytes:
+        """Receive n bytes; at the end of the ring, call the interrupt."""
+        sent = bytes((self.arrived + i) * 7 % 251 for i in range(n))
+        for byte in sent:
+            self._ring[self.arrived % 1024] = byte
+            self.arrived += 1
+            self._rx[1] = 1024 - self.arrived % 1024
+            if self.arrived % 1024 == 0 and interrupts:
+                self.c.dma_receive_interrupt()
+        return sent
+
+    def receive(self, n: int) -> tuple[bytes, int]:
+        return received(self.c, n)
+
+    def transmit(self, sent: bytes) -> int:
+        return int(self.c.port_transmit(sent, ctypes.c_size_t(len(sent))))
+
+    @property
+    def sending(self) -> bytes:
+        """Bytes of the transfer that is enabled."""
+        return bytes(self._out[: self._tx[1]]) if self._tx[0] & 1 else b""
+
+    def complete(self) -> None:
+        """End the transfer, as the controller does by itself."""
+        self._tx[0] &= ~1
+
+
+def received(port: ctypes.CDLL, n: int) -> tuple[bytes, int]:
+    """Bytes that the port takes, at most n, and the number lost."""
+    taken, lost = (ctypes.c_uint8 * n)(), ctypes.c_uint32()
+    count = port.port_receive(taken, ctypes.c_size_t(n), ctypes.byref(lost))
+    return bytes(taken[:count]), lost.value
+
+
+@pytest.fixture(scope="module")
+def dma(tmp_path_factory: pytest.TempPathFactory) -> Dma:
+    return Dma(tmp_path_factory.mktemp("dma"))
+
+
+def test_dma_port_takes_every_byte_of_many_laps(dma: Dma) -> None:
+    for n in (1, 700, 1024, 5, 1023, 1024, 300):
+        sent = dma.arrive(n)
+        assert dma.receive(n // 2) == (sent[: n // 2], 0)
+        assert dma.receive(4096) == (sent[n // 2 :], 0)
+    assert dma.receive(4096) == (b"", 0)
+
+
+def test_dma_port_takes_the_bytes_of_a_lap_whose_interrupt_is_pending(dma: Dma) -> None:
+    dma.arrive(1024 - dma.arrived % 1024 - 10)
+    dma.receive(4096)
+    sent = dma.arrive(20, interrupts=False)
+    assert dma.receive(4096) == (sent, 0)
+    dma.c.dma_receive_interrupt()
+    assert dma.receive(4096) == (b"", 0)
+
+
+def test_dma_port_tells_of_bytes_that_were_overwritten(dma: Dma) -> None:
+    dma.arrive(1025)
+    assert dma.receive(4096) == (b"", 1025)
+    sent = dma.arrive(1024)
+    assert dma.receive(4096) == (sent, 0)
+
+
+def test_dma_port_waits_for_the_end_of_a_transfer(dma: Dma) -> None:
+    sent = bytes(range(256)) + b"rest"
+    assert dma.transmit(sent) == 256
+    assert dma.sending == sent[:256]
+    assert dma.transmit(b"rest") == 0
+    dma.complete()
+    assert dma.transmit(b"rest") == 4
+    assert dma.sending == b"rest"
+
+
+# ---- RTOS
+
+FREERTOS = """#include <stdint.h>
+#include <stddef.h>
+typedef long BaseType_t;
+typedef uint32_t TickType_t;
+typedef struct { uint8_t bytes[4096]; size_t from, to; }* StreamBufferHandle_t;
+typedef struct { uint32_t notifications; }* TaskHandle_t;
+enum { pdFALSE, pdTRUE };
+#define portMAX_DELAY 0xFFFFFFFFU
+#define portYIELD_FROM_ISR(wakes) ((void)(wakes))
+#define taskENTER_CRITICAL()
+#define taskEXIT_CRITICAL()
+size_t   xStreamBufferSendFromISR(StreamBufferHandle_t buffer, const void* bytes, size_t n, BaseType_t* wakes);
+size_t   xStreamBufferReceive(StreamBufferHandle_t buffer, void* bytes, size_t n, TickType_t wait);
+void     vTaskNotifyGiveFromISR(TaskHandle_t task, BaseType_t* wakes);
+uint32_t ulTaskNotifyTake(BaseType_t clear, TickType_t wait);
+"""
+"""Part of FreeRTOS that the page calls, with its own signatures: https://www.freertos.org/Documentation."""
+
+FREERTOS_C = """#include "FreeRTOS.h"
+size_t xStreamBufferSendFromISR(StreamBufferHandle_t buffer, const void* bytes, size_t n, BaseType_t* wakes) {
+    (void)wakes;
+    if ((buffer->to - buffer->from) == 4096U) { return 0U; }
+    buffer->bytes[buffer->to++ % 4096U] = *(const uint8_t*)bytes;
+    return n;
+}
+size_t xStreamBufferReceive(StreamBufferHandle_t buffer, void* bytes, size_t n, TickType_t wait) {
+    size_t taken = 0U;
+    (void)wait;
+    while ((taken < n) && (buffer->from != buffer->to)) {
+        ((uint8_t*)bytes)[taken++] = buffer->bytes[buffer->from++ % 4096U];
+    }
+    return taken;
+}
+void vTaskNotifyGiveFromISR(TaskHandle_t task, BaseType_t* wakes) { (void)wakes; task->notifications++; }
+extern TaskHandle_t device_task;
+uint32_t ulTaskNotifyTake(BaseType_t clear, TickType_t wait) {
+    (void)clear; (void)wait;
+    const uint32_t before = device_task->notifications;
+    device_task->notifications = 0U;
+    return before;
+}
+"""
+
+
+class Rtos:
+    """The port to FreeRTOS, with a UART whose registers are memory."""
+
+    def __init__(self, folder: Path) -> None:
+        (folder / "FreeRTOS.h").write_text(f"#ifndef FREERTOS_H\n#define FREERTOS_H\n{FREERTOS}#endif\n")
+        for name in ("stream_buffer.h", "task.h"):
+            (folder / name).write_text('#include "FreeRTOS.h"\n')
+        (folder / "freertos.c").write_text(FREERTOS_C)
+        self.c = ctypes.CDLL(str(compiled("an RTOS", folder / "port.so", "-shared", "-fPIC")))
+        self.c.port_receive.restype = ctypes.c_size_t
+        self.task, self._buffer = ctypes.c_uint32(), ctypes.create_string_buffer(4096 + 16)
+        ctypes.c_void_p.in_dll(self.c, "device_task").value = ctypes.addressof(self.task)
+        ctypes.c_void_p.in_dll(self.c, "from_line").value = ctypes.addressof(self._buffer)
+
+    def interrupt(self, status: int, data: int = 0) -> None:
+        ctypes.c_uint32.in_dll(self.c, "UART_STATUS").value = status
+        ctypes.c_uint32.in_dll(self.c, "UART_DATA").value = data
+        self.c.uart_interrupt()
+
+    @property
+    def control(self) -> int:
+        return ctypes.c_uint32.in_dll(self.c, "UART_CONTROL").value
+
+
+@pytest.fixture(scope="module")
+def rtos(tmp_path_factory: pytest.TempPathFactory) -> Rtos:
+    return Rtos(tmp_path_factory.mktemp("rtos"))
+
+
+def test_rtos_port_hands_over_bytes_and_counts_those_without_room(rtos: Rtos) -> None:
+    sent = bytes(i % 251 for i in range(4100))
+    for byte in sent:
+        rtos.interrupt(1, byte)
+    assert rtos.task.value == 4100
+    assert received(rtos.c, 100) == (sent[:100], 4)
+    assert received(rtos.c, 8192) == (sent[100:4096], 0)
+
+
+def test_rtos_port_asks_for_room_once(rtos: Rtos) -> None:
+    rtos.task.value = 1
+    assert rtos.c.port_idle(ctypes.c_bool(True), ctypes.c_bool(True))  # noqa: FBT003
+    assert (rtos.control, rtos.task.value) == (3, 0)
+    rtos.interrupt(2)
+    assert (rtos.control, rtos.task.value) == (1, 1)
+
+
+# ---- size
+
+
+@pytest.mark.tools("arm-none-eabi-gcc")
+def test_port_to_a_uart_takes_the_flash_and_ram_of_the_page(tmp_path: Path) -> None:
+    told = re.search(r"takes ([\d.]+) kB of flash at `-Os`, ([\d.]+) kB at `-O2`, and ([\d.]+) kB of RAM", flat(BOARD))
+    assert told is not None
+    (tmp_path / "port.c").write_text(port_of("a UART"))
+    fault = "void board_fail(const char* line);\nvoid board_fail(const char* line) { (void)line; for (;;) { } }"
+    (tmp_path / "registers.c").write_text(f"#include <stdint.h>\n{UART}\n{fault}\n")
+    ports = ESTIMATOR / "ports"
+    flags = ["-std=c99", "-mcpu=cortex-m4", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-mthumb", "-ffp-contract=off"]
+    flags += ["-DNDEBUG", "-ffreestanding", "-nostdlib", "-nostartfiles", "-ffunction-sections", "-Wl,--gc-sections"]
+    flags += [f"-I{part}" for part in (*FOLDERS, CODECS, ports / "cortex_m", ports / "cortex_m" / "include")]
+    flags += [f"-L{ports / 'stm32f405'}", f"-T{ports / 'cortex_m' / 'image.ld'}"]
+    sources = [*tmp_path.glob("*.c"), *(path for part in (*FOLDERS, CODECS) for path in part.glob("*.c"))]
+    sources.append(ports / "cortex_m" / "start.c")
+    for level, flash in zip(("-Os", "-O2"), told.groups(), strict=False):
+        image = tmp_path / "image.elf"
+        subprocess.run(["arm-none-eabi-gcc", level, *flags, *map(str, sources), "-lgcc", "-o", str(image)], check=True)
+        size = subprocess.run(["arm-none-eabi-size", str(image)], capture_output=True, text=True, check=True).stdout
+        text, data, bss, *_ = map(int, size.splitlines()[1].split()[:3])
+        assert (text + data) / 1000 == pytest.approx(float(flash), rel=0.05)
+        assert (data + bss) / 1000 == pytest.approx(float(told[3]), rel=0.05)
+
+
+def flat(page: Path) -> str:
+    """The text of a page in one line."""
+    return " ".join(page.read_text(encoding="utf-8").split())
 
 
 # ---- bxCAN: ST RM0090, section 32.9: the registers by their offsets

@@ -6,8 +6,9 @@ import pytest
 
 from tests import tools
 
-CORES = ("m3", "m4", "m7")
-"""Cores that QEMU has a board of."""
+FIRMWARE_IDS = {"m3": "QEMU_M3", "m4": "QEMU_M4", "m7": "QEMU_M7", "f405": "BOARD"}
+"""Name in the identity of the device, of each image that has a kind of its own."""
+CORES = tuple(FIRMWARE_IDS)
 
 FOLDER = tools.FIRMWARE
 

@@ -88,6 +88,7 @@ SOME_OF_CAN = ("drop", "duplicate", "error", "collide", "fd", "bus-off", "babble
 REAL = [
     *(("serial", "host", kind) for kind in FaultyWire.KINDS if kind != "delay"),
     *(pytest.param("serial", "qemu-m4", kind, marks=needs_firmware) for kind in SOME),
+    pytest.param("serial", "qemu-f405", "reset", marks=needs_firmware),
     *(("can", "can:virtual", kind) for kind in SOME_OF_CAN),
     *(("can", "host?link=slcan", kind) for kind in ("drop", "collide", "reset")),
 ]

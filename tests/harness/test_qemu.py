@@ -21,14 +21,14 @@ from analogrig.devices.device import Device
 from analogrig.devices.host import HostDevice
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.opening import reopen_dut
-from analogrig.devices.qemu import QemuDevice, QemuM4
+from analogrig.devices.qemu import QemuDevice, QemuF405, QemuM4
 from analogrig.devices.registry import KINDS, describe, from_table
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Run
 from analogrig.scenario import Scenario
 from tests.harness.fed import catalogue
-from tests.harness.firmware import CORES, FOLDER, needs_firmware
+from tests.harness.firmware import CORES, FIRMWARE_IDS, FOLDER, needs_firmware
 from tests.harness.processes import LONG_S, descendants
 
 pytestmark = needs_firmware
@@ -66,7 +66,7 @@ def reference(request: pytest.FixtureRequest) -> tuple[Scenario, Run]:
 
 
 DEVICES = [
-    *({"kind": kind} for kind in KINDS if kind not in ("inproc", "serial", "can")),  # two need an address
+    *({"kind": kind} for kind in KINDS if kind not in ("inproc", "serial", "can", "qemu-f405")),  # two need an address
     {"kind": "qemu-m3", "firmware": str(FOLDER / "analogrig-m0.elf")},
 ]
 
@@ -86,6 +86,15 @@ def test_every_scenario_gives_the_same_bits_on_every_device(
     assert run.alarm_index.tolist() == expected.alarm_index.tolist()
 
 
+@pytest.mark.parametrize("options", ["exchange=sample", "exchange=stream", "link=slcan"])
+def test_stm32_gives_the_same_bits(options: str) -> None:
+    """The port is the same as that of the other boards, but for the registers of its UARTs."""
+    scenario = shortened("thesis")
+    played = play(describe(f"qemu-f405?{options}"), scenario)
+    assert played.conditions.faults == ()
+    assert played.theta_hash() == play(InprocDevice(name="bob"), scenario).theta_hash()
+
+
 def test_shortened_scenarios_still_have_alarms() -> None:
     assert len(play(HostDevice(name="bob"), shortened("thesis")).alarm_index) > 0
 
@@ -96,7 +105,7 @@ def test_firmware_says_which_it_is_and_every_boot_has_its_number(core: str) -> N
     for _ in range(2):
         with describe(f"qemu-{core}").connect() as dut:
             identity = dut.description()["identity"]
-            assert identity["firmware"] == f"QEMU_{core.upper()}"
+            assert identity["firmware"] == FIRMWARE_IDS[core]
             nonces.add(identity["boot_nonce"])
     assert len(nonces) == 2
 
@@ -166,20 +175,50 @@ def test_what_is_no_firmware_is_told_in_the_words_of_qemu(tmp_path: Path) -> Non
         describe(f"qemu-m4:{tmp_path}/nothing.elf").connect()
 
 
+FAULT = "*(volatile int*)0xE0200000 = 1;"
+"""A write where nothing is."""
+
+
+def image(folder: Path, board: str, main: str) -> Path:
+    """An image of the project's start-up code, a board, and a program of the test."""
+    ports = Path(__file__).parents[2] / "estimator_c" / "ports"
+    (folder / "main.c").write_text(main)
+    options = ["-std=c99", "-mcpu=cortex-m4", "-mthumb", "-ffreestanding", "-nostdlib", "-nostartfiles"]
+    paths = [f"-I{ports}/cortex_m", f"-I{ports}/cortex_m/include", f"-L{ports}/{board}", f"-T{ports}/cortex_m/image.ld"]
+    shared = [ports / "cortex_m" / "start.c", ports / "cortex_m" / "uart.c", *(ports / board).glob("*.c")]
+    product = folder / "program.elf"
+    subprocess.run([GCC, *options, *paths, folder / "main.c", *shared, "-lgcc", "-o", product], check=True)
+    return product
+
+
 @pytest.mark.tools(GCC)
 def test_hard_fault_is_told_in_the_words_of_the_firmware(tmp_path: Path) -> None:
-    """The project's own start-up code, and a program that writes where nothing is."""
-    (tmp_path / "main.c").write_text("int main(void) { *(volatile int*)0xE0200000 = 1; return 0; }\n")
-    port = Path(__file__).parents[2] / "estimator_c" / "ports" / "cortex_m"
-    sources = [str(path) for path in (tmp_path / "main.c", port / "start.c", port / "semihosting.c")]
-    handlers = [f"{line}_{way}_interrupt" for line in ("serial", "slcan") for way in ("receive", "transmit")]
-    (tmp_path / "vectors.c").write_text("".join(f"void {handler}(void) {{}}\n" for handler in handlers))
-    image = str(tmp_path / "faulty.elf")
-    options = ["-mcpu=cortex-m4", "-mthumb", "-ffreestanding", "-nostdlib", "-nostartfiles"]
-    paths = [f"-I{port}", f"-I{port / 'include'}", "-T", str(port / "mps2.ld"), str(tmp_path / "vectors.c")]
-    subprocess.run([GCC, *options, *paths, *sources, "-lgcc", "-o", image], check=True)
+    faulty = image(tmp_path, "mps2", f"int main(void) {{ {FAULT} return 0; }}\n")
     with pytest.raises(LinkClosed, match=r"QEMU \(mps2-an386\) ended with status \d+: analogrig: hard fault"):
-        describe(f"qemu-m4:{image}").connect()
+        describe(f"qemu-m4:{faulty}").connect()
+
+
+@pytest.mark.tools(GCC)
+def test_hard_fault_resets_an_stm32(tmp_path: Path) -> None:
+    """It prints a line after each reset, and faults at the first byte that it receives."""
+    main = f"""#include "uart.h"
+int main(void) {{
+    board_start();
+    for (unsigned i = 0U; i < 5U; i++) {{ board_send(0U, (uint8_t)"boot\\n"[i]); }}
+    while (!uart_has_input(0U)) {{ }}
+    {FAULT}
+    return 0;
+}}
+"""
+    faulty = image(tmp_path, "stm32f405", main)
+    wire = QemuF405(name="bob", firmware=str(faulty)).wire()
+    for _ in range(3):
+        printed = b""
+        while not printed.endswith(b"\n"):
+            printed += wire.read(LONG_S)
+        assert printed == b"boot\n"
+        wire.write(b"x")
+    wire.close()
 
 
 def test_absent_firmware_is_named_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

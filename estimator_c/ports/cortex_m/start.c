@@ -1,30 +1,22 @@
 // SPDX-License-Identifier: MIT
 /// Start-up code for any Cortex-M, from reset to main(): vector table, initialised memory, floating-point unit.
 
-#include "semihosting.h"
+#include "board.h"
 
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 
-#define FAULT_STATUS 70U  ///< EX_SOFTWARE of sysexits.h
-
 int main(void);
 
-/// Symbols of mps2.ld.
+/// Symbols of image.ld.
 extern uint32_t       data_begin;
 extern uint32_t       data_end;
 extern const uint32_t data_image;
 extern uint32_t       bss_begin;
 extern uint32_t       bss_end;
 extern uint32_t       stack_top;
-
-/// Interrupt handlers of the port.
-void serial_receive_interrupt(void);
-void serial_transmit_interrupt(void);
-void slcan_receive_interrupt(void);
-void slcan_transmit_interrupt(void);
 
 void start(void);
 
@@ -52,25 +44,21 @@ void start(void) {
         *to = 0U;
     }
     (void)main();
-    semihosting_end("analogrig: the device has ended\n", 0U);
+    board_fail("analogrig: main() has returned\n");
 }
 
-static void fault(void) { semihosting_end("analogrig: hard fault\n", FAULT_STATUS); }
+static void fault(void) { board_fail("analogrig: hard fault\n"); }
 
-static void unexpected(void) { semihosting_end("analogrig: an interrupt that nobody asked for\n", FAULT_STATUS); }
+static void unexpected(void) { board_fail("analogrig: an interrupt that nobody asked for\n"); }
 
-typedef void (*handler_t)(void);
-
-/// Vector table of Armv6-M and Armv7-M: 16 entries of the processor, followed by those of the board.
+/// Vector table of Armv6-M and Armv7-M: the 16 entries of the processor. Those of the board follow: see board.h.
 __attribute__((section(".vectors"), used)) static const struct {
     const uint32_t* stack;
-    handler_t       system[15];
-    handler_t       board[32];
+    board_handler_t system[15];
 } vectors = {
     .stack  = &stack_top,
     .system = { start_reset, unexpected, fault, fault, fault, fault, NULL, NULL, NULL, NULL, unexpected, unexpected,
                 NULL, unexpected, unexpected },
-    .board = { serial_receive_interrupt, serial_transmit_interrupt, slcan_receive_interrupt, slcan_transmit_interrupt },
 };
 
 // Functions that the compiler calls implicitly. The pointers are volatile, because gcc would replace the loops by calls

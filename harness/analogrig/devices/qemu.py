@@ -1,4 +1,4 @@
-"""Devices of the kinds ``qemu-m3``, ``qemu-m4`` and ``qemu-m7``: Cortex-M firmware on a board emulated by QEMU."""
+"""Devices of the kinds ``qemu-m3``, ``-m4``, ``-m7``, ``-f405``: Cortex-M firmware on a board emulated by QEMU."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ class QemuDevice(EitherDevice):
     starting_s: ClassVar[float] = 5.0
     core: ClassVar[str]
     machine: ClassVar[str]
+    semihosting: ClassVar[bool] = True
+    """True if the firmware reads its boot nonce by semihosting; otherwise it has one of its own."""
     firmware: str | None = None
     """An ELF file; None for the project's firmware, which `make firmware` builds."""
 
@@ -64,15 +66,16 @@ class QemuDevice(EitherDevice):
         qemu = shutil.which(QEMU)
         if qemu is None:
             raise LinkError(f"{QEMU} is not installed: apt-get install qemu-system-arm")
-        # The firmware reads its boot nonce by semihosting, since nothing else of a boot is random in QEMU.
-        nonce = f"arg=analogrig,arg={secrets.randbits(32):08x}"
         command: list[str | Path] = [*_on_one_processor(), qemu, "-machine", self.machine, "-kernel", self._image()]
-        command += [*_NO_SCREEN, "-semihosting-config", f"enable=on,target=native,{nonce}", *line]
+        command += [*_NO_SCREEN, *line]
+        if self.semihosting:
+            nonce = f"arg=analogrig,arg={secrets.randbits(32):08x}"
+            command += ["-semihosting-config", f"enable=on,target=native,{nonce}"]
         return Child(command, f"QEMU ({self.machine})", inherited=inherited)
 
     @property
     def things(self) -> tuple[Thing, ...]:
-        """The firmware: by semihosting it can open any file of this machine."""
+        """The firmware: by semihosting it could open any file of this machine."""
         return (Thing("firmware", self.firmware, "the device boots the firmware"),) if self.firmware else ()
 
     def placed(self, folder: Path) -> Self:
@@ -125,3 +128,12 @@ class QemuM7(QemuDevice):
     kind, core, machine = "qemu-m7", "m7", "mps2-an500"
     usage: ClassVar[str] = "qemu-m7[:ELF]"
     summary: ClassVar[str] = "Cortex-M7 firmware on a board that QEMU emulates"
+
+
+class QemuF405(QemuDevice):
+    """STM32F405: the image for the real board, which needs nothing of QEMU."""
+
+    kind, core, machine = "qemu-f405", "f405", "netduinoplus2"
+    usage: ClassVar[str] = "qemu-f405[:ELF]"
+    summary: ClassVar[str] = "STM32F405 firmware on a board that QEMU emulates"
+    semihosting: ClassVar[bool] = False

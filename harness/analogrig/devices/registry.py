@@ -29,6 +29,7 @@ KINDS = Kinds(
         "qemu-m3": "analogrig.devices.qemu:QemuM3",
         "qemu-m4": "analogrig.devices.qemu:QemuM4",
         "qemu-m7": "analogrig.devices.qemu:QemuM7",
+        "qemu-f405": "analogrig.devices.qemu:QemuF405",
         "serial": "analogrig.devices.serial:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
     },
