@@ -29,7 +29,8 @@ C_SOURCES := $(wildcard $(foreach folder,emulator/*/engine harness/*/* estimator
 
 # The firmware of the boards that QEMU emulates; the M0's runs on that of the M3. Also an STM32F405.
 BOARDS := m0 m3 m4 m7 f405
-FIRMWARE := $(BOARDS:%=$(BUILD)/firmware/analogrig-%.elf)
+TEXT_FIRMWARE := $(BUILD)/firmware/text_firmware.elf
+FIRMWARE := $(BOARDS:%=$(BUILD)/firmware/analogrig-%.elf) $(TEXT_FIRMWARE)
 M4F := -mcpu=cortex-m4 -mfloat-abi=hard -mfpu=fpv4-sp-d16
 CPU_m0 := -mcpu=cortex-m0 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_BOARD_CHOICE
 CPU_m3 := -mcpu=cortex-m3 -DFIRMWARE_ID=ANALOGRIG_FIRMWARE_FIRMWARE_ID_QEMU_M3_CHOICE
@@ -107,7 +108,7 @@ kills: $(PRODUCTS) ## end commands by signals at random instants, 40 of each com
 can-guest: $(PRODUCTS) $(BUILD)/can_guest/linux ## CAN on real SocketCAN, in a Linux that QEMU emulates; ARGS="-k fd" goes to its pytest
 	@$(BIN)/python -m tests.can_guest $(ARGS)
 
-firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F, M7 and STM32F405, into build/firmware; needs gcc-arm-none-eabi
+firmware: $(FIRMWARE) ## the device for Cortex-M0, M3, M4F, M7 and STM32F405, and the text example, into build/firmware; needs gcc-arm-none-eabi
 	@arm-none-eabi-size $(FIRMWARE)
 
 $(BUILD)/firmware/analogrig-m0.elf: estimator_c/ports/cortex_m0/float.S
@@ -119,6 +120,9 @@ $(BUILD)/firmware/analogrig-%.elf: $(NATIVE_SOURCES) $(wildcard estimator_c/port
 	@arm-none-eabi-gcc $(FIRMWARE_CFLAGS) $(CPU_$*) $(FIRMWARE_LDFLAGS) -L $(board) $(filter %.S,$^) \
 	    $(wildcard $(FIRMWARE_FOLDERS:%=%/*.c) $(board)/*.c) \
 	    $(BUILD)/generated/*.c -lgcc -o $@
+
+$(TEXT_FIRMWARE): $(NATIVE_SOURCES) $(wildcard estimator_c/ports/*/*.ld harness/examples/text_firmware/*)
+	@$(MAKE) --silent -C harness/examples/text_firmware ESTIMATOR=$(CURDIR)/estimator_c OUT=$(abspath $(@D)) $(abspath $@)
 
 no-firmware:
 	@echo "arm-none-eabi-gcc is absent, so no firmware is built: make tools"

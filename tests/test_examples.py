@@ -38,7 +38,9 @@ def run(command: str, folder: Path, status: int = 0) -> str:
 @pytest.fixture
 def example(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of the example that the parameter names."""
-    ignored = shutil.ignore_patterns("my_device*", "est.h", "build", "__pycache__")
+    ignored = shutil.ignore_patterns(
+        "my_device*", "text_firmware", "text_firmware.elf", "est.h", "build", "__pycache__"
+    )
     copy = tmp_path / str(request.param)
     shutil.copytree(EXAMPLES / request.param, copy, ignore=ignored)
     return copy
@@ -68,6 +70,19 @@ def test_estimator_is_that_of_the_tutorial() -> None:
     assert set(pasted) == {"src/my_state.h", "src/my_estimator.c", "Makefile"}
     for path, text in pasted.items():
         assert (EXAMPLES / "estimator" / path).read_text(encoding="utf-8") == text, path
+
+
+@pytest.mark.parametrize("example", ["text_firmware"], indirect=True)
+def test_text_firmware_answers_as_a_program(example: Path) -> None:
+    told = run("make --silent && printf 'R\\n7,1000,2000\\n' | ./text_firmware", example)
+    assert told.splitlines() == ["text firmware with est", "OK", f"7,{6 * '00000000,'}0"]
+
+
+@pytest.mark.tools("arm-none-eabi-gcc")
+@pytest.mark.parametrize("example", ["text_firmware"], indirect=True)
+def test_text_firmware_compiles_for_its_board(example: Path) -> None:
+    run("make --silent text_firmware.elf", example)
+    assert (example / "text_firmware.elf").read_bytes().startswith(b"\x7fELF")
 
 
 @pytest.mark.parametrize("example", ["rig"], indirect=True)

@@ -78,6 +78,7 @@ BUILT = {
     "firmware": Built(
         (
             *(FIRMWARE / f"analogrig-{board}.elf" for board in ("m0", "m3", "m4", "m7", "f405")),
+            FIRMWARE / "text_firmware.elf",
         ),
         "firmware",
         "arm-none-eabi-gcc",
