@@ -12,6 +12,7 @@ import tarfile
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[2]
 ESTIMATOR = ROOT / "estimator_c"
@@ -266,10 +267,12 @@ def test_zephyr_options_have_the_ranges_and_defaults_of_the_header() -> None:
 
 
 def test_zephyr_module_names_files_that_exist() -> None:
-    module = (ESTIMATOR / "zephyr" / "module.yml").read_text()
-    build = dict(re.findall(r"^  (cmake|kconfig): (\S+)$", module, re.MULTILINE))
-    assert (ESTIMATOR / build["cmake"] / "CMakeLists.txt").is_file()
-    assert (ESTIMATOR / build["kconfig"]).is_file()
+    """The keys are those of the schema in Zephyr's scripts/zephyr_module.py."""
+    module = yaml.safe_load((ESTIMATOR / "zephyr" / "module.yml").read_text())
+    assert set(module) == {"name", "build"}
+    assert set(module["build"]) == {"cmake", "kconfig"}
+    assert (ESTIMATOR / module["build"]["cmake"] / "CMakeLists.txt").is_file()
+    assert (ESTIMATOR / module["build"]["kconfig"]).is_file()
 
 
 ESP_IDF = f"""project(idf C)
@@ -304,6 +307,21 @@ def test_every_manifest_has_the_version_of_the_header() -> None:
     assert re.findall(r"^version=(.*)$", properties, re.MULTILINE) == [VERSION]
     assert re.findall(r'^version: "(.*)"$', component, re.MULTILINE) == [VERSION]
     assert f'version = "{VERSION}"' in project
+
+
+def test_manifests_have_the_fields_that_their_registries_require() -> None:
+    library = json.loads((ESTIMATOR / "library.json").read_text())
+    assert {"name", "version", "description", "keywords", "license"} <= set(library)
+    assert re.fullmatch(r"[a-z][a-z0-9_-]{0,49}", library["name"])
+    assert all(re.fullmatch(r"[a-z0-9-]{2,50}", word) for word in library["keywords"])
+    component = yaml.safe_load((ESTIMATOR / "idf_component.yml").read_text())
+    assert set(component) == {"version", "description", "license", "dependencies"}
+    assert re.fullmatch(r"\d+\.\d+\.\d+", component["version"])
+    assert component["license"] == library["license"] == "MIT"
+    fields = dict(line.split("=", 1) for line in (ESTIMATOR / "library.properties").read_text().splitlines())
+    required = ("name", "version", "author", "maintainer", "sentence", "paragraph", "category", "architectures")
+    assert all(fields[field] for field in required)
+    assert fields["category"] == "Data Processing", "one of the ten of the Arduino library specification"
 
 
 def test_manifests_of_arduino_and_platformio_name_the_headers_of_src() -> None:
