@@ -37,7 +37,7 @@ PACKAGES = {COMPILER: "gcc-arm-none-eabi", SIMULATOR: "qemu-system-arm", "avr-gc
 
 FLAGS = (
     *("-std=c99", "-mthumb", "-ffreestanding", "-ffp-contract=off", "-DNDEBUG", "-ffunction-sections"),
-    *("-Wall", "-Wextra", "-Wno-type-limits", "-Wdouble-promotion", "-Werror"),  # enums are one byte here
+    *("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror"),
     *("-nostdlib", "-nostartfiles", "-Wl,--gc-sections", f"-I{CORE}", f"-I{ISOLATION}"),
 )
 
