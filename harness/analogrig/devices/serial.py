@@ -38,6 +38,8 @@ class SerialDevice(ByteDevice):
         return PortWire(self.url, self.baud or DEFAULT_BAUD)
 
     def hint(self, link_name: str) -> str:  # noqa: ARG002
+        if self.url.startswith("socket:"):
+            return "the port may be serving another client"
         return f"the line was opened at {self.baud} baud"
 
     @property
