@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
 import secrets
+import select
 import shutil
 import socket
-from collections.abc import Sequence
+import termios
+import time
+import tty
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -25,6 +30,7 @@ if TYPE_CHECKING:
 FIRMWARE = Path(__file__).parents[3] / "build" / "firmware"
 
 QEMU = "qemu-system-arm"
+_ASK_AGAIN_S = 0.05
 _NO_SCREEN = ("-display", "none", "-monitor", "none", "-nodefaults")
 
 
@@ -57,7 +63,8 @@ class QemuDevice(EitherDevice):
 
         def open_bus(first_line: str) -> ChildBus:
             (terminal,) = re.findall(r"/dev/\S+", first_line) or [""]
-            return ChildBus(self.slcan(terminal), lambda _: child, name="qemu slcan")
+            with _listening(terminal, self.starting_s):
+                return ChildBus(self.slcan(terminal), lambda _: child, name="qemu slcan")
 
         child = self._boot(["-serial", "null", "-chardev", "pty,id=line", "-serial", "chardev:line"])
         return child.connect(open_bus)
@@ -95,6 +102,27 @@ class QemuDevice(EitherDevice):
             cure = "" if self.firmware else f": run `make firmware` in a clone, or name one: qemu-{self.core}:ELF"
             raise LinkError(f"there is no firmware {self.firmware or self.program}{cure}")
         return self.program
+
+
+@contextlib.contextmanager
+def _listening(terminal: str, within_s: float) -> Iterator[None]:
+    """Keep the terminal open after the adapter there has answered: before the firmware has started, a UART may drop
+    what it receives, and python-can opens the channel only once.
+
+    If nothing answers in time, the handshake reports it.
+    """
+    descriptor = os.open(terminal, os.O_RDWR | os.O_NOCTTY)
+    try:
+        tty.setraw(descriptor)
+        deadline_s = time.monotonic() + within_s
+        answer = False
+        while not answer and time.monotonic() < deadline_s:
+            os.write(descriptor, b"V\r")
+            answer = bool(select.select([descriptor], [], [], _ASK_AGAIN_S)[0])
+        termios.tcflush(descriptor, termios.TCIFLUSH)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _on_one_processor() -> list[str]:
