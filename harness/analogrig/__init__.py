@@ -14,8 +14,9 @@ A rig plays a scenario, a device under test answers with alarms and estimates, a
     >>> all(change.latency_n is not None for change in verdict.tweaks)
     True
 
-The names in ``__all__`` are the public interface, and so are their documented members. Everything else in the packages
-``analogrig``, ``analogrig_emulator`` and ``analogrig_thesis`` is private: it may move or change in any version.
+The names in ``__all__``, also of ``analogrig.devices`` and ``analogrig.rigs``, are the public interface, and so are
+their documented members. Everything else in the packages ``analogrig``, ``analogrig_emulator`` and
+``analogrig_thesis`` is private: it may move or change in any version.
 
 =============  =========================================================================================
 play           ``open_rig``, ``open_dut``, ``Bench``; their types ``Rig``, ``Device``, ``EstimatorConfig``
@@ -24,6 +25,8 @@ judge          ``Run``, ``Conditions``, ``judge``, ``Verdict``, ``ChangeVerdict`
 test           ``Play``, ``Played``, ``Finding``, ``rate_below``, ``with_some_seed``, ``strategies``
 errors         ``AnalogrigError`` and its kinds; ``EmulatorError``
 =============  =========================================================================================
+
+Kinds of devices and rigs of your own are made from ``analogrig.devices`` and ``analogrig.rigs``.
 
 ``strategies`` (a module) needs the extra ``analogrig[pytest]``. Importing ``analogrig`` loads nothing else: each name
 loads what it needs on first use.
@@ -63,6 +66,8 @@ if TYPE_CHECKING:
     __version__: str
     """Version of the installed package."""
 else:
+    from analogrig.lazy import loader
+
     _MODULES = {
         "analogrig.bench": "Bench",
         "analogrig.estimator_config": "EstimatorConfig",
@@ -84,21 +89,17 @@ else:
         "analogrig_emulator": "EmulatorError Excitation",
     }
 
+    _load = loader(__name__, _MODULES)
+
     def __getattr__(name: str) -> object:
         """Load a public name on first use."""
         import importlib
 
         if name == "__version__":
-            found = importlib.import_module("analogrig.identity").version()
-        elif name == "strategies":
-            found = importlib.import_module("analogrig.testing.strategies")
-        else:
-            module = next((module for module, names in _MODULES.items() if name in names.split()), None)
-            if module is None:
-                raise AttributeError(f"module 'analogrig' has no attribute {name!r}; public names: analogrig.__all__")
-            found = getattr(importlib.import_module(module), name)
-        globals()[name] = found
-        return found
+            return importlib.import_module("analogrig.identity").version()
+        if name == "strategies":
+            return importlib.import_module("analogrig.testing.strategies")
+        return _load(name)
 
     def __dir__() -> list[str]:
         """List the public names, loaded or not."""

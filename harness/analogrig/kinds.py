@@ -46,18 +46,45 @@ class Kinds(Mapping[str, type[T]], Generic[T]):
     def __len__(self) -> int:
         return len(self._own) + len(self._added)
 
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Kinds that other packages add."""
+        return tuple(self._added)
+
+    @property
+    def ignored(self) -> Mapping[str, str]:
+        """Kinds that other packages add in vain, with the reason."""
+        return {
+            point.name: f"ignored: {self._package(point)} cannot replace a kind that there is"
+            for point in self._points
+            if point.name in self._own or self._added[point.name] is not point
+        }
+
+    @functools.cached_property
+    def _points(self) -> tuple[importlib.metadata.EntryPoint, ...]:
+        """Entry points of other packages in a fixed order."""
+        found = importlib.metadata.entry_points(group=self._group)
+        return tuple(sorted(found, key=lambda point: (point.name, point.value)))
+
     @functools.cached_property
     def _added(self) -> Mapping[str, importlib.metadata.EntryPoint]:
-        """Entry points of other packages by kind."""
-        found = sorted(importlib.metadata.entry_points(group=self._group), key=lambda point: (point.name, point.value))
-        return {point.name: point for point in reversed(found) if point.name not in self._own}
+        """Entry points of other packages by kind; the first of each is used."""
+        return {point.name: point for point in reversed(self._points) if point.name not in self._own}
+
+    def _package(self, point: importlib.metadata.EntryPoint) -> str:
+        return f"the package {point.dist.name if point.dist else point.module} ({self._group}: {point.value})"
 
     def _load(self, point: importlib.metadata.EntryPoint) -> type[T]:
-        package = f"the package {point.dist.name if point.dist else point.module} ({self._group}: {point.value})"
+        where = f"kind {point.name!r}: {self._package(point)}"
         try:
             loaded = point.load()
-        except Exception as error:
-            raise ConfigurationError(f"kind {point.name!r}: {package} cannot be imported: {error}") from error
+        except (Exception, SystemExit) as error:  # foreign code raises what it likes
+            raise ConfigurationError(f"{where} cannot be imported: {type(error).__name__}: {error}") from error
         if not (isinstance(loaded, type) and issubclass(loaded, self._base)):
-            raise ConfigurationError(f"kind {point.name!r}: {package} is no subclass of {self._base.__name__}")
+            raise ConfigurationError(f"{where} is no subclass of {self._base.__name__}")
+        if (kind := getattr(loaded, "kind", point.name)) != point.name:
+            raise ConfigurationError(f"{where} states the kind {kind!r}")
+        for name, hint in self._base.__annotations__.items():
+            if str(hint).startswith("ClassVar") and not hasattr(loaded, name):
+                raise ConfigurationError(f"{where} has no {name}")
         return loaded

@@ -34,7 +34,7 @@ _MOST_SHOWN = 200
 class Thing:
     """Something outside analogrig that opening a rig or a device would load, run or connect to."""
 
-    kind: Literal["library", "firmware", "command", "address", "serial port", "CAN bus"]
+    kind: Literal["library", "firmware", "command", "address", "serial port", "CAN bus", "Python module"]
     name: str
     """Value of ``--allow``: an absolute path, HOST:PORT, a URL, ``can:INTERFACE/CHANNEL``, a command without a path."""
     order: str

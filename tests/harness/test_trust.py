@@ -21,6 +21,7 @@ import shutil
 import socket
 import struct
 import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -245,7 +246,18 @@ def a_can_server(folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path) -
     return Bait(name, witness, name, toml)
 
 
-DEVICES = (a_library, a_firmware, a_terminal, a_url, a_spied_url, a_can_adapter, a_can_server)
+def a_python_module(folder: Path, monkeypatch: pytest.MonkeyPatch, library: Path) -> Bait:  # noqa: ARG001
+    """Calling its function leaves the witness; it is imported by the first test that allows it."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (folder / "evil_estimator.py").write_text(
+        "import os, pathlib\ndef make():\n    pathlib.Path(os.environ['TRUST_WITNESS']).touch()\n"
+    )
+    name = "python:evil_estimator:make"
+    toml = 'kind = "python"\nfactory = "evil_estimator:make"\ndatasheet.theta_n = 6\n'
+    return Bait(name, LeavesFile(folder / "witness"), name, toml)
+
+
+DEVICES = (a_library, a_firmware, a_terminal, a_url, a_spied_url, a_can_adapter, a_can_server, a_python_module)
 
 
 # ---- rigs

@@ -81,11 +81,28 @@ def _entries(kind: str) -> list[dict[str, str]]:
     shipped = cast("config.Kind", kind)
     for path in (config.locate(shipped, name) for name in config.names(shipped)):
         found.setdefault(path.stem, _entry(path.stem, config.read_toml(path).get("description", ""), str(path)))
-    if kind == "devices":
-        from analogrig.devices.registry import KINDS as DEVICE_KINDS
+    return [*found.values(), *_kinds(kind)]
 
-        found |= {each.usage: _entry(each.usage, each.summary) for each in DEVICE_KINDS.values()}
-    return list(found.values())
+
+def _kinds(of: str) -> Iterator[dict[str, str]]:
+    """Kinds of devices, and those that installed packages add; a broken one with its error."""
+    from analogrig.devices.registry import KINDS as DEVICE_KINDS
+    from analogrig.errors import ConfigurationError
+    from analogrig.rigs.description import KINDS as RIG_KINDS
+
+    if of not in ("devices", "rigs"):
+        return
+    kinds, names = (DEVICE_KINDS, [*DEVICE_KINDS]) if of == "devices" else (RIG_KINDS, RIG_KINDS.added)
+    for name in names:
+        try:
+            described = kinds[name]
+        except ConfigurationError as error:
+            yield _entry(name, error)
+            continue
+        summary = getattr(described, "summary", "") or (described.__doc__ or "").partition("\n")[0]
+        yield _entry(getattr(described, "usage", name), summary)
+    for name, reason in kinds.ignored.items():
+        yield _entry(name, reason)
 
 
 def _entry(name: str, description: Any, file: str = "") -> dict[str, str]:

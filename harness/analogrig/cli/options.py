@@ -64,7 +64,8 @@ def add_allow(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="THING",
-        help="library, firmware, command, serial port, CAN bus or HOST:PORT that a file may name (repeatable)",
+        help="library, firmware, command, Python module, serial port, CAN bus or HOST:PORT that a file may name"
+        " (repeatable)",
     )
 
 

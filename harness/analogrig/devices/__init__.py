@@ -1,1 +1,73 @@
-"""Devices under test: kinds, registry, sessions, and the estimator without a device."""
+"""Devices under test: the interface for kinds of devices of your own.
+
+A kind is two classes. The description, a frozen dataclass, is a table of a device file; it opens the device, which
+takes blocks of samples and yields answers. An installed package adds the kind as an entry point:
+
+    [project.entry-points."analogrig.devices"]
+    mykind = "my_package.my_module:MyDescription"
+
+=============  ==========================================================================================
+describe       ``AdaptedDescription`` (base class), ``DeviceDescription``, ``Capability``, ``Thing``
+state          ``Datasheet``, ``ModelOrders``
+answer         ``Device`` (base class), ``Samples``, ``Answers``, ``RaisedAlarm``, ``ReportedDiagnosis``
+flags          ``SteppedFlag``, ``LOST``, ``UNREPORTED``, ``UNARMED``
+errors         ``DeviceRefused``, ``LinkClosed``, ``TimeLimitReached``; ``analogrig`` has more
+=============  ==========================================================================================
+
+The page "How do I add a kind of device?" has an example. This proves one:
+
+    pytest --pyargs analogrig.testing.conformance --hil-dut mykind
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+    from analogrig.catalogue import SteppedFlag
+    from analogrig.datasheet import Datasheet, ModelOrders
+    from analogrig.devices.adapted import AdaptedDescription
+    from analogrig.devices.description import Capability, DeviceDescription
+    from analogrig.devices.device import Device
+    from analogrig.errors import DeviceRefused, LinkClosed, TimeLimitReached
+    from analogrig.run import LOST, UNARMED, UNREPORTED
+    from analogrig.trust import Thing
+else:
+    from analogrig.lazy import loader
+
+    __getattr__ = loader(
+        __name__,
+        {
+            "analogrig.answers": "Answers RaisedAlarm ReportedDiagnosis Samples",
+            "analogrig.catalogue": "SteppedFlag",
+            "analogrig.datasheet": "Datasheet ModelOrders",
+            "analogrig.devices.adapted": "AdaptedDescription",
+            "analogrig.devices.description": "Capability DeviceDescription",
+            "analogrig.devices.device": "Device",
+            "analogrig.errors": "DeviceRefused LinkClosed TimeLimitReached",
+            "analogrig.run": "LOST UNARMED UNREPORTED",
+            "analogrig.trust": "Thing",
+        },
+    )
+
+__all__ = [
+    "LOST",
+    "UNARMED",
+    "UNREPORTED",
+    "AdaptedDescription",
+    "Answers",
+    "Capability",
+    "Datasheet",
+    "Device",
+    "DeviceDescription",
+    "DeviceRefused",
+    "LinkClosed",
+    "ModelOrders",
+    "RaisedAlarm",
+    "ReportedDiagnosis",
+    "Samples",
+    "SteppedFlag",
+    "Thing",
+    "TimeLimitReached",
+]

@@ -36,6 +36,7 @@ class CanDevice(FrameDevice):
     kind: ClassVar[str] = "can"
     usage: ClassVar[str] = "can:INTERFACE[/CHANNEL][?KEY=VALUE&...]"
     summary: ClassVar[str] = "node on a CAN bus that python-can can open"
+    collects: ClassVar[str] = "options"
     interface: str = ""
     """Interface in python-can's terms. Empty interface and channel come from python-can's own configuration."""
     channel: str = ""
@@ -67,12 +68,6 @@ class CanDevice(FrameDevice):
     def _place(cls, name: str, place: str) -> dict[str, Any]:  # noqa: ARG003
         interface, _, channel = place.partition("/")
         return {key: value for key, value in (("interface", interface), ("channel", channel)) if value}
-
-    @classmethod
-    def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
-        """The table with the keys that are no fields collected in ``options``."""
-        own = {key: value for key, value in table.items() if key in cls.__dataclass_fields__}
-        return {"options": {key: value for key, value in table.items() if key not in own}, **own}
 
     def bus(self) -> CanBus:
         from analogrig.devices.can_nodes import ChildBus, InhabitedBus

@@ -46,6 +46,8 @@ class DeviceDescription:
     """Name on the command line, with its parameters."""
     summary: ClassVar[str]
     """One line for `analogrig list`."""
+    collects: ClassVar[str] = ""
+    """Field that collects the keys of a name that are no fields; empty: they are refused."""
     name: str
     description: str = ""
     """One line for people."""
@@ -85,7 +87,11 @@ class DeviceDescription:
     @classmethod
     def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
         """The table with every key at its place in the description."""
-        return table
+        if not cls.collects:
+            return table
+        names = {field.name for field in dataclasses.fields(cls)}
+        own = {key: value for key, value in table.items() if key in names}
+        return {cls.collects: {key: value for key, value in table.items() if key not in own}, **own}
 
     @classmethod
     def _place(cls, name: str, place: str) -> dict[str, Any]:

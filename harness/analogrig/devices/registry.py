@@ -32,6 +32,7 @@ KINDS = Kinds(
         "qemu-f405": "analogrig.devices.qemu:QemuF405",
         "serial": "analogrig.devices.serial:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
+        "python": "analogrig.devices.python:PythonDescription",
     },
 )
 """Description of each kind of device."""

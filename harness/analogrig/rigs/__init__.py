@@ -1,4 +1,59 @@
-"""Rigs: instruments that play a scenario and yield samples."""
+"""Rigs, which play a scenario and yield samples: the interface for kinds of rigs of your own.
+
+A kind is two classes. The description, a frozen dataclass with the fields ``name`` and ``kind``, is a table of a rigs
+file; it opens the rig, which performs scenarios. An installed package adds the kind as an entry point. Its name alone,
+as in ``--rig mykind``, stands for a description with all defaults:
+
+    [project.entry-points."analogrig.rigs"]
+    mykind = "my_package.my_module:MyDescription"
+
+=============  ==========================================================================================
+describe       ``RigDescription`` (base class), ``Thing``
+perform        ``Rig`` (base class), ``Performance``, ``Hindsight``, ``CAPABILITIES``
+sample         ``Block``, ``CHANNELS``, ``Channel``, ``Segment``
+errors         ``RigTimeout``, ``RigClosed``, ``RigRefused``; ``RigError`` is in ``analogrig``
+=============  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 CAPABILITIES = ("excite", "tweak")
 """Optional capabilities of a rig beyond sampling, for ``Rig.capabilities``."""
+
+if TYPE_CHECKING:
+    from analogrig.errors import RigClosed, RigRefused, RigTimeout
+    from analogrig.plant import Segment
+    from analogrig.rigs.rig import Block, Hindsight, Performance, Rig, RigDescription
+    from analogrig.run import CHANNELS, Channel
+    from analogrig.trust import Thing
+else:
+    from analogrig.lazy import loader
+
+    __getattr__ = loader(
+        __name__,
+        {
+            "analogrig.errors": "RigClosed RigRefused RigTimeout",
+            "analogrig.plant": "Segment",
+            "analogrig.rigs.rig": "Block Hindsight Performance Rig RigDescription",
+            "analogrig.run": "CHANNELS Channel",
+            "analogrig.trust": "Thing",
+        },
+    )
+
+__all__ = [
+    "CAPABILITIES",
+    "CHANNELS",
+    "Block",
+    "Channel",
+    "Hindsight",
+    "Performance",
+    "Rig",
+    "RigClosed",
+    "RigDescription",
+    "RigRefused",
+    "RigTimeout",
+    "Segment",
+    "Thing",
+]

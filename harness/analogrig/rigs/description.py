@@ -35,8 +35,9 @@ def open_rig(name: str, *, self_test: bool = True, allow: Trust | Iterable[str] 
     """Open a rig by name. Use it in a ``with`` statement: leaving it switches outputs off and closes connections.
 
     ``recording:FILE`` replays a recording. Other names stand for a table ``[rig.NAME]`` of the rigs file, or else
-    for a shipped rig. The rigs file is the one that ANALOGRIG_RIGS names, or else rigs.toml in this folder. FILE.toml
-    stands for the rig described there, FILE.toml:NAME for one of several.
+    for a shipped rig, or else for a kind of rig that an installed package adds. The rigs file is the one that
+    ANALOGRIG_RIGS names, or else rigs.toml in this folder. FILE.toml stands for the rig described there, FILE.toml:NAME
+    for one of several.
 
     :param self_test: False: skip the self-test that the description of a real rig may ask for.
     :param allow: addresses, ports and commands that a description may name (``analogrig.trust``).
@@ -74,6 +75,8 @@ def _read(name: str) -> tuple[RigDescription, str, str]:
     kind, _, recording = name.partition(":")
     if kind == "recording" and recording:
         return RecordingDescription(Path(recording)), name, ""
+    if name in KINDS.added and name not in own_rigs()[1] and name not in config.names("rigs"):
+        return from_table({"kind": name, "name": name}, name), name, ""
     table, where, file = _find(name)
     return from_table(table, where).placed(file.parent), where, str(file)
 

@@ -175,8 +175,8 @@ def add_options(parser: pytest.Parser) -> None:
         action="append",
         default=[],
         metavar="THING",
-        help="library, firmware, command, serial port, CAN bus or HOST:PORT that a file may name (repeatable; not from"
-        " the ini file; in conftest.py: config.option.hil_allow)",
+        help="library, firmware, command, Python module, serial port, CAN bus or HOST:PORT that a file may name"
+        " (repeatable; not from the ini file; in conftest.py: config.option.hil_allow)",
     )
 
 

@@ -1,0 +1,314 @@
+"""Devices of the kind ``python``: answers, settings and errors of an object in this process."""
+
+from __future__ import annotations
+
+import re
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
+from analogrig.bench import Bench
+from analogrig.catalogue import Change, SteppedFlag
+from analogrig.cli import main
+from analogrig.datasheet import Datasheet, ModelOrders
+from analogrig.devices.description import DeviceDescription
+from analogrig.devices.device import Device
+from analogrig.devices.opening import open_dut, reopen_dut
+from analogrig.devices.python import PythonDescription
+from analogrig.errors import ConfigurationError, DeviceError, DeviceRefused, TimeLimitReached
+from analogrig.judging.verdict import judge
+from analogrig.rigs.description import open_rig
+from analogrig.run import UNARMED, UNREPORTED
+from analogrig.scenario import Scenario
+
+ESTIMATORS = "tests.harness.python_estimators"
+THESIS_HASH, HEALTHY_HASH = "2ba8713bf6ac34db", "a84863c36d986882"
+
+pytestmark = pytest.mark.usefixtures("_own_path")
+
+
+@pytest.fixture
+def _own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paths that a device adds are removed after the test."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def module(folder: Path, text: str) -> str:
+    """Name of a new module in the folder."""
+    name = f"written_{folder.name}_{len(list(folder.glob('*.py')))}"
+    (folder / f"{name}.py").write_text(textwrap.dedent(text))
+    return name
+
+
+def samples(n: int, first: int = 0, missing: Sequence[int] = ()) -> Samples:
+    valid = ~np.isin(np.arange(n), missing)
+    return Samples(first, np.full(n, 5, np.uint16), np.full(n, 7, np.uint16), valid)
+
+
+def made(factory: str, **settings: Any) -> Device:
+    return PythonDescription(name="it", factory=f"{ESTIMATORS}:{factory}", settings=settings).connect()
+
+
+def answered(device: Device, *blocks: Samples) -> list[Answers]:
+    device.start()
+    return list(device.play(blocks))
+
+
+@pytest.mark.parametrize(("scenario", "start"), [("thesis", THESIS_HASH), ("healthy", HEALTHY_HASH)])
+@pytest.mark.parametrize("factory", ["Core", "CoreInBlocks"])
+def test_our_core_as_a_python_object_gives_its_estimates_to_the_bit(factory: str, scenario: str, start: str) -> None:
+    with open_rig("emulator") as rig, open_dut(f"python:{ESTIMATORS}:{factory}") as dut:
+        run = Bench(rig, dut).play(Scenario.load(scenario), 7)
+    assert run.theta_hash().startswith(start)
+    assert judge(run).valid
+
+
+def test_every_quantity_arrives_at_its_sample() -> None:
+    device = made("Counting", period=3)
+    (first, second) = answered(device, samples(4, missing=[2]), samples(2, 4))
+    assert first.theta is not None and first.innovation is not None and first.statistic is not None
+    assert first.theta.tolist() == [[0, 0], [1, -1], [1, -1], [3, -3]], "a missing sample repeats the estimate"
+    assert first.innovation.tolist() == first.statistic.tolist() == [0, 1, 2, 3]
+    assert first.flags.tolist() == [UNARMED, UNARMED, UNARMED | SteppedFlag.MISSING, 0]
+    assert first.alarms == (RaisedAlarm(0, statistic=0.0), RaisedAlarm(3, statistic=3.0))
+    assert first.diagnoses[1] == ReportedDiagnosis(3, Change.MASS, 3, 0.5)
+    assert second.theta is not None
+    assert second.theta.tolist() == [[4, -4], [5, -5]]
+    assert (len(second), second.alarms) == (2, ())
+
+
+def test_sample_without_an_estimate_is_unreported() -> None:
+    device = made("Answering", answer=False, sheet={"theta_n": 1})
+    (answers,) = answered(device, samples(2, missing=[1]))
+    assert answers.flags.tolist() == [UNREPORTED, SteppedFlag.MISSING]
+
+
+def test_quantity_that_is_not_reported_is_absent() -> None:
+    (answers,) = answered(made("Answering", answer=np.True_), samples(2))
+    assert [alarm.index for alarm in answers.alarms] == [0, 1]
+    assert answers.theta is answers.innovation is answers.statistic is None
+
+
+def test_record_begins_anew_with_reset_or_with_a_new_object(folder: Path) -> None:
+    name = module(
+        folder,
+        """
+        made = []
+        class New:
+            n = 0
+            def __init__(self): made.append(self)
+            def step(self, u, y, valid):
+                self.n += 1
+                return self.n == 2
+        class Reset(New):
+            def reset(self): self.n = 0
+        """,
+    )
+    for factory, objects in (("New", 3), ("Reset", 1)):
+        device = open_dut(f"python:{name}:{factory}")
+        before = len(sys.modules[name].made)
+        assert [[a.index for a in answered(device, samples(4))[0].alarms] for _ in range(3)] == [[1]] * 3
+        assert len(sys.modules[name].made) - before == objects - 1
+
+
+def test_data_sheet_of_the_object_replaces_what_the_file_states() -> None:
+    stated = Datasheet(theta_n=9, hold_off_n=60)
+    settings: dict[str, Any] = {
+        "answer": False,
+        "sheet": {"theta_n": 3, "model": {"na": 2, "nb": 1}, "cannot_tell": ["a hang"]},
+    }
+    device = PythonDescription(
+        name="it", factory=f"{ESTIMATORS}:Answering", settings=settings, datasheet=stated
+    ).connect()
+    assert device.datasheet == Datasheet(theta_n=3, model=ModelOrders(2, 1), hold_off_n=60, cannot_tell=("a hang",))
+    assert Datasheet.recorded(device.description()) == device.datasheet
+
+
+def test_settings_come_from_file_and_command_line_and_are_recorded(folder: Path) -> None:
+    name = module(
+        folder,
+        """
+        class It:
+            def __init__(self, *, threshold=1.0, kind="plain"): self.answer = (threshold, kind) == (4, "3d")
+            def step(self, u, y, valid): return self.answer
+        """,
+    )
+    (folder / "it.toml").write_text(
+        f'kind = "python"\nfactory = "{name}:It"\nsettings = {{ threshold = 4, kind = "3d" }}'
+    )
+    for device in (
+        open_dut(f"python:{name}:It?threshold=4&kind=3d"),
+        open_dut("it.toml", allow=f"python:{name}:It"),
+    ):
+        assert len(answered(device, samples(1))[0].alarms) == 1
+        again = reopen_dut(device.description(), "run.npz", allow=[f"python:{name}:It"])
+        assert again.description() == device.description()
+        assert len(answered(again, samples(1))[0].alarms) == 1
+        device.configure(threshold=5)
+        assert len(answered(device, samples(1))[0].alarms) == 0
+        with pytest.raises(DeviceRefused, match="has no setting thershold; it has threshold, kind"):
+            device.configure(threshold=4, thershold=4)
+        assert len(answered(device, samples(1))[0].alarms) == 0, "all or none"
+
+
+def test_file_may_not_import_a_module_of_itself(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = module(folder, "raise SystemExit('was imported')")
+    (folder / "it.toml").write_text(f'kind = "python"\nfactory = "{name}:It"')
+    assert main(["run", "--dut", "it.toml"]) == 2
+    error = capsys.readouterr().err
+    assert error == (
+        f"analogrig: it.toml: the device imports python:{name}:It, which no file may order:"
+        f" pass --allow python:{name}:It\n"
+    )
+    assert main(["run", "--dut", "it.toml", "--allow", f"python:{name}:It"]) == 2
+    assert "was imported" in capsys.readouterr().err
+
+
+WRONG_NAMES = {
+    "python": "device 'python': names no factory: pass python:package.module:name",
+    "python:lonely": "factory must be package.module:name, not 'lonely'",
+    "python:no_such_module:It": "there is no module no_such_module, neither in {folder} nor installed",
+    f"python:{ESTIMATORS}.more:It": f"there is no module {ESTIMATORS}.more",
+    f"python:{ESTIMATORS}:It": "python_estimators.py has no It",
+    f"python:{ESTIMATORS}:SHEET": "python_estimators:SHEET is a dict, which cannot be called",
+    f"python:{ESTIMATORS}:Core?arl=3": "Core has no setting arl; it has arl0",
+    f"python:{ESTIMATORS}:Answering": "Answering needs the setting answer",
+    f"python:{ESTIMATORS}:Core?arl0=-1": "Core raised ValueError: arl0 must be",
+    "python:builtins:str": "str made a str, which has no method step(u, y, valid)",
+}
+
+
+@pytest.mark.parametrize("name", WRONG_NAMES)
+def test_wrong_name_is_one_line(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--dut", name]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("analogrig: ") and error.count("\n") == 1
+    assert WRONG_NAMES[name].format(folder=folder) in error
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("import no_such_module", r"cannot be imported: ModuleNotFoundError: .*written_.*\.py:1"),
+        ("def step(:", r"cannot be imported: SyntaxError: .*written_.*\.py, line 1"),
+        ("\nx = 1 / 0", r"cannot be imported: ZeroDivisionError: division by zero \(.*written_.*\.py:2\)"),
+    ],
+)
+def test_module_that_cannot_be_imported_is_one_line(folder: Path, text: str, error: str) -> None:
+    with pytest.raises(ConfigurationError, match=error):
+        open_dut(f"python:{module(folder, text)}:It")
+
+
+@pytest.mark.parametrize("way", ["step", "step_block"])
+def test_exception_names_sample_type_and_line_and_ends_the_run(way: str, folder: Path) -> None:
+    quiet = "False" if way == "step" else "np.zeros(len(u), bool)"
+    name = module(
+        folder,
+        f"""
+        import numpy as np
+        class It:
+            n = 0
+            def {way}(self, u, y, valid):
+                self.n += np.size(u)
+                return self.fail() if self.n > 300 else {quiet}
+            def fail(self):
+                return np.ones(2) @ np.ones(3)
+        """,
+    )
+    with open_rig("emulator") as rig, open_dut(f"python:{name}:It") as dut:
+        run = Bench(rig, dut).play(Scenario.load("healthy"), 1)
+    where = "step of sample 300" if way == "step" else "step_block of the samples 256 to 511"
+    assert run.samples == (300 if way == "step" else 256), "the answers before it hold"
+    (fault,) = run.conditions.faults
+    assert re.fullmatch(rf"device .*: {where} raised ValueError: matmul.* \(.*{name}\.py:9\)", fault)
+    assert judge(run).outcome == "inconclusive"
+
+
+WRONG_ANSWERS: dict[str, tuple[object, object, str]] = {
+    "text": ("no", None, r"must return True, False or an object with such an alarm, not 'no' \(str\)"),
+    "nothing": (None, None, r"not None \(NoneType\)"),
+    "number": (1, None, r"not 1 \(int\)"),
+    "alarm": ({"alarm": 1}, None, r"not \{'alarm': 1\} \(dict\)"),
+    "key": ({"alarm": False, "thetta": [1]}, None, "unknown key 'thetta'"),
+    "nan": (
+        {"alarm": False, "statistic": float("nan")},
+        {"statistic": True},
+        r"statistic is nan \(float\): non-finite",
+    ),
+    "far": ({"alarm": False, "innovation": 1e39}, {"innovation": True}, "innovation is 1e\\+39 .*beyond float32"),
+    "theta": ({"alarm": False, "theta": [1.0]}, {"theta_n": 2}, "theta must be 2 numbers, as the data sheet states"),
+    "words": ({"alarm": False, "theta": ["1", "2"]}, {"theta_n": 2}, "theta must be 2 numbers"),
+    "unstated": ({"alarm": False, "theta": [1.0]}, None, "returned theta, which the data sheet does not state"),
+    "change": ({"alarm": False, "diagnosis": {"change": "age"}}, {"diagnoses": True}, "change must be one of mass, "),
+    "onset": (
+        {"alarm": False, "diagnosis": {"change": "mass", "onset": 9, "extent": 1.0}},
+        {"diagnoses": True},
+        "onset must be a sample from 0 to 0, not 9",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_ANSWERS)
+def test_wrong_answer_is_one_line(wrong: str) -> None:
+    answer, sheet, error = WRONG_ANSWERS[wrong]
+    with pytest.raises(DeviceError, match=f"device it: step of sample 0: .*{error}"):
+        answered(made("Answering", answer=answer, sheet=sheet or {}), samples(2))
+
+
+WRONG_BLOCKS: dict[str, tuple[object, object, str]] = {
+    "alarm": ({"alarm": [0, 1]}, None, "alarm must be an array of 2 truth values"),
+    "length": (np.zeros(3, np.bool_), None, "alarm must be an array of 2 truth values"),
+    "theta": ({"alarm": [False] * 2, "theta": np.zeros((3, 1))}, {"theta_n": 1}, "theta must be 2 x 1 numbers"),
+    "nan": ({"alarm": [False] * 2, "theta": [[1.0], [np.nan]]}, {"theta_n": 1}, "theta is .*: non-finite"),
+    "armed": ({"alarm": [False] * 2}, {"armed": True}, "armed must be an array of 2 truth values, not None"),
+    "diagnosis": ({"alarm": [False] * 2, "diagnosis": [None]}, {"diagnoses": True}, "diagnosis must be a list of 2"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_BLOCKS)
+def test_wrong_answer_to_a_block_is_one_line(wrong: str) -> None:
+    answer, sheet, error = WRONG_BLOCKS[wrong]
+    with pytest.raises(DeviceError, match=f"device it: step_block of the samples 8 to 9: {error}"):
+        answered(made("Answering", answer=answer, sheet=sheet or {}, block=True), samples(2, 8))
+
+
+@pytest.mark.parametrize("sheet", [3, {"theta": 3}, {"theta_n": -1}])
+def test_wrong_data_sheet_is_one_line(sheet: object) -> None:
+    with pytest.raises(ConfigurationError, match=f"device it: datasheet of {ESTIMATORS}:Answering: "):
+        made("Answering", answer=False, sheet=sheet)
+
+
+def test_time_limit_ends_the_play_after_the_answers_in_time() -> None:
+    device = made("Counting")
+    device.limit(0.0)
+    with pytest.raises(TimeLimitReached):
+        answered(device, samples(2))
+    device.limit(float("inf"))
+    assert len(answered(device, samples(2))[0]) == 2
+
+
+def test_file_of_the_module_is_recorded_as_it_was_imported(folder: Path) -> None:
+    name = module(folder, "class It:\n    def step(self, u, y, valid): return False\n")
+    (before,) = open_dut(f"python:{name}:It").files()
+    (folder / f"{name}.py").write_text("")
+    (after,) = open_dut(f"python:{name}:It").files()
+    assert before == after
+    assert Path(before.path).name == f"{name}.py" and len(before.sha256) == 64
+
+
+def test_device_runs_in_this_process_in_blocks() -> None:
+    description: DeviceDescription = PythonDescription(name="it", factory=f"{ESTIMATORS}:Core")
+    assert description.capabilities == {"blocks", "configure", "in-process"}
+    assert description.only_one == "" and description.program is None
