@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import doctest
+import importlib
 import inspect
+import re
 import subprocess
 import sys
 from typing import Any
@@ -19,6 +21,15 @@ PUBLIC = """
     write_report
 """.split()
 
+DEVICES = """
+    LOST UNARMED UNREPORTED AdaptedDescription Answers Capability Datasheet Device DeviceDescription DeviceRefused
+    LinkClosed ModelOrders RaisedAlarm ReportedDiagnosis Samples SteppedFlag Thing TimeLimitReached
+""".split()
+RIGS = """
+    CAPABILITIES CHANNELS Block Channel Hindsight Performance Rig RigClosed RigDescription RigRefused RigTimeout Segment
+    Thing
+""".split()
+
 NO_BEGINNING = {"What", "Whether", "Of", "As", "How", "Who", "Whatever", "Whoever", "That", "Those"}
 """First words of a docstring that cannot be read alone."""
 
@@ -32,6 +43,17 @@ def test_public_names_are_these_and_at_most_forty() -> None:
     assert len(PUBLIC) <= 40
     assert sorted(PUBLIC) == PUBLIC
     assert set(PUBLIC) <= set(dir(analogrig))
+
+
+@pytest.mark.parametrize(("package", "names"), [("devices", DEVICES), ("rigs", RIGS)])
+def test_interfaces_for_kinds_of_other_packages_are_these(package: str, names: list[str]) -> None:
+    module = importlib.import_module(f"analogrig.{package}")
+    assert module.__all__ == names
+    for name in names:
+        assert getattr(module, name) is not None
+        assert re.search(rf"\b{name}\b", str(module.__doc__)), name
+    with pytest.raises(AttributeError, match=f"no attribute 'no_such'; public names: analogrig.{package}.__all__"):
+        module.no_such  # noqa: B018 - what a user writes
 
 
 def test_star_import_brings_the_public_names() -> None:
@@ -84,6 +106,7 @@ def test_import_loads_nothing_heavy_and_an_error_neither() -> None:
     assert "analogrig" in loaded
     assert not loaded & heavy
     assert not loaded_after("from analogrig import AnalogrigError") & heavy
+    assert not loaded_after("import analogrig.devices, analogrig.rigs") & heavy
     assert "numpy" in loaded_after("from analogrig import Run")
     assert not loaded_after("from analogrig import Played, Finding, Play, Scenario") & {"hypothesis", "pytest"}
 

@@ -25,7 +25,7 @@ from analogrig.errors import ConfigurationError
 from analogrig.rigs.description import from_table as rig_of
 from analogrig.rigs.description import open_rig
 from analogrig.rigs.emulator import is_emulated
-from analogrig.rigs.rig import Rig
+from analogrig.rigs.rig import Rig, RigDescription
 from analogrig.scenario import PotChange, Scenario
 from analogrig.trust import Trust
 from analogrig.wording import number_of
@@ -222,7 +222,12 @@ def open_table(table: Mapping[str, Any]) -> Rig:
 
     :raises ConfigurationError: it is wrong.
     """
-    return rig_of(table.get("described", table), f"rig {table['name']}").open()
+    return _described(table).open()
+
+
+def _described(table: Mapping[str, Any]) -> RigDescription:
+    """:raises ConfigurationError: the table of a plan describes no rig."""
+    return rig_of(table.get("described", table), f"rig {table['name']}")
 
 
 def device_table(name: str, allow: Trust | Iterable[str] = ()) -> Mapping[str, Any]:
@@ -248,7 +253,7 @@ def device_of(table: Mapping[str, Any]) -> DeviceDescription:
 
 def one_worker_only(rigs: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]) -> str:
     """Name of the first rig or device that only one worker can use at a time; "" if there is none."""
-    single_rigs = ("" if "card" in table else str(table["name"]) for table in rigs)
+    single_rigs = (str(table["name"]) if _described(table).only_one else "" for table in rigs)
     return next(filter(None, (*single_rigs, *(device_of(table).only_one for table in devices))), "")
 
 

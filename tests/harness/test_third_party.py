@@ -1,0 +1,150 @@
+"""Kinds of devices and rigs that another package adds, through every command; and packages that are broken."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from analogrig.devices.registry import KINDS
+from analogrig.run import Run
+
+PAGE = Path(__file__).parents[2] / "harness/docs/howto/add-a-kind-of-device.md"
+RIG = Path(__file__).with_name("third_party.py")
+SCENARIO = """\
+samples = 400
+rig = "flat"
+dut = "jump:80"
+[excitation]
+low_v = 0.1
+high_v = 9.9
+[expect]
+missed = 0
+"""
+CAMPAIGN = 'trials = 2\nscenario = "scenario.toml"\nrigs = ["flat"]\ndevices = ["jump:80", "jump:5000"]\n'
+PLAYS = """\
+def test_it(hil_play):
+    assert hil_play("scenario.toml").run.alarm_index.tolist() == [251]
+"""
+BROKEN = {
+    "devices": {
+        "absent": ("no_such_module:It", "kind 'absent': the package broken"),
+        "failing": ("broken_kinds_fail:It", "cannot be imported: ZeroDivisionError: division by zero"),
+        "leaving": ("broken_kinds_leave:It", "cannot be imported: SystemExit: bye"),
+        "alien": ("json:JSONDecoder", "is no subclass of DeviceDescription"),
+        "misnamed": ("my_kinds:JumpDescription", "states the kind 'jump'"),
+        "dumb": ("broken_kinds_dumb:It", "has no usage"),
+        "inproc": ("my_kinds:JumpDescription", "ignored: the package broken"),
+        "jump": ("broken_kinds_fail:It", "cannot be imported"),
+    },
+    "rigs": {
+        "emulator": ("third_party:FlatDescription", "cannot replace a kind that there is"),
+        "gone": ("no_such_module:It", "No module named 'no_such_module'"),
+    },
+}
+
+
+def install(site: Path, package: str, **groups: dict[str, str]) -> None:
+    """What pip leaves of a package, except its modules."""
+    info = site / f"{package}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    text = "".join(
+        f"[analogrig.{group}]\n" + "".join(f"{kind} = {target}\n" for kind, target in kinds.items())
+        for group, kinds in groups.items()
+    )
+    (info / "entry_points.txt").write_text(text)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the installed package of the page, and a rig."""
+    folder = tmp_path_factory.mktemp("site")
+    (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    (folder / "my_kinds.py").write_text(source)
+    (folder / "third_party.py").write_text(RIG.read_text(encoding="utf-8"))
+    install(
+        folder, "my_kinds", devices={"jump": "my_kinds:JumpDescription"}, rigs={"flat": "third_party:FlatDescription"}
+    )
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "scenario.toml").write_text(SCENARIO)
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+    (tmp_path / "test_plays.py").write_text(PLAYS)
+    return tmp_path
+
+
+def run(site: Path, cwd: Path, module: str, *words: str) -> subprocess.CompletedProcess[str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("ANALOGRIG", "PYTEST"))}
+    return subprocess.run(
+        [sys.executable, "-m", module, *words],
+        cwd=cwd,
+        env=kept | {"PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_page_shows_a_kind_in_forty_lines(site: Path) -> None:
+    lines = [line for line in (site / "my_kinds.py").read_text().splitlines() if line.strip()]
+    assert len(lines) <= 40
+
+
+def test_kinds_of_another_package_play(site: Path, folder: Path) -> None:
+    words = ("run", "--dut", "jump:80", "--rig", "flat", "--scenario", "scenario.toml", "--out", "out")
+    done = run(site, folder, "analogrig.cli", *words)
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    played = Run.load(folder / "out" / "run.npz")
+    assert played.alarm_index.tolist() == [251]
+    assert played.datasheet.statistic and played.alarm_statistic[0] > 80.0
+    assert played.conditions.rig == {"name": "flat", "kind": "flat", "jump_at": 250}
+    assert played.conditions.dut["codes"] == 80
+    again = run(site, folder, "analogrig.cli", "replay", "out/run.npz", "--out", "again")
+    assert (again.returncode, again.stderr) == (0, ""), "the device is opened from the record"
+
+
+def test_kinds_of_another_package_play_in_pytest_and_in_campaigns(site: Path, folder: Path) -> None:
+    done = run(site, folder, "pytest", "-q", "-p", "no:cacheprovider", "--hil-rig", "flat", "--hil-dut", "jump")
+    assert "1 passed" in done.stdout, done.stdout
+    done = run(
+        site, folder, "analogrig.cli", "campaign", "campaign.toml", "--workers", "2", "--out", "out.json", "--json"
+    )
+    assert done.stderr == ""
+    assert [cell["missed"] for cell in json.loads(done.stdout)["cells"]] == [0, 2]
+
+
+def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: Path) -> None:
+    (folder / "broken_kinds_fail.py").write_text("1 / 0")
+    (folder / "broken_kinds_leave.py").write_text("raise SystemExit('bye')")
+    (folder / "broken_kinds_dumb.py").write_text(
+        "import analogrig.devices\nclass It(analogrig.devices.DeviceDescription):\n    kind = 'dumb'\n"
+    )
+    install(folder, "broken", **{group: {k: v[0] for k, v in kinds.items()} for group, kinds in BROKEN.items()})
+    both = Path(f"{site}{os.pathsep}{folder}")
+    done = run(both, folder, "analogrig.cli", "list", "--json")
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
+    listed = json.loads(done.stdout)
+    for group, kinds in BROKEN.items():
+        rows = [(row["name"], row["description"]) for row in listed[group]]
+        for kind, (_, text) in kinds.items():
+            assert any(name == kind and text in shown for name, shown in rows), (kind, rows)
+    assert "host[?link=slcan]" in {row["name"] for row in listed["devices"]}
+    played = run(both, folder, "analogrig.cli", "run", "--dut", "inproc", "--out", "out")
+    assert (played.returncode, played.stderr) == (0, "")
+    failed = run(both, folder, "analogrig.cli", "run", "--dut", "failing")
+    assert failed.returncode == 2
+    assert failed.stderr.startswith("analogrig: kind 'failing': the package broken (analogrig.devices: ")
+    assert failed.stderr.count("\n") == 1
+
+
+def test_every_kind_states_what_a_list_shows() -> None:
+    assert all(cls.kind == kind and cls.usage.startswith(kind) and cls.summary for kind, cls in KINDS.items())
