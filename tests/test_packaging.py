@@ -44,6 +44,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig/bin/analogrig-device",
         "analogrig/bin/analogrig-tether",
         "analogrig/fixtures/scenarios/thesis.toml",
+        "analogrig/include/analogrig_estimator.h",
         "analogrig/py.typed",
         "analogrig/reporting/uPlot.iife.min.js",
         "analogrig/reporting/uPlot.min.css",

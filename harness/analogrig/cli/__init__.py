@@ -46,6 +46,7 @@ _COMMANDS = (
     emulation.add_netlist,
     listing.add_list,
     listing.add_completion,
+    listing.add_include,
 )
 """Functions that add the commands to the parser, in the order of ``--help``."""
 

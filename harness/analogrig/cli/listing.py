@@ -1,10 +1,11 @@
-"""``analogrig list`` and ``completion``: the names that commands take, for people and for shells."""
+"""``analogrig list``, ``completion`` and ``include``: names and places, for people, shells and compilers."""
 
 from __future__ import annotations
 
 import argparse
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
 from analogrig.cli.options import CAMPAIGN, DUT, PROGRAMS, RIG, SCENARIO, add_command, add_json
@@ -15,6 +16,9 @@ SHELLS = ("bash", "zsh", "fish")
 
 COMPLETION_VARIABLE = "_ARGCOMPLETE"
 """Set by the shell when it asks for completions instead of running the command."""
+
+_INCLUDE = Path(__file__).parents[1] / "include"
+"""Folder of the headers that the package brings."""
 
 _KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN: "campaigns"}
 
@@ -47,6 +51,16 @@ def add_completion(commands: Any) -> None:
     )
     command.add_argument("shell", choices=SHELLS, help="shell that reads the script")
     command.set_defaults(command=_completion)
+
+
+def add_include(commands: Any) -> None:
+    command = add_command(
+        commands,
+        "include",
+        "print the folder of analogrig_estimator.h, the C header for an estimator of your own",
+        "include",
+    )
+    command.set_defaults(command=_include)
 
 
 def _list(arguments: argparse.Namespace) -> int:
@@ -118,6 +132,11 @@ def _completion(arguments: argparse.Namespace) -> int:
     from argcomplete.shell_integration import shellcode
 
     show_plain(shellcode(["analogrig"], shell=arguments.shell).strip("\n"))
+    return PASSED
+
+
+def _include(_: argparse.Namespace) -> int:
+    show_plain(str(_INCLUDE))
     return PASSED
 
 
