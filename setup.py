@@ -30,12 +30,13 @@ ENGINE = Path("emulator/analogrig_emulator/_engine.so")
 DEVICE = Path("harness/analogrig/_device.so")
 HOST = Path("harness/analogrig/bin/analogrig-device")
 TETHER = Path("harness/analogrig/bin/analogrig-tether")
+LIBRARY_CHILD = Path("harness/analogrig/bin/analogrig-library")
 STAMP = Path("harness/analogrig/_commit.txt")
 UPLOT = {
     Path("harness/analogrig/reporting/uPlot.iife.min.js"): "uplot/static/uPlot.iife.js",
     Path("harness/analogrig/reporting/uPlot.min.css"): "uplot/static/uPlot.min.css",
 }
-PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, *UPLOT)
+PRODUCTS = (CATALOGUE, ENGINE, DEVICE, HOST, TETHER, LIBRARY_CHILD, *UPLOT)
 
 GENERATE = Path("estimator_c/catalogue/generate.py")
 ENGINE_SOURCES = ("emulator/analogrig_emulator/engine/*.c",)
@@ -43,6 +44,7 @@ DEVICE_SOURCES = ("estimator_c/core/*.c", "estimator_c/isolation/*.c", "estimato
 HOST_SOURCES = ("estimator_c/ports/host/*.c", "estimator_c/ports/loop/*.c")
 LIBRARY_SOURCES = ("estimator_c/ports/library/*.c",)
 TETHER_SOURCES = ("harness/analogrig/devices/tether.c",)
+LIBRARY_CHILD_SOURCES = ("harness/analogrig/devices/library_child.c",)
 DATA = Path("analogrig")
 """The package of the wheel that receives SHIPPED, at the same paths below it."""
 FIXTURES = ("fixtures/*/*.toml",)  # and not the pictures of the README
@@ -65,6 +67,7 @@ BIT_EXACT = ("-std=c99", "-ffp-contract=off", "-fno-fast-math")
 SHARED = ("-shared", "-fPIC")
 HOST_ROOM = ("-DDEVICE_LOOP_INPUT_SIZE=18360U",)  # 255 blocks, 0.18 s of real time: as long as the harness may be late
 POSIX = ("-D_XOPEN_SOURCE=700",)  # pseudo-terminals, processes; no part of the device but its port may know them
+LIBRARY_CHILD_FLAGS = (*POSIX, "-D_DEFAULT_SOURCE", "-Iharness/analogrig/include")  # anonymous memory
 
 
 class BuildProducts(Command):
@@ -110,6 +113,7 @@ class BuildProducts(Command):
         compile_c(placed(DEVICE), (*sources(LIBRARY_SOURCES), *device), (*SHARED, *include))
         compile_c(placed(HOST), (*sources(HOST_SOURCES), *device), (*POSIX, *HOST_ROOM, *include))
         compile_c(placed(TETHER), sources(TETHER_SOURCES), POSIX)
+        compile_c(placed(LIBRARY_CHILD), sources(LIBRARY_CHILD_SOURCES), LIBRARY_CHILD_FLAGS, ("-ldl", "-lm"))
         for product, origin in UPLOT.items():
             shutil.copyfile(str(distribution("uplot-python").locate_file(origin)), placed(product))
         if not in_tree:
@@ -126,7 +130,7 @@ class BuildProducts(Command):
 
     def get_source_files(self) -> list[str]:
         """Part of the protocol of setuptools: what an sdist must hold."""
-        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES)
+        programs = (*HOST_SOURCES, *LIBRARY_SOURCES, *TETHER_SOURCES, *LIBRARY_CHILD_SOURCES)
         return [str(path) for path in sources((*ENGINE_SOURCES, *DEVICE_SOURCES, *programs, *OTHER_SOURCES))]
 
     def get_outputs(self) -> list[str]:
@@ -175,14 +179,14 @@ def generate_codecs(generated: Path, tables: Path) -> None:
     os.utime(tables)  # it may have been left as it was; make must see that it is up to date
 
 
-def compile_c(product: Path, files: Iterable[Path], flags: Iterable[str]) -> None:
+def compile_c(product: Path, files: Iterable[Path], flags: Iterable[str], libraries: Iterable[str] = ()) -> None:
     """Compile and link in one go.
 
     A program that has the old product open keeps it: the new one is a new file, moved into place.
     """
     part = product.with_name(f".{product.name}.{os.getpid()}")
     options = ["-O2", *words("CFLAGS"), *flags, *BIT_EXACT]
-    command = [*compiler(), *options, "-o", str(part), *map(str, files), *words("LDFLAGS")]
+    command = [*compiler(), *options, "-o", str(part), *map(str, files), *libraries, *words("LDFLAGS")]
     logging.getLogger(__name__).info(shlex.join(command))
     try:
         if subprocess.run(command, check=False).returncode != 0:

@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).parents[1]
-FOLDERS = ("emulator/analogrig_emulator/engine", "harness/analogrig/devices", "harness/analogrig/include", "estimator_c")
+FOLDERS = (
+    "emulator/analogrig_emulator/engine",
+    "harness/analogrig/devices",
+    "harness/analogrig/include",
+    "estimator_c",
+)
 
 
 @pytest.mark.tools("clang-format-14")

@@ -42,6 +42,7 @@ def test_wheel_holds_every_product(wheel: Path) -> None:
         "analogrig/_commit.txt",
         "analogrig/_device.so",
         "analogrig/bin/analogrig-device",
+        "analogrig/bin/analogrig-library",
         "analogrig/bin/analogrig-tether",
         "analogrig/fixtures/scenarios/thesis.toml",
         "analogrig/include/analogrig_estimator.h",

@@ -728,7 +728,9 @@ def test_process_that_is_killed_in_the_run_is_told_with_its_status(host: tuple[C
     dut, pid = host
     feed(dut, 0, 82)
     os.kill(pid, signal.SIGKILL)
-    with pytest.raises(LinkClosed, match="^device host: the device process ended with status -9 after sample 81$"):
+    with pytest.raises(
+        LinkClosed, match=r"^device host: the device process ended with status -9 \(SIGKILL\) after sample 81$"
+    ):
         feed(dut, 82, N)
 
 

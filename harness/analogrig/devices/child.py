@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import re
 import select
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -64,6 +65,11 @@ class Child:
     def has_ended(self) -> bool:
         return self._process.poll() is not None
 
+    @property
+    def status(self) -> int | None:
+        """Exit status, negative for a signal; None while the process runs."""
+        return self._process.poll()
+
     def connect(self, open_line: Callable[[str], T]) -> T:
         """Result of ``open_line``, called with the first line of output. If that fails, the process is ended.
 
@@ -102,7 +108,7 @@ class Child:
             self._stderr += self._process.stderr.read().decode(errors="replace")
         lines = self._stderr.strip().splitlines()
         messages = [line for line in lines if _COMPLAINT.match(line)] or lines
-        return f"{self._what} ended with status {status}{f': {messages[-1]}' if messages else ''}"
+        return f"{self._what} ended with status {_status(status)}{f': {messages[-1]}' if messages else ''}"
 
     @contextlib.contextmanager
     def reports_exit(self) -> Iterator[None]:
@@ -124,6 +130,13 @@ class Child:
             self._process.wait()
         if self._process.stderr is not None:
             self._process.stderr.close()
+
+
+def _status(status: int) -> str:
+    """Exit status, with the name of the signal that it stands for."""
+    with contextlib.suppress(ValueError):
+        return f"{status} ({signal.Signals(-status).name})"
+    return str(status)
 
 
 class ChildWire:

@@ -37,9 +37,13 @@ class IdentityStruct(ctypes.Structure):
     )
 
 
-def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
+_TUTORIAL = "sources to compile: harness/docs/tutorials/your-estimator.md"
+
+
+def load_library(library: Path, functions: Iterable[str], cure: str = _TUTORIAL) -> ctypes.CDLL:
     """The library of the project's device or of a user's own, with all of ``functions``.
 
+    :param cure: advice if a function is lacking.
     :raises LinkError: the project's library was not built.
     :raises ConfigurationError: the user's library cannot be loaded, or lacks a function.
     """
@@ -54,10 +58,7 @@ def load_library(library: Path, functions: Iterable[str]) -> ctypes.CDLL:
         raise ConfigurationError(f"{library}: cannot be loaded as a library of a device: {reason}") from error
     lacking = [function for function in functions if not hasattr(c, function)]
     if lacking:
-        raise ConfigurationError(
-            f"{library}: is no library of a device: it lacks {', '.join(lacking)}"
-            " (sources to compile: harness/docs/tutorials/your-estimator.md)"
-        )
+        raise ConfigurationError(f"{library}: is no library of a device: it lacks {', '.join(lacking)} ({cure})")
     return c
 
 

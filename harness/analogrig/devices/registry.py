@@ -26,6 +26,7 @@ KINDS = Kinds(
     {
         "host": "analogrig.devices.host:HostDevice",
         "inproc": "analogrig.devices.inproc:InprocDevice",
+        "library": "analogrig.devices.estimator_library:EstimatorLibrary",
         "qemu-m3": "analogrig.devices.qemu:QemuM3",
         "qemu-m4": "analogrig.devices.qemu:QemuM4",
         "qemu-m7": "analogrig.devices.qemu:QemuM7",

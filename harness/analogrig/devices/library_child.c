@@ -1,0 +1,219 @@
+// SPDX-License-Identifier: MIT
+/// analogrig-library LIBRARY SOCKET MEMORY SLOTS SAMPLES_BYTES RECORDS_BYTES [NAME=VALUE...]: calls a library of
+/// analogrig_estimator.h, whose crash ends this process only.
+///
+/// SOCKET is a descriptor of a SOCK_SEQPACKET socket, MEMORY that of the memory shared with the parent process. It holds
+/// SLOTS times SAMPLES_BYTES of samples, and then SLOTS times RECORDS_BYTES of records. The first message is the
+/// library's hello_t, or the text of an error. Each request has one reply, in order.
+
+#include "analogrig_estimator.h"
+
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <fenv.h>
+#include <stdbool.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/mman.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#define EXIT_USAGE 2
+#define EXIT_CANNOT_PREPARE 3
+#define EXIT_NO_SOCKET 4
+
+#define SLOTS_MAX 8U
+#define TEXT_MAX 1024U
+#define STATE_ALIGNMENT 64U
+
+/// Samples for analogrig_step(); n = 0 stands for analogrig_init().
+typedef struct {
+    uint64_t n;
+    uint32_t slot;
+    uint32_t stride;
+} request_t;
+
+typedef struct {
+    int64_t result;  ///< of analogrig_init()
+} reply_t;
+
+/// analogrig_about_t with its name in place.
+typedef struct {
+    uint32_t abi;
+    uint32_t theta_n;
+    uint64_t state_bytes;
+    uint32_t reports;
+    char     name[TEXT_MAX];  ///< which makes it longer than any text of an error
+} hello_t;
+
+typedef struct {
+    const analogrig_about_t* (*about)(void);
+    int (*init)(void*, const analogrig_setting_t*, size_t);
+    void (*step)(void*, size_t, const analogrig_in_t*, void*, size_t);
+} library_t;
+
+typedef struct {
+    size_t      slots_n;
+    const void* samples[SLOTS_MAX];
+    void*       records[SLOTS_MAX];
+} memory_t;
+
+static int fail(const char* const what) {
+    (void)fprintf(stderr, "analogrig-library: %s: %s\n", what, strerror(errno));
+    exit(EXIT_CANNOT_PREPARE);
+}
+
+/// Send a message. If that fails, the parent has gone or the library has closed the socket, and perhaps standard error.
+static void send_to_parent(const int fd, const void* const message, const size_t size) {
+    if (send(fd, message, size, MSG_NOSIGNAL) < 0) {
+        exit(EXIT_NO_SOCKET);
+    }
+}
+
+/// End with a text for the parent.
+static void refuse(const int fd, const char* const text) {
+    send_to_parent(fd, text, strnlen(text, TEXT_MAX));
+    exit(EXIT_SUCCESS);
+}
+
+/// Memory between two pages whose access ends this process. A negative `fd` stands for memory that is not shared.
+static void* map_guarded(const int fd, const size_t offset, const size_t size, const int protection) {
+    const size_t page  = (size_t)sysconf(_SC_PAGESIZE);
+    const int    kind  = (fd < 0) ? (MAP_PRIVATE | MAP_ANONYMOUS) : MAP_SHARED;
+    char* const  guard = (char*)mmap(NULL, size + (2U * page), PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if ((guard == MAP_FAILED) ||
+        (mmap(guard + page, size, protection, kind | MAP_FIXED, fd, (off_t)offset) == MAP_FAILED)) {
+        (void)fail("cannot map memory");
+    }
+    return guard + page;
+}
+
+static size_t round_up(const size_t size, const size_t unit) { return ((size + unit - 1U) / unit) * unit; }
+
+/// State that ends at a guard page, but for its alignment.
+static void* map_state(const size_t state_bytes) {
+    const size_t used  = round_up((state_bytes > 0U) ? state_bytes : 1U, STATE_ALIGNMENT);
+    const size_t pages = round_up(used, (size_t)sysconf(_SC_PAGESIZE));
+    return (char*)map_guarded(-1, 0U, pages, PROT_READ | PROT_WRITE) + (pages - used);
+}
+
+static memory_t map_slots(const int fd, const size_t slots_n, const size_t samples_bytes, const size_t records_bytes) {
+    memory_t memory = { .slots_n = slots_n };
+    for (size_t i = 0U; i < slots_n; i++) {
+        const size_t records = (slots_n * samples_bytes) + (i * records_bytes);
+        memory.samples[i]    = map_guarded(fd, i * samples_bytes, samples_bytes, PROT_READ);
+        memory.records[i]    = map_guarded(fd, records, records_bytes, PROT_READ | PROT_WRITE);
+    }
+    return memory;
+}
+
+/// The function `name` of a library. ISO C cannot convert an object pointer to a function pointer.
+static bool find(void* const handle, const char* const name, void* const function) {
+    void* const found = dlsym(handle, name);
+    (void)memcpy(function, &found, sizeof(found));
+    return found != NULL;
+}
+
+static library_t load(const char* const path, const int fd) {
+    library_t   library = { 0 };
+    char        text[TEXT_MAX];
+    void* const handle = dlopen(path, RTLD_NOW | RTLD_LOCAL);
+    if (handle == NULL) {
+        refuse(fd, dlerror());
+    }
+    const char* const lacking = !find(handle, "analogrig_about", &library.about) ? "analogrig_about"
+                                : !find(handle, "analogrig_init", &library.init) ? "analogrig_init"
+                                : !find(handle, "analogrig_step", &library.step) ? "analogrig_step"
+                                                                                 : NULL;
+    if (lacking != NULL) {
+        (void)snprintf(text, sizeof(text), "lacks the function %s of analogrig_estimator.h", lacking);
+        refuse(fd, text);
+    }
+    return library;
+}
+
+/// Greet the parent. Of another ABI nothing but its number is known.
+static uint64_t greet(const library_t* const library, const int fd) {
+    const analogrig_about_t* const about = library->about();
+    hello_t                        hello = { 0 };
+    if (about == NULL) {
+        refuse(fd, "analogrig_about returned a null pointer");
+    }
+    hello.abi = about->abi;
+    if (about->abi == ANALOGRIG_ABI) {
+        hello.theta_n     = about->theta_n;
+        hello.state_bytes = about->state_bytes;
+        hello.reports     = about->reports;
+        if (about->name != NULL) {
+            (void)strncpy(hello.name, about->name, sizeof(hello.name) - 1U);
+        }
+    }
+    send_to_parent(fd, &hello, sizeof(hello));
+    return hello.state_bytes;
+}
+
+/// Settings from NAME=VALUE words, which are cut at the equals sign.
+static analogrig_setting_t* parse(const size_t n, char* const words[]) {
+    analogrig_setting_t* const settings = (analogrig_setting_t*)calloc(n + 1U, sizeof(analogrig_setting_t));
+    for (size_t i = 0U; (settings != NULL) && (i < n); i++) {
+        char* const equals = strchr(words[i], '=');
+        if (equals == NULL) {
+            return NULL;
+        }
+        *equals     = '\0';
+        settings[i] = (analogrig_setting_t){ .name = words[i], .value = strtod(equals + 1, NULL) };
+    }
+    return settings;
+}
+
+/// Standard input is empty. Standard output goes to standard error, whose end the parent quotes.
+static void redirect(void) {
+    const int nothing = open("/dev/null", O_RDWR | O_CLOEXEC);
+    if ((nothing < 0) || (dup2(nothing, STDIN_FILENO) < 0) || (dup2(STDERR_FILENO, STDOUT_FILENO) < 0)) {
+        (void)fail("cannot redirect standard streams");
+    }
+}
+
+int main(const int argc, char* argv[]) {
+    const struct rlimit no_core = { 0 };
+    if (argc < 7) {
+        (void)fputs("usage: analogrig-library LIBRARY SOCKET MEMORY SLOTS SAMPLES_BYTES RECORDS_BYTES "
+                    "[NAME=VALUE...]\n",
+                    stderr);
+        return EXIT_USAGE;
+    }
+    const int                  fd            = atoi(argv[2]);
+    const int                  shared        = atoi(argv[3]);
+    const size_t               slots_n       = (size_t)strtoul(argv[4], NULL, 10);
+    const size_t               samples_bytes = (size_t)strtoul(argv[5], NULL, 10);
+    const size_t               records_bytes = (size_t)strtoul(argv[6], NULL, 10);
+    const size_t               settings_n    = (size_t)argc - 7U;
+    analogrig_setting_t* const settings      = parse(settings_n, &argv[7]);
+    if ((slots_n > SLOTS_MAX) || (settings == NULL)) {
+        return EXIT_USAGE;
+    }
+    redirect();
+    (void)setrlimit(RLIMIT_CORE, &no_core);  // to write one takes longer than all else
+    const memory_t  memory      = map_slots(shared, slots_n, samples_bytes, records_bytes);
+    const library_t library     = load(argv[1], fd);
+    const size_t    state_bytes = (size_t)greet(&library, fd);
+    void*           state       = NULL;
+    request_t       request;
+    while (recv(fd, &request, sizeof(request), 0) == (ssize_t)sizeof(request)) {
+        reply_t reply = { 0 };
+        (void)fesetenv(FE_DFL_ENV);  // a library built with -ffast-math turns off denormals when it is loaded
+        if (request.n == 0U) {
+            state        = (state == NULL) ? map_state(state_bytes) : memset(state, 0, state_bytes);
+            reply.result = library.init(state, settings, settings_n);
+        } else if ((state != NULL) && (request.slot < memory.slots_n)) {
+            library.step(state, (size_t)request.n, memory.samples[request.slot], memory.records[request.slot],
+                         request.stride);
+        } else {
+            return EXIT_USAGE;
+        }
+        send_to_parent(fd, &reply, sizeof(reply));
+    }
+    return EXIT_SUCCESS;
+}
