@@ -81,10 +81,10 @@ class EstimatorLibrary(AdaptedDescription):
         return always | ({"in-process"} if self.in_process else frozenset())
 
     def open(self) -> Device:
-        return LibraryDevice(self)
+        return EstimatorLibraryDevice(self)
 
     def direct(self, *, alarms_only: bool = False) -> Device:
-        device = LibraryDevice(self, alarms_only=alarms_only)
+        device = EstimatorLibraryDevice(self, alarms_only=alarms_only)
         try:
             device.recover()
             device.configure()
@@ -123,7 +123,7 @@ class EstimatorLibrary(AdaptedDescription):
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _Piece:
     """Samples of one call of the library: all of a block, or a piece of a long one."""
 
     samples: Samples
@@ -132,7 +132,7 @@ class _Part:
     is_last: bool
 
 
-class LibraryDevice(Device):
+class EstimatorLibraryDevice(Device):
     """Estimator in a shared library."""
 
     def __init__(self, description: EstimatorLibrary, *, alarms_only: bool = False) -> None:
@@ -146,9 +146,9 @@ class LibraryDevice(Device):
         self._alarms_only = alarms_only
         self._opened: LibraryHost | None = None
         self._until_s = math.inf
-        self._posted: deque[_Part] = deque()
+        self._posted: deque[_Piece] = deque()
         self._answered: list[Answers] = []
-        """Answers to the first parts of a block."""
+        """Answers to the first pieces of a block."""
         self._next_index = 0
         self._held = np.zeros(2, np.uint16)
         """u and y of the last valid sample."""
@@ -222,45 +222,45 @@ class LibraryDevice(Device):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         try:
             for block in blocks:
-                for part in self._parts(block):
+                for piece in self._pieces(block):
                     if len(self._posted) == SLOTS:
                         yield from self._take()
-                    self._post(part)
+                    self._post(piece)
         except TimeLimitReached:
             yield from self._take_in_time()
             raise
         while self._posted:
             yield from self._take()
 
-    def _parts(self, block: Samples) -> Iterator[_Part]:
+    def _pieces(self, block: Samples) -> Iterator[_Piece]:
         skipped_n = block.first - self._next_index
         if skipped_n < 0:
             raise ValueError(f"sample {block.first} comes again: the next one is {self._next_index}")
         whole = _after_missing(skipped_n, block) if skipped_n else block
         for start in range(0, len(whole), SLOT_SAMPLES):
-            part = slice(start, start + SLOT_SAMPLES)
-            samples = Samples(whole.first + start, whole.u[part], whole.y[part], whole.valid[part])
-            yield _Part(samples, skipped_n, is_last=part.stop >= len(whole))
+            piece = slice(start, start + SLOT_SAMPLES)
+            samples = Samples(whole.first + start, whole.u[piece], whole.y[piece], whole.valid[piece])
+            yield _Piece(samples, skipped_n, is_last=piece.stop >= len(whole))
         self._next_index += len(whole)
 
-    def _post(self, part: _Part) -> None:
-        samples = part.samples
+    def _post(self, piece: _Piece) -> None:
+        samples = piece.samples
         u, y = samples.u, samples.y
         if not samples.valid.all():
             last = np.maximum.accumulate(np.where(samples.valid, np.arange(1, len(samples) + 1), 0))
             u, y = (np.concatenate(([held], x))[last] for held, x in zip(self._held, (u, y), strict=True))
         self._held[:] = u[-1], y[-1]
         self._host.post(u, y, samples.valid)
-        self._posted.append(part)
+        self._posted.append(piece)
 
     def _take(self) -> Iterator[Answers]:
-        """Wait for the records of the oldest part. Yield the answers to its block if it is the last of it."""
-        part = self._posted[0]
-        records = self._host.take(len(part.samples), part.samples.first)
-        self._answered.append(self._answers(part.samples, records))
+        """Wait for the records of the oldest piece. Yield the answers to its block if it is the last of it."""
+        piece = self._posted[0]
+        records = self._host.take(len(piece.samples), piece.samples.first)
+        self._answered.append(self._answers(piece.samples, records))
         self._posted.popleft()
-        if part.is_last:
-            yield self._join(part.skipped_n)
+        if piece.is_last:
+            yield self._join(piece.skipped_n)
 
     def _take_in_time(self) -> Iterator[Answers]:
         """Answers that have come; those to the last block in part."""
@@ -268,26 +268,26 @@ class LibraryDevice(Device):
             while self._posted:
                 yield from self._take()
         except TimeLimitReached:
-            part = self._posted[0]
-            self._answered.append(self._answers(part.samples, self._host.answered(len(part.samples))))
-            yield self._join(part.skipped_n)
+            piece = self._posted[0]
+            self._answered.append(self._answers(piece.samples, self._host.answered(len(piece.samples))))
+            yield self._join(piece.skipped_n)
 
     def _join(self, skipped_n: int) -> Answers:
-        """Answers to a block from those to its parts."""
-        parts, self._answered = self._answered, []
-        if len(parts) == 1 and not skipped_n:
-            return parts[0]
+        """Answers to a block from those to its pieces."""
+        pieces, self._answered = self._answered, []
+        if len(pieces) == 1 and not skipped_n:
+            return pieces[0]
 
         def joined(name: str) -> Any:
-            arrays = [getattr(part, name) for part in parts]
+            arrays = [getattr(piece, name) for piece in pieces]
             return None if arrays[0] is None else np.concatenate(arrays)[skipped_n:]
 
-        alarms = tuple(alarm for part in parts for alarm in part.alarms)
+        alarms = tuple(alarm for piece in pieces for alarm in piece.alarms)
         names = ("flags", "theta", "innovation", "statistic")
         return Answers(alarms=alarms, **{name: joined(name) for name in names})
 
     def _answers(self, samples: Samples, records: NDArray[Any]) -> Answers:
-        """Answers from the first records of a part; copies, since the records will be overwritten."""
+        """Answers from the first records of a piece; copies, since the records will be overwritten."""
         sheet, valid = self._sheet, samples.valid[: len(records)]
         flags = np.where(valid, np.uint8(0), np.uint8(SteppedFlag.MISSING))
         if records["refused"].any():
