@@ -17,7 +17,7 @@ SHELLS = ("bash", "zsh", "fish")
 COMPLETION_VARIABLE = "_ARGCOMPLETE"
 """Set by the shell when it asks for completions instead of running the command."""
 
-_INCLUDE = Path(__file__).parents[1] / "include"
+INCLUDE = Path(__file__).parents[1] / "include"
 """Folder of the headers that the package brings."""
 
 _KIND_OF_METAVAR = {SCENARIO: "scenarios", RIG: "rigs", DUT: "devices", CAMPAIGN: "campaigns"}
@@ -136,7 +136,7 @@ def _completion(arguments: argparse.Namespace) -> int:
 
 
 def _include(_: argparse.Namespace) -> int:
-    show_plain(str(_INCLUDE))
+    show_plain(str(INCLUDE))
     return PASSED
 
 

@@ -226,11 +226,11 @@ class EstimatorLibraryDevice(Device):
                     if len(self._posted) == SLOTS:
                         yield from self._take()
                     self._post(piece)
+            while self._posted:
+                yield from self._take()
         except TimeLimitReached:
             yield from self._take_in_time()
             raise
-        while self._posted:
-            yield from self._take()
 
     def _pieces(self, block: Samples) -> Iterator[_Piece]:
         skipped_n = block.first - self._next_index

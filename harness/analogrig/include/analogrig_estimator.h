@@ -58,9 +58,9 @@ __attribute__((visibility("default"))) const analogrig_about_t* analogrig_about(
 /// Returns 0: ready; i > 0: settings[i - 1] is unknown or out of range; below 0: cannot start.
 __attribute__((visibility("default"))) int analogrig_init(void* state, const analogrig_setting_t* settings, size_t n);
 
-/// Take n samples in order. Record k of `out` is at k * out_bytes, and all zeros; write no more than out_bytes of it.
+/// Take n samples in order. Record k of `out` is at k * stride, all zeros at first, and ends after theta_n elements.
 __attribute__((visibility("default"))) void
-analogrig_step(void* state, size_t n, const analogrig_in_t* in, void* out, size_t out_bytes);
+analogrig_step(void* state, size_t n, const analogrig_in_t* in, void* out, size_t stride);
 #ifdef __cplusplus
 }
 #endif
@@ -92,11 +92,11 @@ analogrig_step(void* state, size_t n, const analogrig_in_t* in, void* out, size_
         return 0;                                                                                                      \
     }                                                                                                                  \
     void analogrig_step(void* const state, const size_t n, const analogrig_in_t* const in, void* const out,            \
-                        const size_t out_bytes) {                                                                      \
+                        const size_t stride) {                                                                         \
         const size_t used = offsetof(analogrig_out_t, theta) + (theta_n_) * sizeof(float);                             \
         for (size_t k = 0U; k < n; k++) {                                                                              \
             analogrig_out_t one;                                                                                       \
-            char* const     record = (char*)out + k * out_bytes;                                                       \
+            char* const     record = (char*)out + k * stride;                                                          \
             (void)memset(&one, 0, used);                                                                               \
             step((type*)state, &in[k], &one);                                                                          \
             one.done = 0U;                                                                                             \
