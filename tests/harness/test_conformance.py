@@ -1,0 +1,86 @@
+"""The shipped conformance suite: every kind of ours keeps it, and it finds each of many faults."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from analogrig.testing.conformance.test_device import *  # noqa: F403 - the tests, run here on each device
+from tests.harness.faulty_devices import FAULTS, SHARED_MEMORY
+from tests.harness.test_third_party import install
+
+HERE = Path(__file__).parent
+PAGE = HERE.parents[1] / "harness/docs/howto/test-a-python-estimator.md"
+
+ESTIMATORS = "python:tests.harness.python_estimators"
+DEVICES = ("inproc", "host", f"{ESTIMATORS}:Core", f"{ESTIMATORS}:CoreInBlocks", "python:my_estimator:Rls")
+"""One device of each kind that this machine can run without tools, and the estimator of the page."""
+
+FAULTY_TESTS = """\
+import pytest
+from analogrig.testing.conformance.test_device import *
+
+def pytest_generate_tests(metafunc):
+    metafunc.parametrize("hil_dut", {names}, indirect=True, ids=lambda name: name)
+"""
+CONFTEST = """\
+def pytest_collection_modifyitems(items):
+    items[:] = [item for item in items if item.name in {wanted}]
+"""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if metafunc.function.__module__ == "analogrig.testing.conformance.test_device":
+        metafunc.parametrize("hil_dut", DEVICES, indirect=True)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _estimator_of_the_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    folder = tmp_path_factory.mktemp("page")
+    (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    (folder / "my_estimator.py").write_text(source)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield
+
+
+@pytest.fixture
+def _site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Folder with an installed package of faulty devices; what they leave in shared memory is removed."""
+    folder = tmp_path / "site"
+    install(folder, "faulty", devices={"faulty": "faulty_devices:FaultyDescription"})
+    (folder / "faulty_devices.py").write_text((HERE / "faulty_devices.py").read_text())
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    yield
+    for left in Path("/dev/shm").glob(f"{SHARED_MEMORY}*"):  # noqa: S108
+        left.unlink()
+
+
+def finding(fault: str) -> str:
+    """Name of the test that must find a fault."""
+    test, _, rest = FAULTS[fault].found_by.partition("[")
+    return f"{test}[faulty:{fault}{'-' if rest else ']'}{rest}"
+
+
+@pytest.mark.usefixtures("_site")
+def test_suite_finds_every_fault(pytester: pytest.Pytester) -> None:
+    wanted = [finding(name) for name, cls in FAULTS.items() if cls.found_by]
+    pytester.makepyfile(FAULTY_TESTS.format(names=[f"faulty:{name}" for name in FAULTS]))
+    pytester.makeconftest(CONFTEST.format(wanted=wanted))
+    pytester.runpytest_subprocess("-q", "--hil-time-limit", "1", "--junitxml", "out.xml")
+    cases = ET.parse(pytester.path / "out.xml").getroot().iter("testcase")  # noqa: S314 - written a moment ago
+    found = {case.attrib["name"] for case in cases if any(each.tag in ("failure", "error") for each in case)}
+    assert len(wanted) >= 20
+    assert found == set(wanted)
+
+
+@pytest.mark.usefixtures("_site")
+def test_suite_runs_as_shipped_on_a_device_of_another_package(pytester: pytest.Pytester) -> None:
+    done = pytester.runpytest_subprocess("--pyargs", "analogrig.testing.conformance", "--hil-dut", "faulty", "-rs")
+    assert done.ret == 0
+    done.assert_outcomes(passed=23, skipped=1)
+    done.stdout.fnmatch_lines("*has not the capability blocks")
