@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -11,14 +14,26 @@ import pytest
 
 from analogrig.testing.conformance.test_device import *  # noqa: F403 - the tests, run here on each device
 from tests.harness.faulty_devices import FAULTS, SHARED_MEMORY
+from tests.harness.library_builds import OWN, build
 from tests.harness.test_third_party import install
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "harness/docs/howto/test-a-python-estimator.md"
 
+FOLDER = Path(tempfile.gettempdir()) / f"analogrig-conformance-{os.getpid()}"
+"""Folder of the devices that the tests build."""
+
 ESTIMATORS = "python:tests.harness.python_estimators"
-DEVICES = ("inproc", "host", f"{ESTIMATORS}:Core", f"{ESTIMATORS}:CoreInBlocks", "python:my_estimator:Rls")
-"""One device of each kind that this machine can run without tools, and the estimator of the page."""
+DEVICES = {
+    "inproc": "inproc",
+    "host": "host",
+    "python": f"{ESTIMATORS}:Core",
+    "python in blocks": f"{ESTIMATORS}:CoreInBlocks",
+    "python of the page": "python:my_estimator:Rls",
+    "library": f"library:{FOLDER / 'own.so'}",
+    "library in process": f"library:{FOLDER / 'own.so'}?in_process=true",
+}
+"""Devices of each kind that this machine can run without tools."""
 
 FAULTY_TESTS = """\
 import pytest
@@ -35,17 +50,20 @@ def pytest_collection_modifyitems(items):
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if metafunc.function.__module__ == "analogrig.testing.conformance.test_device":
-        metafunc.parametrize("hil_dut", DEVICES, indirect=True)
+        metafunc.parametrize("hil_dut", list(DEVICES.values()), ids=list(DEVICES), indirect=True)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _estimator_of_the_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    folder = tmp_path_factory.mktemp("page")
+def _devices() -> Iterator[None]:
+    """Build the library, and write the estimator of the page."""
+    FOLDER.mkdir()
+    build(FOLDER / "own.so", OWN)
     (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    (folder / "my_estimator.py").write_text(source)
+    (FOLDER / "my_estimator.py").write_text(source)
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(folder)
+        patch.syspath_prepend(FOLDER)
         yield
+    shutil.rmtree(FOLDER)
 
 
 @pytest.fixture

@@ -95,6 +95,12 @@ def test_sample_without_an_estimate_is_unreported() -> None:
     assert answers.flags.tolist() == [UNREPORTED, SteppedFlag.MISSING]
 
 
+def test_skipped_samples_are_missing_ones() -> None:
+    (answers,) = answered(made("Counting"), samples(2, 7))
+    assert answers.statistic is not None
+    assert answers.statistic.tolist() == [7, 8]
+
+
 def test_quantity_that_is_not_reported_is_absent() -> None:
     (answers,) = answered(made("Answering", answer=np.True_), samples(2))
     assert [alarm.index for alarm in answers.alarms] == [0, 1]
@@ -280,8 +286,8 @@ WRONG_BLOCKS: dict[str, tuple[object, object, str]] = {
 @pytest.mark.parametrize("wrong", WRONG_BLOCKS)
 def test_wrong_answer_to_a_block_is_one_line(wrong: str) -> None:
     answer, sheet, error = WRONG_BLOCKS[wrong]
-    with pytest.raises(DeviceError, match=f"device it: step_block of the samples 8 to 9: {error}"):
-        answered(made("Answering", answer=answer, sheet=sheet or {}, block=True), samples(2, 8))
+    with pytest.raises(DeviceError, match=f"device it: step_block of the samples 0 to 1: {error}"):
+        answered(made("Answering", answer=answer, sheet=sheet or {}, block=True), samples(2))
 
 
 @pytest.mark.parametrize("sheet", [3, {"theta": 3}, {"theta_n": -1}])

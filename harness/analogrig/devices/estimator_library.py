@@ -43,6 +43,7 @@ class EstimatorLibrary(AdaptedDescription):
     kind: ClassVar[str] = "library"
     usage: ClassVar[str] = "library:FILE.so[?in_process=true]"
     summary: ClassVar[str] = "estimator of your own in a shared library with three functions"
+    collects: ClassVar[str] = "settings"
     library: str
     """Shared library."""
     in_process: bool = False
@@ -67,13 +68,6 @@ class EstimatorLibrary(AdaptedDescription):
     @classmethod
     def _place(cls, name: str, place: str) -> dict[str, Any]:  # noqa: ARG003
         return {"library": place}
-
-    @classmethod
-    def _group_options(cls, table: dict[str, Any]) -> dict[str, Any]:
-        """A key that is no field is a setting."""
-        fields = {field.name for field in dataclasses.fields(cls)}
-        settings = {key: value for key, value in table.items() if key not in fields}
-        return {key: value for key, value in table.items() if key in fields} | {"settings": settings}
 
     @property
     def capabilities(self) -> frozenset[Capability]:
@@ -195,10 +189,16 @@ class EstimatorLibraryDevice(Device):
             described = dataclasses.replace(self._description, settings={**self._as_opened, **settings})
         except ValueError as error:
             raise DeviceRefused(f"device {self.name}: {error}") from error
-        if described != self._description:
+        before = self._description
+        if described != before:
             self._description = described
             self.recover()
-        self.start()
+        try:
+            self.start()
+        except DeviceRefused:
+            self._description = before
+            self.recover()
+            raise
 
     def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
         if not self._host.is_idle:

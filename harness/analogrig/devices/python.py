@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
+
 from analogrig import config
 from analogrig.answers import Answers, Samples
 from analogrig.datasheet import Datasheet
@@ -115,8 +117,14 @@ class PythonDevice(Device):
             self._object = self._make(self._description.settings)
 
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
-        rows = Rows(self._datasheet)
+        rows, next_sample = Rows(self._datasheet), 0
         for block in blocks:
+            if skipped_n := block.first - next_sample:
+                nothing = np.zeros(skipped_n, np.uint16)
+                skipped = Samples(next_sample, nothing, nothing, np.zeros(skipped_n, np.bool_))
+                rows.begin(skipped)
+                self._answer(skipped, rows)
+            next_sample = block.first + len(block)
             rows.begin(block)
             try:
                 self._answer(block, rows)

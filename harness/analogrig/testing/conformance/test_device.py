@@ -298,6 +298,24 @@ def test_missing_samples_are_ignored(dut: Device, stimulus: Stimulus) -> None:
     assert not (flags & LOST).any(), "samples were lost"
 
 
+def test_skipped_samples_are_missing_ones(dut: Device, stimulus: Stimulus) -> None:
+    index = np.arange(len(stimulus.u))
+    first, end = 200, 230
+    expected = play(dut, stimulus.replaced(valid=(index < first) | (index >= end)), first, end - first, SAMPLES_N)
+    begin(dut, stimulus)
+    blocks = [
+        Samples(at.start, stimulus.u[at], stimulus.y[at], stimulus.valid[at])
+        for at in (slice(0, first), slice(end, None))
+    ]
+    found = finish(dut, dut.play(blocks))
+    assert [len(part) for part in found.parts] == [first, SAMPLES_N - end]
+    assert found.alarms == tuple(alarm for alarm in expected.alarms if not first <= alarm.index < end)
+    for name in ("theta", "statistic"):
+        ours, theirs = found.array(name), expected.array(name)
+        if ours is not None and theirs is not None:
+            assert np.array_equal(ours, np.delete(theirs, np.arange(first, end), axis=0)), f"other {name}"
+
+
 def extreme_stimuli(stimulus: Stimulus) -> Iterator[tuple[str, Stimulus]]:
     """Records that no plant gives."""
     n, top = len(stimulus.u), stimulus.full_scale
