@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from . import (
+    bench_adapters,
     bench_calibration,
     bench_detection,
     bench_engine,
@@ -37,6 +38,7 @@ RESULTS = Path("build/bench.json")
 BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "engine": bench_engine.figures,
     "link": bench_link.figures,
+    "adapters": bench_adapters.figures,
     "detection": bench_detection.figures,
     "statistics": bench_statistics.figures,
     "isolation": bench_isolation.figures,

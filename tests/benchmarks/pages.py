@@ -11,6 +11,7 @@ FOLDER = Path("harness/docs/evidence")
 TITLES: Mapping[str, str] = {
     "engine": "Speed of the engine, beside ngspice",
     "link": "Speed of the links",
+    "adapters": "Speed of the adapters",
     "detection": "Detection on the thesis's profile",
     "statistics": "Detection delay and false alarms of simulated plants",
     "isolation": "Isolation",

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,8 +116,7 @@ class EstimatorLibrary(AdaptedDescription):
         return {name: float(value) for name, value in self.settings.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
+class _Piece(NamedTuple):
     """Samples of one call of the library: all of a block, or a piece of a long one."""
 
     samples: Samples
@@ -237,6 +236,10 @@ class EstimatorLibraryDevice(Device):
         if skipped_n < 0:
             raise ValueError(f"sample {block.first} comes again: the next one is {self._next_index}")
         whole = _after_missing(skipped_n, block) if skipped_n else block
+        if 0 < len(whole) <= SLOT_SAMPLES:
+            yield _Piece(whole, skipped_n, is_last=True)
+            self._next_index += len(whole)
+            return
         for start in range(0, len(whole), SLOT_SAMPLES):
             piece = slice(start, start + SLOT_SAMPLES)
             samples = Samples(whole.first + start, whole.u[piece], whole.y[piece], whole.valid[piece])
@@ -289,12 +292,15 @@ class EstimatorLibraryDevice(Device):
     def _answers(self, samples: Samples, records: NDArray[Any]) -> Answers:
         """Answers from the first records of a piece; copies, since the records will be overwritten."""
         sheet, valid = self._sheet, samples.valid[: len(records)]
-        flags = np.where(valid, np.uint8(0), np.uint8(SteppedFlag.MISSING))
+        flags = np.zeros(len(records), np.uint8)
+        if not valid.all():
+            flags[~valid] = SteppedFlag.MISSING
         if records["refused"].any():
             flags[valid & (records["refused"] != 0)] |= SteppedFlag.REFUSED
         if sheet.armed:
             flags[records["armed"] == 0] |= UNARMED
-        indices = np.flatnonzero(records["alarm"]).tolist()
+        alarm = records["alarm"]
+        indices = np.flatnonzero(alarm).tolist() if alarm.any() else []
         return Answers(
             flags=flags,
             alarms=tuple(

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +103,29 @@ class About:
                 )
 
 
+class _Slot:
+    """Memory of one block: views of its samples and records, made once because that takes longer than to fill them."""
+
+    def __init__(self, samples: NDArray[Any], records: NDArray[Any]) -> None:
+        self.u, self.y, self.valid = (samples[name] for name in ("u", "y", "valid"))
+        self.records = records
+        self.bytes = records.view(np.uint8)
+        self.done, self.guard = records["done"], records["guard"]
+        self.addresses = samples.ctypes.data, records.ctypes.data
+
+    def fill(self, u: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> None:
+        """Set the samples, and prepare their records."""
+        n = len(u)
+        self.u[:n], self.y[:n], self.valid[:n] = u, y, valid
+        self.bytes[: n * self.records.itemsize] = 0
+        self.guard[:n] = _GUARD
+
+    def done_n(self, n: int) -> int:
+        """Number of complete records before the first incomplete one, of ``n``."""
+        done = self.done[:n]
+        return n if done.all() else int(np.argmin(done))
+
+
 class LibraryHost(ABC):
     """Loaded library and its memory. Begin a record by ``start``; then each ``post`` has one ``take``, in order.
 
@@ -120,8 +143,13 @@ class LibraryHost(ABC):
         self._type = record_type(about.theta_n)
         sizes = [SAMPLES_BYTES] * SLOTS + [RECORDS_BYTES] * SLOTS
         starts = [sum(sizes[:i]) for i in range(len(sizes))]
-        self._samples = [np.frombuffer(memory, SAMPLE, SLOT_SAMPLES, start) for start in starts[:SLOTS]]
-        self._records = [np.frombuffer(memory, self._type, SLOT_SAMPLES, start) for start in starts[SLOTS:]]
+        self._slots = [
+            _Slot(
+                np.frombuffer(memory, SAMPLE, SLOT_SAMPLES, samples),
+                np.frombuffer(memory, self._type, SLOT_SAMPLES, records),
+            )
+            for samples, records in zip(starts[:SLOTS], starts[SLOTS:], strict=True)
+        ]
         self._posted = self._taken = 0
         """Blocks since the start of the record."""
 
@@ -135,13 +163,10 @@ class LibraryHost(ABC):
 
     def post(self, u: NDArray[Any], y: NDArray[Any], valid: NDArray[np.bool_]) -> None:
         """Give the library at most SLOT_SAMPLES samples. At most SLOTS blocks may await ``take``."""
-        n, slot = len(u), self._posted % SLOTS
-        samples, records = self._samples[slot][:n], self._records[slot][:n]
-        samples["u"], samples["y"], samples["valid"] = u, y, valid
-        records.view(np.uint8)[:] = 0
-        records["guard"] = _GUARD
+        slot = self._posted % SLOTS
+        self._slots[slot].fill(u, y, valid)
         self._posted += 1
-        self._post(slot, n)
+        self._post(slot, len(u))
 
     def take(self, n: int, first: int) -> NDArray[Any]:
         """Records (n,) of the oldest block, whose first sample is ``first``; valid until the next ``post``.
@@ -149,24 +174,24 @@ class LibraryHost(ABC):
         :raises DeviceError: the library failed; names the sample.
         :raises TimeLimitReached: the time limit is over; ``answered`` counts the records until then.
         """
-        records = self._records[self._taken % SLOTS][:n]
-        self._await(_Call("analogrig_step", records, first))
+        slot = self._slots[self._taken % SLOTS]
+        self._await(_Call("analogrig_step", slot, n, first))
         self._taken += 1
-        if (done := _done_n(records)) < n:
+        if (done_n := slot.done_n(n)) < n:
             raise DeviceError(
-                f"device {self._device}: sample {first + done}: analogrig_step returned without an answer (done = 0)"
+                f"device {self._device}: sample {first + done_n}: analogrig_step returned without an answer (done = 0)"
             )
-        if (broken := np.flatnonzero(records["guard"] != _GUARD)).size:
+        if (broken := slot.guard[:n] != _GUARD).any():
             raise DeviceError(
-                f"device {self._device}: sample {first + int(broken[0])}: analogrig_step wrote beyond the end of its"
-                f" record, which holds theta_n = {self.about.theta_n} elements of theta"
+                f"device {self._device}: sample {first + int(np.argmax(broken))}: analogrig_step wrote beyond the end"
+                f" of its record, which holds theta_n = {self.about.theta_n} elements of theta"
             )
-        return records
+        return slot.records[:n]
 
     def answered(self, n: int) -> NDArray[Any]:
         """Records of the oldest block of n samples that are complete by now."""
-        records = self._records[self._taken % SLOTS][:n]
-        return records[: _done_n(records)]
+        slot = self._slots[self._taken % SLOTS]
+        return slot.records[: slot.done_n(n)]
 
     def start(self, settings: Mapping[str, float]) -> None:
         """Begin a record.
@@ -206,31 +231,26 @@ class LibraryHost(ABC):
         """Wait for the end of the oldest analogrig_step; errors as ``take``."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Call:
+class _Call(NamedTuple):
     """A call of a function of the library."""
 
     function: str
-    records: NDArray[Any] | None = None
+    slot: _Slot | None = None
+    n: int = 0
+    """Samples of the block."""
     first: int = 0
-    """Sample of the first record."""
+    """First of them."""
 
     @property
     def done_n(self) -> int:
-        return 0 if self.records is None else _done_n(self.records)
+        return 0 if self.slot is None else self.slot.done_n(self.n)
 
     @property
     def place(self) -> str:
         """The function, with the sample that it is at."""
-        if self.records is None:
+        if self.slot is None:
             return self.function
-        return f"sample {self.first + min(self.done_n, len(self.records) - 1)}: {self.function}"
-
-
-def _done_n(records: NDArray[Any]) -> int:
-    """Number of complete records before the first incomplete one."""
-    done = records["done"] == 1
-    return len(done) if done.all() else int(np.argmin(done))
+        return f"sample {self.first + min(self.done_n, self.n - 1)}: {self.function}"
 
 
 class ChildHost(LibraryHost):
@@ -376,10 +396,6 @@ class InProcessHost(LibraryHost):
         self._step = self._c.analogrig_step
         self._step.restype = None
         self._step.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t]
-        self._slots = [
-            (samples.ctypes.data, records.ctypes.data)
-            for samples, records in zip(self._samples, self._records, strict=True)
-        ]
 
     def _init(self, settings: Mapping[str, float]) -> int:
         ctypes.memset(self._state, 0, self.about.state_bytes)
@@ -389,7 +405,7 @@ class InProcessHost(LibraryHost):
 
     def _post(self, slot: int, n: int) -> None:
         with self._environment:
-            self._step(self._state, n, *self._slots[slot], self._type.itemsize)
+            self._step(self._state, n, *self._slots[slot].addresses, self._type.itemsize)
 
     def _await(self, call: _Call) -> None:
         """Return: the call has ended."""
