@@ -170,4 +170,4 @@ def test_tether_ends_as_its_command_does() -> None:
 
 def test_tether_without_a_command_explains_itself() -> None:
     done = subprocess.run([TETHER], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (2, "usage: analogrig-tether COMMAND [ARGUMENT...]\n")
+    assert (done.returncode, done.stderr) == (2, "usage: analogrig-tether [--stdio IN OUT] COMMAND [ARGUMENT...]\n")

@@ -36,21 +36,25 @@ T = TypeVar("T")
 class Child:
     """A process that ends with this one."""
 
-    def __init__(self, command: Sequence[str | Path], what: str, *, inherited: Sequence[int] = ()) -> None:
+    def __init__(
+        self, command: Sequence[str | Path], what: str, *, inherited: Sequence[int] = (), stdio: Sequence[int] = ()
+    ) -> None:
         """Start ``command``, called ``what`` in errors; it inherits these file descriptors.
 
+        :param stdio: descriptors of its standard input and output; by default ``first_line`` reads its output.
         :raises LinkError: the tether was not built.
         """
         self._what = what
         self._stderr = ""
+        option = ("--stdio", *map(str, stdio)) if stdio else ()
         try:
             self._process = subprocess.Popen(
-                [TETHER, *command],
+                [TETHER, *option, *command],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
-                pass_fds=inherited,
+                pass_fds=(*inherited, *stdio),
                 process_group=0,  # Ctrl-C reaches the harness only, which then ends the device
             )
         except OSError as error:
@@ -150,12 +154,16 @@ class ChildWire:
         self.clock = wire.clock
 
     def write(self, sent: bytes) -> None:
-        with self.child.reports_exit():
+        try:  # a context manager would take longer than the exchange of a line
             self._wire.write(sent)
+        except LinkClosed as error:
+            raise LinkClosed(self.child.exit_report()) from error
 
     def read(self, timeout_s: float) -> bytes:
-        with self.child.reports_exit():
+        try:
             return self._wire.read(timeout_s)
+        except LinkClosed as error:
+            raise LinkClosed(self.child.exit_report()) from error
 
     def close(self) -> None:
         self._wire.close()

@@ -34,6 +34,8 @@ KINDS = Kinds(
         "serial": "analogrig.devices.serial:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
         "python": "analogrig.devices.python:PythonDescription",
+        "lines": "analogrig.devices.lines:LinesDevice",
+        "exec": "analogrig.devices.program:ProgramDevice",
     },
 )
 """Description of each kind of device."""

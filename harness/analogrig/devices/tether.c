@@ -1,5 +1,6 @@
-/// analogrig-tether COMMAND [ARGUMENT...]: runs COMMAND and ends it when the parent process ends.
+/// analogrig-tether [--stdio IN OUT] COMMAND [ARGUMENT...]: runs COMMAND and ends it when the parent process ends.
 ///
+/// With --stdio, the inherited descriptors IN and OUT are the command's standard input and output.
 /// The end of standard input ends the command, by SIGTERM and a second later by SIGKILL. If this program is killed, the
 /// kernel kills the command. If the command ends by itself, this program writes the last part of the command's standard
 /// error, and exits with the same status or signal.
@@ -20,6 +21,7 @@
 #define EXIT_USAGE 2
 #define EXIT_CANNOT_START 127
 #define GRACE_S 1U
+#define NO_STDIO (-1)
 
 /// Bytes of the command's standard error that are kept. The command may write any amount.
 #define TAIL_MAX 2048U
@@ -50,10 +52,34 @@ static bool handle(const int signal_number, void (*const handler)(int)) {
     return sigaction(signal_number, &action, NULL) == 0;
 }
 
+/// Descriptors that become the standard input and output of the command; NO_STDIO leaves both.
+typedef struct {
+    int in;
+    int out;
+} stdio_t;
+
+static void close_stdio(const stdio_t stdio) {
+    if (stdio.in != NO_STDIO) {
+        (void)close(stdio.in);
+        (void)close(stdio.out);  // fails if it is the same
+    }
+}
+
+static bool redirect(const stdio_t stdio) {
+    const bool done =
+        (stdio.in == NO_STDIO) || ((dup2(stdio.in, STDIN_FILENO) >= 0) && (dup2(stdio.out, STDOUT_FILENO) >= 0));
+    close_stdio(stdio);
+    return done;
+}
+
 /// Execute the command, in the child process. Returns the exit status only on failure.
-static int execute(char* const argv[], const int errors, const pid_t parent, const sigset_t* const mask) {
+static int
+execute(char* const argv[], const stdio_t stdio, const int errors, const pid_t parent, const sigset_t* const mask) {
     if ((prctl(PR_SET_PDEATHSIG, SIGKILL) != 0) || (getppid() != parent)) {
         return fail("cannot tie the command to its parent");
+    }
+    if (!redirect(stdio)) {
+        return fail("cannot redirect the command");
     }
     if ((dup2(errors, STDERR_FILENO) < 0) || (sigprocmask(SIG_SETMASK, mask, NULL) != 0) || !handle(SIGPIPE, SIG_DFL)) {
         return fail("cannot prepare the command");
@@ -149,8 +175,11 @@ int main(const int argc, char* argv[]) {
     int           errors[2];
     sigset_t      child;
     sigset_t      mask;
-    if (argc < 2) {
-        (void)fputs("usage: analogrig-tether COMMAND [ARGUMENT...]\n", stderr);
+    const bool    redirects = (argc > 3) && (strcmp(argv[1], "--stdio") == 0);
+    const stdio_t stdio     = { redirects ? atoi(argv[2]) : NO_STDIO, redirects ? atoi(argv[3]) : NO_STDIO };
+    char** const  arguments = &argv[redirects ? 4 : 1];
+    if (*arguments == NULL) {
+        (void)fputs("usage: analogrig-tether [--stdio IN OUT] COMMAND [ARGUMENT...]\n", stderr);
         return EXIT_USAGE;
     }
     (void)sigemptyset(&child);
@@ -165,10 +194,11 @@ int main(const int argc, char* argv[]) {
     }
     if (pid == 0) {
         (void)close(errors[0]);
-        return execute(&argv[1], errors[1], self, &mask);
+        return execute(arguments, stdio, errors[1], self, &mask);
     }
     command = (sig_atomic_t)pid;
     (void)close(errors[1]);
+    close_stdio(stdio);
     const int status = watch(errors[0], &tail, &mask);
     drain(errors[0], &tail);
     (void)!write(STDERR_FILENO, tail.bytes, tail.n);

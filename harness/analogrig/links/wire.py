@@ -72,18 +72,20 @@ class Wire(Connection, Protocol):
 
 
 class DescriptorWire:
-    """A wire on a file descriptor: a terminal, or one end of a socket pair."""
+    """A wire on a file descriptor: a terminal, one end of a socket pair; or on two: pipes."""
 
-    def __init__(self, fd: int, name: str) -> None:
-        """Take over ``fd``."""
+    def __init__(self, fd: int, name: str, *, write_fd: int = -1) -> None:
+        """Take over ``fd``, and ``write_fd`` if another descriptor is written to."""
         self.name = name
         self.clock: Clock = time.monotonic
         self._fd = fd
+        self._write_fd = fd if write_fd < 0 else write_fd
         os.set_blocking(fd, False)
+        os.set_blocking(self._write_fd, False)
         self._readable = select.poll()
         self._readable.register(fd, select.POLLIN)
         self._writable = select.poll()
-        self._writable.register(fd, select.POLLOUT)
+        self._writable.register(self._write_fd, select.POLLOUT)
 
     def write(self, sent: bytes) -> None:
         try:
@@ -103,7 +105,7 @@ class DescriptorWire:
     def _take(self, sent: bytes) -> int:
         """Number of bytes that the line accepts without waiting."""
         try:
-            return os.write(self._fd, sent)
+            return os.write(self._write_fd, sent)
         except BlockingIOError:
             return 0
 
@@ -123,8 +125,8 @@ class DescriptorWire:
         return received
 
     def close(self) -> None:
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
+        descriptors, self._fd, self._write_fd = {self._fd, self._write_fd} - {-1}, -1, -1
+        for fd in descriptors:
             with contextlib.suppress(OSError):
                 os.close(fd)
 

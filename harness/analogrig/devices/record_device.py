@@ -1,0 +1,108 @@
+"""Program that reads packed records of samples and writes packed records of answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analogrig.answers import Answers, Samples
+from analogrig.catalogue import SteppedFlag
+from analogrig.devices.answer_form import NO_ANSWER, AnswerRows
+from analogrig.devices.line_device import TemplateDevice
+from analogrig.devices.template_description import TemplateDescription
+from analogrig.devices.templates import record
+from analogrig.errors import LinkClosed, LinkTimeout, TimeLimitReached
+from analogrig.protocol.pace import Pace
+
+_BUFFER_BYTES = 65_536
+"""Bytes that a pipe holds at least; a window of more would wait for itself."""
+
+
+class RecordDevice(TemplateDevice):
+    """Program with packed records. It is started for each record of samples."""
+
+    def __init__(self, description: TemplateDescription) -> None:
+        super().__init__(description)
+        self._sent = record("send", description.send)
+        self._received = record("receive", description.receive)
+        self._window = max(
+            1, min(description.window, _BUFFER_BYTES // max(self._sent.itemsize, self._received.itemsize))
+        )
+        self._answered = 0
+        self._rows = AnswerRows(self._form, self.name, self._to_codes)
+
+    def recover(self) -> None:
+        if self._has_failed or not self._is_fresh:
+            self._reopen()
+
+    def start(self, pace: Pace | None = None) -> None:  # noqa: ARG002
+        self.recover()
+        self._is_fresh = False
+        self._next_index = self._answered = 0
+        self._rows = AnswerRows(self._form, self.name, self._to_codes)
+
+    def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
+        try:
+            for block, is_gap in self._with_gaps(blocks):
+                answers = self._rows.answers(*self._exchange(block), block.first)
+                if not is_gap:
+                    yield answers
+        except LinkClosed as error:
+            raise self._closed(error, self._answered) from error
+        except TimeLimitReached:
+            self._has_failed = True
+            raise
+
+    def _exchange(self, block: Samples) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Values and flags of the answers to a block."""
+        n = len(block)
+        is_sent = np.ones(n, np.bool_) if "valid" in (self._sent.names or ()) else block.valid
+        columns, out = self._columns(block), np.zeros(n, self._sent)
+        for name in self._sent.names or ():
+            out[name] = columns[name]
+        indices = np.flatnonzero(is_sent)
+        answers = np.empty(len(indices), self._received)
+        for start in range(0, len(indices), self._window):
+            chunk = indices[start : start + self._window]
+            self._wire.write(out[chunk].tobytes())
+            received = self._receive(block.first + chunk)
+            answers[start : start + len(chunk)] = np.frombuffer(received, self._received)
+        self._answered = block.first + n
+        values = np.empty((len(indices), len(self._form.columns)))
+        for i, name in enumerate(self._form.columns):
+            values[:, i] = answers[name]
+        flags = ~block.valid * np.int64(SteppedFlag.MISSING) + ~is_sent * np.int64(NO_ANSWER)
+        return values, flags
+
+    def _receive(self, indices: NDArray[np.int64]) -> bytes:
+        """Records of the answers to these samples.
+
+        :raises LinkTimeout: nothing came within the time-out.
+        :raises DeviceError: there is more than that.
+        """
+        size, needed = self._received.itemsize, self._received.itemsize * len(indices)
+        parts, n = [], 0
+        deadline_s = self._wire.clock() + self._description.timeout_s
+        while n < needed:
+            self._answered = int(indices[n // size])
+            received = self._wire.read(self._left_s(deadline_s))
+            if received:
+                deadline_s = self._wire.clock() + self._description.timeout_s
+            elif self._wire.clock() >= deadline_s:
+                raise self._silence(n % size)
+            n += len(received)
+            parts.append(received)
+        if n > needed:
+            raise self._error(f"sent more answers than samples, the first after sample {int(indices[-1])}")
+        return b"".join(parts)
+
+    def _silence(self, rest: int) -> LinkTimeout:
+        self._has_failed = True
+        part = f", {rest} of {self._received.itemsize} bytes of it" if rest else ""
+        text = (
+            f"device {self.name}: no answer to sample {self._answered} within {self._description.timeout_s:g} s{part}"
+        )
+        hint = self._description.hint()
+        return LinkTimeout(f"{text}; {hint}" if hint and not self._answered else text)

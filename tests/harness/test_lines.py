@@ -1,0 +1,264 @@
+"""Firmwares that speak lines of text over a serial line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analogrig.answers import Samples
+from analogrig.bench import Bench
+from analogrig.config import read_toml
+from analogrig.devices.lines import LinesDevice
+from analogrig.devices.program import ProgramDevice
+from analogrig.devices.registry import from_table, recorded, trusted
+from analogrig.devices.template_description import TemplateDescription
+from analogrig.devices.templates import Reader, Writer
+from analogrig.errors import ConfigurationError, LinkTimeout
+from analogrig.rigs.description import open_rig
+from analogrig.run import Channel
+from analogrig.scenario import Scenario
+from analogrig.trust import Trust
+from tests.harness import line_faults
+from tests.harness.line_faults import COMMON, EXPECTED, FLOODS, PROTOCOLS, N, Scripted, cases, check_clean, outcome
+from tests.harness.processes import LONG_S
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "harness" / "examples" / "program"
+
+
+@pytest.mark.parametrize(("protocol", "fault"), cases())
+def test_fault_of_a_line_ends_as_documented(protocol: str, fault: str) -> None:
+    for step in (N // 2,) if fault in FLOODS else (0, N // 2, line_faults.steps(fault)[-1]):
+        assert outcome(protocol, fault, step)[0] == EXPECTED[protocol][fault]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_answers_of_a_firmware_belong_to_their_samples(protocol: str) -> None:
+    check_clean(Scripted.with_fault(protocol))
+
+
+def test_counters_of_the_line_name_the_faults() -> None:
+    found = {}
+    for fault in ("debug line", "twice back", "late back", "garbled back", "wrong digit"):
+        device = Scripted.with_fault("checksum", fault, 4)
+        device.recover()
+        list(line_faults.record(device))
+        found[fault] = dict(device.link_counters)
+        device.close()
+    assert found == {
+        "debug line": {"lines_other": 1},
+        "twice back": {"lines_repeated": 1},
+        "late back": {"lines_late": 1},
+        "garbled back": {"lines_other": 1},
+        "wrong digit": {"lines_garbled": 1},
+    }
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[str]:
+    """Terminal behind which the example runs as a firmware would."""
+    shutil.copytree(EXAMPLE, tmp_path, dirs_exist_ok=True)
+    subprocess.run(["make", "--silent", f"ESTIMATOR={ROOT / 'estimator_c'}"], cwd=tmp_path, check=True)
+    theirs, ours = os.openpty()
+    tty.setraw(ours)
+    with subprocess.Popen([tmp_path / "my_program"], stdin=theirs, stdout=theirs) as firmware:
+        os.close(theirs)
+        yield os.ttyname(ours)
+        firmware.kill()
+        os.close(ours)
+
+
+def test_firmware_on_a_terminal_gives_the_estimates_of_every_device(port: str, tmp_path: Path) -> None:
+    table = {key: value for key, value in read_toml(tmp_path / "my_program.toml").items() if key != "arguments"}
+    description = from_table({**table, "kind": "lines", "name": "bob", "url": port, "timeout_s": LONG_S}, "bob")
+    with open_rig("emulator") as rig, description.connect() as dut:
+        bench = Bench(rig, dut)
+        for _ in range(2):
+            run = bench.play(Scenario.load("thesis"), seed=7)
+            assert run.theta_hash().startswith("2ba8713bf6ac34db")
+            assert not run.conditions.faults
+        assert from_table({**recorded(dut.description()).as_table()}, "") == recorded(dut.description())
+
+
+def test_silent_firmware_is_told_with_the_speed_of_the_line() -> None:
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    device = LinesDevice(name="bob", url=os.ttyname(theirs), baud=9600, timeout_s=0.05)
+    nothing = np.zeros(4, np.uint16)
+    with device.connect() as dut:
+        dut.start()
+        with pytest.raises(LinkTimeout) as raised:
+            list(dut.play([Samples(0, nothing, nothing, np.ones(4, np.bool_))]))
+    assert str(raised.value) == "device bob: no answer to sample 0 within 0.05 s; the line was opened at 9600 baud"
+    os.close(ours)
+    os.close(theirs)
+
+
+# --------------------------------------------------------------------------------------------------------- templates
+
+MINIMAL: dict[str, Any] = {"name": "bob", "url": "port"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"send": "{u:d},{y:d}"}, r"send: must end with \\n"),
+        ({"send": "{u:q}\n"}, r"send: the type of {u:q} must be one of d, x, g, a, f32"),
+        ({"send": "{u}\n"}, r"send: '{' is neither {NAME:TYPE} nor two braces"),
+        ({"send": "{v:d}\n"}, "send: has no field v"),
+        ({"send": "{u:d},{u:d}\n"}, "send: the field u is there twice"),
+        ({"send": "{u:d}{checksum:x}\n"}, "send: has a field checksum: set checksum to one of xor, crc16, crc32"),
+        ({"send": "{checksum:x}{u:d}\n", "checksum": "xor"}, "send: no field may follow checksum"),
+        ({"receive": "{a:g}{b:g}\n"}, "receive: nothing separates a from b"),
+        ({"receive": "{a:g}\n{b:g}\n"}, "receive: must be one line"),
+        ({"receive": "{alarm:g}\n"}, "receive: alarm must be a whole number, not of the type g"),
+        ({"receive": "x" * 5000}, "receive: longer than 4000 characters"),
+        ({"theta": ["a1"]}, "theta: receive has no field a1"),
+        ({"window": 2}, 'window: more than 1 sample in flight needs echo = "index"'),
+        ({"window": 0}, "window must be 1 to 4096, not 0"),
+        ({"echo": "index"}, "echo needs {index:d} in send and in receive"),
+        ({"units": "volts"}, "send: volts need the type g, a or f32"),
+        ({"reset_answer": "OK"}, "reset_answer needs reset"),
+        ({"missing": "-\n", "send": "{u:d},{valid:d}\n"}, "missing: send has valid already"),
+        ({"baud": 0}, "baud must be 1 to 100000000, not 0"),
+        ({"settings": {"gain": 1.0}}, "settings: a device of the kind lines has none"),
+        ({"receive": "{a1:g},{a2:g}\n", "datasheet": {"model": {"na": 1, "nb": 2}}}, "model has 3 parameters, theta 2"),
+    ],
+)
+def test_wrong_template_is_refused_with_its_key(changes: dict[str, Any], told: str) -> None:
+    with pytest.raises(ConfigurationError) as raised:
+        from_table({"kind": "lines", **MINIMAL, **changes}, "bob.toml")
+    assert str(raised.value).startswith(f"bob.toml: {told.replace(chr(92) * 2, chr(92))}")
+
+
+@pytest.mark.parametrize(
+    ("template", "line", "values"),
+    [
+        ("{a:d},{b:g}\n", b"7, -1.5e3", [7, -1500]),
+        ("{a:g},{b:g}\n", b".5,+2.", [0.5, 2]),
+        ("{a:g},{b:g}\n", b"nan,-INF", [np.nan, -np.inf]),
+        ("{a:g},{b:g}\n", b"nan(0x8),1e999", [np.nan, np.inf]),
+        ("{a:a},{b:a}\n", b"0x1.8p+1,-0x0p+0", [3, 0]),
+        ("{a:a},{b:a}\n", b"0x1p+99999,nan", [np.inf, np.nan]),
+        ("{a:f32}{b:f32}\n", b"3f800000C0490fdb", [1, np.float32(-np.pi)]),
+        ("{a:x} {b:x}\n", b"ff 0x10", [255, 16]),
+        ('{{"a":{a:g},"s":"{s:s}","b":{b:d}}}\n', b'{"a":1,"s":"on","b":2}', [1, 2]),
+        ("{a:g},{b:g}\n", b"1_0,2", None),
+        ("{a:g},{b:g}\n", b"1,2,3", None),
+        ("{a:g},{b:g}\n", b"1,", None),
+        ("{a:d},{b:d}\n", b"0b1,2", None),
+        ("{a:d},{b:d}\n", b"1" * 40 + b",2", None),
+        ("{a:f32},{b:d}\n", b"3f80000,2", None),
+        ("{a:g},{b:g}\n", b"\xb2,2", None),
+    ],
+)
+def test_line_is_read_by_its_template(template: str, line: bytes, values: list[float] | None) -> None:
+    reader = Reader("receive", template, lambda name: name == "s")
+    words = reader.read(line)
+    if values is None:
+        assert words is None
+    else:
+        assert words is not None
+        np.testing.assert_array_equal(reader.values([words], ["a", "b"]), [values])
+
+
+def test_time_to_read_a_line_is_linear_in_its_length() -> None:
+    reader = Reader("receive", ",".join(f"{{a{i}:g}}" for i in range(8)) + "\n", lambda _: False)
+
+    def cpu_s(n: int) -> float:
+        start_s = time.process_time()
+        for line in (b"1" * n, b"1." * n, b"1e" * n, b" " * n, b"1," * n):
+            assert reader.read(line) is None
+        return time.process_time() - start_s
+
+    assert min(cpu_s(400_000) for _ in range(3)) < 1.0  # quadratic: minutes
+
+
+def test_checksums_are_those_of_their_standards() -> None:
+    for name, check in (("xor", "31"), ("crc16", "29b1"), ("crc32", "cbf43926")):
+        writer = TemplateDescription._checksum(LinesDevice(**MINIMAL, checksum=name))  # type: ignore[arg-type]
+        assert writer is not None
+        assert f"{writer.compute(b'123456789'):0{writer.digits}x}" == check
+
+
+def test_lines_are_written_by_their_template() -> None:
+    writer = Writer("send", '{{"u":{u:d},"y":{y:a}}} 5% {index:x}\n', ("u", "y", "index"))
+    assert writer.lines([[1, 2], [0.5, 0.1], [15, 16]], 2) == [
+        b'{"u":1,"y":0x1.0000000000000p-1} 5% f\n',
+        b'{"u":2,"y":0x1.999999999999ap-4} 5% 10\n',
+    ]
+    assert Writer("missing", "-\n", ()).lines([], 2) == [b"-\n", b"-\n"]
+
+
+# -------------------------------------------------------------------------------------------------------- descriptions
+
+
+def test_faults_that_the_protocol_leaves_unnoticed_are_listed() -> None:
+    def cannot_tell(**changes: Any) -> tuple[str, ...]:
+        return LinesDevice(**MINIMAL, **changes).known_datasheet().cannot_tell
+
+    assert len(cannot_tell()) == 5
+    assert cannot_tell(**COMMON, **PROTOCOLS["checksum"]) == ("a sample received twice if both answers are the same",)
+    assert "a reset of the device during a record" not in cannot_tell(**PROTOCOLS["count"])
+    assert (
+        ProgramDevice(name="bob", arguments=("p",), reset="R\n", reset_answer="OK").known_datasheet().cannot_tell == ()
+    )
+
+
+def test_data_sheet_names_what_the_template_reports() -> None:
+    sheet = LinesDevice(**MINIMAL, receive="{a1:g},{armed:d},{x:g},{statistic:g}\n", theta=("a1",)).known_datasheet()
+    assert (sheet.theta_n, sheet.armed, sheet.statistic, sheet.innovation, sheet.alarms) == (
+        1,
+        True,
+        True,
+        False,
+        False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "option"),
+    [("lines", 'url = "ttyX"', "./ttyX"), ("exec", 'arguments = ["./p", "-v"]', "./p")],
+)
+def test_file_that_names_a_port_or_a_program_needs_to_be_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, place: str, option: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(f'kind = "{kind}"\n{place}\n')
+    with pytest.raises(ConfigurationError, match=f"no file may order: pass --allow {option}$"):
+        trusted("mine.toml", Trust(option="--allow"))
+    trusted("mine.toml", Trust([option]))
+    trusted(f"{kind}:{option}", Trust())
+
+
+def test_model_in_volts_is_converted_to_codes() -> None:
+    """The same model y' = a y + b u + d, written in volts and in codes."""
+    receive = "{a1:g},{b0:g},{d:g},{innovation:g},{alarm:d}\n"
+    program = "for line in open(0): print('-0.5,0.25,3,1,0', flush=True)"
+    sheet = {"model": {"na": 1, "nb": 1, "offset": True}}
+    table = {"arguments": ["python3", "-c", program], "send": "{u:g} {y:g}\n", "units": "volts", "datasheet": sheet}
+    description = from_table({"kind": "exec", "name": "bob", "receive": receive, "timeout_s": LONG_S, **table}, "bob")
+    u, y = (
+        Channel(low_v=low, lsb_v=lsb, unit="", unit_per_v=1.0, noise_lsb=0.0) for low, lsb in ((-5, 0.5), (-2, 0.1))
+    )
+    with description.connect() as device:
+        device.prepare({"force": u, "displacement": y}, 1.0)
+        device.start()
+        zero = np.zeros(1, np.uint16)
+        (answers,) = device.play([Samples(0, zero, zero, np.ones(1, np.bool_))])
+    assert answers.theta is not None
+    assert answers.innovation is not None
+    a1, b0, d = answers.theta[0].tolist()
+    for u_code, y_code in ((0, 0), (7, 13)):
+        in_volts = 0.5 * y.volts(np.array([y_code]))[0] + 0.25 * u.volts(np.array([u_code]))[0] + 3
+        assert y.volts(np.array([0]))[0] + y.lsb_v * (-a1 * y_code + b0 * u_code + d) == pytest.approx(in_volts)
+    assert answers.innovation.tolist() == pytest.approx([10.0])
