@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from analogrig.catalogue import LAYOUTS, Hello, pack, unpack
 from analogrig.links.can_bus import CanBus
-from analogrig.links.can_link import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
+from analogrig.links.can_station import BUS_OFF, CONTROLLER, NOT_ACKNOWLEDGED, PASSIVE, RESTARTED, VIOLATION
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import can
 from analogrig.links.wire_faults import LONGEST_DELAY_S, STRANGERS_HASH, Direction, FaultyLine, Lane, WireFaults
