@@ -39,7 +39,7 @@ DIRECT_BLOCK_SAMPLES = 16_384
 """Block length in samples of a direct bench; such blocks fit in the cache."""
 
 
-class _RunBuilder:
+class RunBuilder:
     """Collector of the samples and answers of one run. The Run shares its arrays.
 
     The arrays are allocated for all samples asked. The operating system provides only the pages that are written.
@@ -187,7 +187,7 @@ class Bench:
         self.dut.prepare(performance.channels, performance.sample_period_s)
         self.dut.start(pace)
         initial = self._initial_conditions(performance, scenario, seed)
-        builder = _RunBuilder(scenario.samples, self.dut.datasheet)
+        builder = RunBuilder(scenario.samples, self.dut.datasheet)
         faults = (*scenario.caveats, *self._collect_samples(blocks, pace, scenario.samples, builder, until_s))
         conditions = self._final_conditions(initial, performance.hindsight(), faults, builder)
         return builder.build(conditions)
@@ -212,7 +212,7 @@ class Bench:
         )
 
     def _collect_samples(
-        self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder, until_s: float
+        self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: RunBuilder, until_s: float
     ) -> list[str]:
         """Exchange the samples; return the failures that ended the exchange early or make it invalid."""
         faults = []
@@ -256,7 +256,7 @@ class Bench:
             yield block
 
     def _final_conditions(
-        self, initial: Conditions, known: Hindsight, faults: tuple[str, ...], builder: _RunBuilder
+        self, initial: Conditions, known: Hindsight, faults: tuple[str, ...], builder: RunBuilder
     ) -> Conditions:
         """Conditions known after the last sample."""
         return dataclasses.replace(
@@ -287,7 +287,7 @@ class Bench:
         """Pace of a real-time run with ``period_s`` between samples; counts the overruns."""
         return self.dut.pace(period_s)
 
-    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: _RunBuilder) -> None:
+    def _exchange(self, blocks: Iterable[Block], pace: Pace | None, samples: int, builder: RunBuilder) -> None:
         """Exchange all records. Each is a run of its own for the device, which has already started the first."""
         for record, record_blocks in itertools.groupby(blocks, key=lambda block: block.record):
             if record:
@@ -297,7 +297,7 @@ class Bench:
             line_s = self.dut.line_s
             builder.end_record(line_s, self.dut.stop())
 
-    def _exchange_record(self, blocks: Iterable[Block], samples: int, builder: _RunBuilder) -> None:
+    def _exchange_record(self, blocks: Iterable[Block], samples: int, builder: RunBuilder) -> None:
         """Send the blocks of one record and collect their replies."""
         sent: deque[Block] = deque()
         start = builder.records[-1]

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeGuard
 
 from analogrig.datasheet import Datasheet
+from analogrig.devices.can_description import CanLineDescription
 from analogrig.devices.description import Capability, DeviceDescription
 from analogrig.devices.device import Device
 from analogrig.devices.library import LIBRARY
 from analogrig.errors import ConfigurationError
 from analogrig.estimator_config import EstimatorConfig
-from analogrig.links.line import CanLine, SerialLine
+from analogrig.links.line import SerialLine
 from analogrig.links.link import FramedLink, Link
 from analogrig.links.wire import Wire
 from analogrig.links.wire_faults import FaultyWire, WireFaults
@@ -23,7 +24,6 @@ if TYPE_CHECKING:  # importing python-can takes longer than all other imports to
     from analogrig.links.can_bus import CanBus
 
 MOST_BAUD = 100_000_000
-MOST_BITRATE = 20_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,24 +147,8 @@ class ByteDevice(CatalogueDescription):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameDevice(CatalogueDescription):
+class FrameDevice(CanLineDescription, CatalogueDescription):
     """A device on a CAN bus."""
-
-    bitrate: int | None = None
-    """Bit rate of the bus [bit/s]. If there is no real bus, the run reports the time that this one would take."""
-    data_bitrate: int | None = None
-    """Bit rate of the data phase of CAN FD [bit/s]; None if it is ``bitrate``."""
-    fd: bool = False
-    """True if bus and device support CAN FD, whose frames carry a block of samples."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("bitrate", "data_bitrate"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value <= MOST_BITRATE:
-                raise ValueError(f"{name} must be 1 to {MOST_BITRATE}, not {value}")
-        if self.data_bitrate is not None and not (self.fd and self.bitrate is not None):
-            raise ValueError("data_bitrate is for CAN FD: set fd = true and bitrate as well")
 
     def open_link(self) -> Link:
         from analogrig.links.can_link import CanLink
@@ -176,9 +160,6 @@ class FrameDevice(CatalogueDescription):
     def bus(self) -> CanBus:
         """Bus with the started device; errors as ``open_link``."""
         raise NotImplementedError
-
-    def line(self) -> CanLine | None:
-        return None if self.bitrate is None else CanLine(self.bitrate, self.data_bitrate)
 
     def fault_kinds(self) -> Collection[str]:
         from analogrig.links.faulty_bus import FaultyBus

@@ -33,6 +33,7 @@ KINDS = Kinds(
         "qemu-f405": "analogrig.devices.qemu:QemuF405",
         "serial": "analogrig.devices.serial:SerialDevice",
         "can": "analogrig.devices.can:CanDevice",
+        "can-dbc": "analogrig.devices.can_dbc:CanDbcDevice",
         "python": "analogrig.devices.python:PythonDescription",
         "lines": "analogrig.devices.lines:LinesDevice",
         "exec": "analogrig.devices.program:ProgramDevice",
@@ -77,7 +78,11 @@ def _read(name: str) -> tuple[DeviceDescription, str]:
         return KINDS[kind].from_name(name, name[len(kind) :].removeprefix(":")).placed(folder_of(name)), ""
     _check_not_compiled(name)
     path = config.locate("devices", name)
-    return from_table({"name": path.stem, **config.read_toml(path)}, str(path)).placed(path.parent), str(path)
+    description = from_table({"name": path.stem, **config.read_toml(path)}, str(path))
+    try:
+        return description.placed(path.parent), str(path)
+    except ConfigurationError as error:  # of a second file that the description names
+        raise ConfigurationError(f"{path}: {error}") from error
 
 
 def _check_not_compiled(name: str) -> None:

@@ -14,8 +14,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis, Samples
 from analogrig.catalogue import (
     BLOCK_SAMPLES,
@@ -38,6 +36,7 @@ from analogrig.catalogue import (
     is_finite,
 )
 from analogrig.errors import DeviceError, LinkClosed, LinkTimeout, TimeLimitReached
+from analogrig.protocol.answer_rows import AnswerRows
 from analogrig.protocol.conversation import Conversation
 from analogrig.protocol.pace import Pace
 from analogrig.run import LOST, UNREPORTED
@@ -74,48 +73,6 @@ def most_answers(samples: int, parameters: int) -> int:
     return samples * (parameters + 2) + 2
 
 
-class _PendingAnswers:
-    """Answers not yet taken, in lists: numpy takes as long for one number as for a hundred."""
-
-    def __init__(self, width: int) -> None:
-        self.width = width
-        """Number of elements of theta, plus one for the innovation."""
-        self.values: list[float] = []
-        self.statistics: list[float] = []
-        self.flags: list[int] = []
-        self.alarms: list[RaisedAlarm] = []
-        self.diagnoses: list[ReportedDiagnosis] = []
-        self._last_taken = (width * [0.0], 0.0)
-
-    def repeat(self, flags: int, statistic: float | None = None) -> None:
-        """Enter a sample without a report: the estimate of the sample before, and no innovation."""
-        row = self.values[-self.width :] or self._last_taken[0]
-        self.values += [*row[:-1], 0.0]
-        self.finish(flags, (self.statistics or self._last_taken[1:])[-1] if statistic is None else statistic)
-
-    def finish(self, flags: int, statistic: float) -> None:
-        self.flags.append(flags)
-        self.statistics.append(statistic)
-
-    def take(self, n: int, before: int) -> Answers:
-        """Remove and return the first n samples, and the alarms and diagnoses before the index ``before``."""
-        cut = n * self.width
-        values = np.array(self.values[:cut], dtype=np.float32).reshape(n, self.width)
-        out = Answers(
-            theta=values[:, :-1],
-            innovation=values[:, -1],
-            statistic=np.array(self.statistics[:n], dtype=np.float32),
-            flags=np.array(self.flags[:n], dtype=np.uint8),
-            alarms=tuple(alarm for alarm in self.alarms if alarm.index < before),
-            diagnoses=tuple(diagnosis for diagnosis in self.diagnoses if diagnosis.index < before),
-        )
-        if n:
-            self._last_taken = (self.values[cut - self.width : cut], self.statistics[n - 1])
-        del self.values[:cut], self.statistics[:n], self.flags[:n], self.alarms[: len(out.alarms)]
-        del self.diagnoses[: len(out.diagnoses)]
-        return out
-
-
 class Exchange:
     """Exchange of one run, from its first sample to its last."""
 
@@ -141,7 +98,7 @@ class Exchange:
         self._check_device = check_device
         self._pace = pace
         self._elements = (*range(parameters), int(Element.INNOVATION), _NO_ELEMENT)
-        self._rows = _PendingAnswers(parameters + 1)
+        self._rows = AnswerRows(parameters + 1)
         self._pending: deque[tuple[int, int]] = deque()
         """First sample and number of samples of each message that is not completely answered."""
         self._deadline_s = 0.0

@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analogrig import catalogue, config
+from analogrig import catalogue
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.errors import ConfigurationError, RecordingError
-from analogrig.recordings.files import silence_logger
+from analogrig.links.dbc import check_layout, load_dbc
 
 if TYPE_CHECKING:
     import can
@@ -49,26 +49,19 @@ def _decode_own(identifier: int, data: bytes) -> Message | None:
     return unpack(bytes((identifier,)) + data)
 
 
-MAX_DBC_BYTES = 16_000_000
-
-
 def _messages(dbc: Path) -> dict[tuple[int, bool], Any]:
-    import cantools
-
     try:
-        with silence_logger("cantools"):
-            text = config.read_bounded(dbc, MAX_DBC_BYTES).decode("cp1252", "replace")  # as cantools reads files
-            database: Any = cantools.database.load_string(text, database_format="dbc")
-    except OSError as error:
-        raise ConfigurationError(f"--dbc {dbc}: {error.strerror or error}") from error
+        database = load_dbc(dbc)
     except ConfigurationError as error:
         raise ConfigurationError(f"--dbc {error}") from error
-    except Exception as error:
-        raise ConfigurationError(f"--dbc {dbc}: not a DBC: {str(error) or type(error).__name__}") from error
     known = [message for message in database.messages if message.name in LAYOUTS]
     if not known:
         raise ConfigurationError(f"--dbc {dbc}: has none of the messages {', '.join(LAYOUTS)}")
     for message in known:
+        try:
+            check_layout(message)
+        except ValueError as error:
+            raise ConfigurationError(f"--dbc {dbc}: {error}") from error
         lacking = set(_signals(message.name)) - {signal.name for signal in message.signals}
         if lacking:
             raise ConfigurationError(f"--dbc {dbc}: message {message.name} lacks {', '.join(sorted(lacking))}")

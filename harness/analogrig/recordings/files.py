@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import io
-import logging
 import sys
 import zlib
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from analogrig.errors import RecordingError
+from analogrig.links.quiet import silence_logger
 from analogrig.wording import number_of
 
 if TYPE_CHECKING:
@@ -174,20 +174,6 @@ def _check_containers(raw: BinaryIO) -> None:
         if len(expanded) == MOST_CONTAINER_BYTES:
             raise ValueError(f"a container expands to {MOST_CONTAINER_BYTES} bytes or more")
     raw.seek(0)
-
-
-@contextlib.contextmanager
-def silence_logger(library: str) -> Iterator[None]:
-    """Suppress the log of a library, whose exception is already reported in one line."""
-    logger = logging.getLogger(library)
-    before = logger.level, logger.disabled
-    logger.setLevel(logging.CRITICAL + 1)  # also silences child loggers
-    logger.disabled = True  # the library may set the level when it is loaded later
-    try:
-        yield
-    finally:
-        logger.disabled = before[1]
-        logger.setLevel(before[0])
 
 
 @contextlib.contextmanager
