@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import can
 import cantools
@@ -84,8 +84,8 @@ model = {{ na = 2, nb = 3, offset = true }}
 """
 
 
-def write(folder: Path, channel: str, **replaced: str) -> Path:
-    """Device file and DBC in ``folder``; ``replaced`` are texts of the device file by those instead of them."""
+def write(folder: Path, channel: str) -> Path:
+    """Device file and DBC in ``folder``."""
     (folder / "ecu.dbc").write_text(DBC, encoding="utf-8")
     file = folder / "ecu.toml"
     file.write_text(TOML.replace("CHANNEL", channel), encoding="utf-8")
@@ -121,7 +121,7 @@ class ScriptedEcu:
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
-    def __enter__(self) -> ScriptedEcu:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 

@@ -427,10 +427,10 @@ def test_number_that_is_none_is_said_to_be_the_devices(kind: type[Message], what
 
 
 def test_number_that_is_none_is_seen_on_a_can_bus_too() -> None:
-    link = CanLink(MemoryBus(1))
+    bus = MemoryBus(1)
     packet = pack(Estimate(0, 1, 84, np.inf))
-    can_frame = can.Message(arbitration_id=packet[0], data=packet[1:], is_extended_id=False)
-    assert link._message(can_frame) == Estimate(0, 1, 84, np.inf)
+    bus._answers.append(can.Message(arbitration_id=packet[0], data=packet[1:], is_extended_id=False))
+    assert CanLink(bus).receive(1.0) == Estimate(0, 1, 84, np.inf)
 
 
 def test_damage_of_an_earlier_run_does_not_explain_a_loss(line: FaultyLink) -> None:

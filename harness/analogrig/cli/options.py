@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from analogrig.devices.can_dbc import CanDbcDevice
     from analogrig.rigs.rig import Rig
     from analogrig.run import Run
     from analogrig.scenario import Scenario
@@ -190,7 +191,7 @@ def files_read(arguments: argparse.Namespace) -> tuple[Path, ...]:
     from analogrig.trust import resolve_name
 
     given = vars(arguments)
-    names = [str(given[key]) for key in ("file", "rig", "scenario", "dut") if given.get(key) is not None]
+    names = [str(given[key]) for key in ("file", "rig", "scenario", "dut", "log_dut") if given.get(key) is not None]
     scenario = Path(given.get("scenario") or "")
     if scenario.suffix == ".toml":
         with contextlib.suppress(AnalogrigError):  # the command that loads it reports the error
@@ -235,12 +236,34 @@ def load_capture(arguments: argparse.Namespace) -> Run:
         return run if scenario is None else replace_scenario(run, scenario)
     if scenario is None:
         raise ConfigurationError(f"{arguments.file}: a CAN log does not name its scenario: name one with --scenario")
+    device = None if arguments.log_dut is None else _described_ecu(arguments.log_dut)
+    if device is not None and arguments.dbc is not None:
+        raise ConfigurationError(f"{arguments.log_dut}: names a DBC of its own: leave out --dbc")
     with open_rig(arguments.rig, allow=trust_of(arguments)) as rig:
         return import_run(
             arguments.file,
             scenario,
             rig,
             dbc=arguments.dbc,
+            device=device,
             number=arguments.run,
             most_lost_n=arguments.most_lost,
         )
+
+
+def _described_ecu(name: str) -> CanDbcDevice:
+    """Device whose messages a CAN log holds. It is only described: nothing is opened.
+
+    :raises ConfigurationError: it is of another kind, or its description is wrong.
+    """
+    from analogrig.devices.can_dbc import CanDbcDevice
+    from analogrig.devices.registry import describe
+    from analogrig.errors import ConfigurationError
+
+    device = describe(name)
+    if not isinstance(device, CanDbcDevice):
+        raise ConfigurationError(
+            f"{name}: a log of a device of the kind {device.kind} needs no device file: leave it out, or pass one of"
+            f" the kind {CanDbcDevice.kind}"
+        )
+    return device

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig.cli.options import (
+    DUT,
     FILE,
     add_capture,
     add_command,
@@ -72,6 +73,7 @@ def add_replay(commands: Any) -> None:
     )
     command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
+    command.set_defaults(log_dut=None)
     add_dut(command, default=None, shown="that of the recording")
     _add_output(command, "build/replay")
     _add_play(command)
@@ -85,9 +87,13 @@ def add_judge(commands: Any) -> None:
         "judge a recorded run or a CAN log, without a device",
         "judge build/run/run.npz",
         "judge build/can/can.log --scenario thesis --json",
+        "judge bench.asc --dut ecu.toml --scenario thesis",
     )
     command.add_argument("file", type=Path, metavar=FILE, help="recording (run.npz) or CAN log")
     add_capture(command)
+    command.add_argument(
+        "--dut", dest="log_dut", metavar=DUT, help="device file (kind can-dbc) of a CAN log with messages of its own"
+    )
     _add_output(command, "build/judge")
     command.set_defaults(command=_judge)
 

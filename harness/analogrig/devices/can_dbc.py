@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from analogrig.datasheet import Datasheet
 from analogrig.devices.adapted import AdaptedDescription
@@ -147,6 +147,8 @@ class CanDbcDevice(CanBusDescription, AdaptedDescription):
         yield "the direction in which a frame of an unanswered sample was lost"
         if not self.start:
             yield "an estimator that keeps its state from the record before"
+        if not self.send.valid:
+            yield "a missing sample, in a log"
         if not self.send.counter:
             yield "a sample that the device takes twice, or not at all, and answers once"
         if received.counter and received.counter_is == "echo":

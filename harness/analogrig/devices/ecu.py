@@ -11,7 +11,7 @@ from analogrig.answers import Answers, Samples
 from analogrig.devices.can_dbc import CanDbcDevice, Request
 from analogrig.devices.device import Device
 from analogrig.devices.ecu_answers import MISSING, EcuAnswers
-from analogrig.errors import DeviceError, LinkError, LinkTimeout, TimeLimitReached
+from analogrig.errors import LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import CanStation
 from analogrig.links.link import CanListener
@@ -104,45 +104,45 @@ class EcuDevice(Device):
 
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         for block in blocks:
-            index = block.first
+            samples = zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True)
             try:
-                for index, *sample in zip(
-                    range(block.first, block.first + len(block)),
-                    block.u.tolist(),
-                    block.y.tolist(),
-                    block.valid.tolist(),
-                    strict=True,
-                ):
+                for index, sample in enumerate(samples, block.first):
                     self._exchange(index, *sample)
             except TimeLimitReached:
                 answered = len(self._answers.rows.flags)
                 yield self._take(answered, block.first + answered)
                 raise
-            except LinkError as error:
-                if isinstance(error, LinkTimeout):
-                    raise
-                raise type(error)(f"device {self.name}: {error}, at sample {index}") from error
             yield self._take(len(block), block.first + len(block))
 
     def _exchange(self, index: int, u: int, y: int, valid: bool) -> None:  # noqa: FBT001
         """Send one sample, and take its answer.
 
+        :raises LinkError, DeviceError: names the sample.
+        """
+        try:
+            self._wait(index)
+            if not valid and not self._description.send.valid:
+                self._answers.skip(index, MISSING | UNREPORTED)
+                return
+            for frame in self._encode(index, u, y, valid):
+                self._station.send(frame)
+            self._answers.begin(index, missing=not valid)
+            self._await_answer()
+        except LinkError as error:
+            raise type(error)(f"device {self.name}: sample {index}: {error}") from error
+
+    def _await_answer(self) -> None:
+        """Take frames until the latest sample is answered, or the time-out is over.
+
         :raises LinkTimeout: too many samples were not answered.
         """
-        self._wait(index)
-        if not valid and not self._description.send.valid:
-            self._answers.skip(index, MISSING | UNREPORTED)
-            return
-        for frame in self._encode(index, u, y, valid):
-            self._station.send(frame)
-        self._answers.begin(index, missing=not valid)
         deadline_s = self._clock() + self._description.timeout_s
         while not self._answers.is_complete:
-            frame_or_none = self._receive(deadline_s)
-            if frame_or_none is None:
-                self._lose(index)
+            frame = self._receive(deadline_s)
+            if frame is None:
+                self._lose()
                 return
-            self._take_frame(frame_or_none)
+            self._take_frame(frame)
 
     def _wait(self, index: int) -> None:
         """Take the frames that come before the sample is due."""
@@ -162,13 +162,13 @@ class EcuDevice(Device):
         elif self._messages.is_of_answer(frame):
             self._station.counted["frames_dropped"] += 1
 
-    def _lose(self, index: int) -> None:
+    def _lose(self) -> None:
         self._answers.end()
         self._timeouts += 1
         if self._timeouts > MOST_TIMEOUTS:
             raise LinkTimeout(
-                f"device {self.name}: no complete answer to sample {index} within {self._description.timeout_s:g} s, nor"
-                f" to {MOST_TIMEOUTS} before it ({self._context()})"
+                f"no complete answer within {self._description.timeout_s:g} s, for the {self._timeouts}th time"
+                f" ({self._context()})"
             )
 
     def _receive(self, until_s: float) -> can.Message | None:

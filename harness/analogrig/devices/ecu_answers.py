@@ -68,34 +68,38 @@ class EcuAnswers:
         :raises DeviceError: no sample awaits it, and nothing shows to which it belongs.
         """
         key = (answer.message, *answer.values)
-        is_counted = answer.count is not None
-        if is_counted and not self._is_due(answer):
+        if not self._is_due(answer):
             return
         if self._is_open and key not in self._seen:
             self._seen[key] = answer.values
             self._values.update(answer.values)
             self._check_complete(answer.message)
-        elif is_counted and self._is_echo and self._seen.get(key, answer.values) == answer.values:
+        elif self._is_echoed(answer) and self._seen.get(key, answer.values) == answer.values:
             self.counted["answers_repeated" if key in self._seen else "answers_late"] += 1
         else:
             raise DeviceError(self._unexpected(answer, is_repeated=key in self._seen))
 
     def _is_due(self, answer: Answer) -> bool:
         """True unless the counter shows that the frame is late or repeated; counts it then."""
-        assert answer.count is not None
+        if answer.counter is None:
+            return True
         modulus = self._moduli[answer.message]
         if self._is_echo:
-            is_due = answer.count == self._index % (self._sample_modulus or 1) % modulus
+            is_due = answer.counter == self._index % (self._sample_modulus or 1) % modulus
             self.counted["answers_late"] += not is_due
             return is_due
         before = self._counts.get(answer.message)
-        self._counts[answer.message] = answer.count
-        step = 1 if before is None else (answer.count - before) % modulus
+        self._counts[answer.message] = answer.counter
+        step = 1 if before is None else (answer.counter - before) % modulus
         if step == 0:
             self.counted["answers_repeated"] += 1
             return False
         self.counted["answers_lacking"] += step - 1
         return True
+
+    def _is_echoed(self, answer: Answer) -> bool:
+        """True if a counter shows to which sample the frame belongs."""
+        return self._is_echo and answer.counter is not None
 
     def _check_complete(self, message: str) -> None:
         ends = self._received.complete
@@ -105,9 +109,9 @@ class EcuAnswers:
 
     def _unexpected(self, answer: Answer, *, is_repeated: bool) -> str:
         frame = f"device {self._name}: a frame {answer.message}"
-        if is_repeated and self._is_echo and answer.count is not None:
+        if is_repeated and self._is_echoed(answer):
             return f"{frame} answers sample {self._index} a second time with other values"
-        cure = "" if answer.count is not None else ", and has no counter (receive.counter)"
+        cure = "" if answer.counter is not None else ", and has no counter (receive.counter)"
         return f"{frame} came after the answer to sample {self._index}{cure}"
 
     def end(self) -> None:

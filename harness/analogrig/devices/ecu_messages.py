@@ -35,7 +35,7 @@ class Answer(NamedTuple):
     message: str
     values: Mapping[str, float]
     """Values of the signals that [receive] names, as ``Message.Signal``."""
-    count: int | None
+    counter: int | None
     """Value of its counter; None if [receive] names none in this message."""
 
 
@@ -45,7 +45,7 @@ class SamplePart(NamedTuple):
     message: str
     values: Mapping[str, float]
     """Physical values by key of [send]: u, y, valid."""
-    count: int | None
+    counter: int | None
     """Value of its counter, if it has one."""
 
 
@@ -102,7 +102,9 @@ class EcuMessages:
 
     # ------------------------------------------------------------------------------------------------------- to the bus
 
-    def encoder(self, channels: Mapping[str, Channel] | None = None) -> Callable[[int, int, int, bool], list[can.Message]]:
+    def encoder(
+        self, channels: Mapping[str, Channel] | None = None
+    ) -> Callable[[int, int, int, bool], list[can.Message]]:
         """Function that returns the frames of a sample, from its index, its codes of u and y, and valid.
 
         :param channels: channels of the rig; None: units that depend on them are not checked.
@@ -142,7 +144,7 @@ class EcuMessages:
         return can.Message(
             arbitration_id=message.frame_id,
             is_extended_id=message.is_extended_frame,
-            data=data.ljust(_frame_bytes(len(data)), b"\0"),
+            data=data if len(data) <= CLASSIC_BYTES else data.ljust(_frame_bytes(len(data)), b"\0"),
             is_fd=is_fd,
             bitrate_switch=is_fd and self._description.data_bitrate is not None,
             is_rx=False,
@@ -168,9 +170,12 @@ class EcuMessages:
         values = None if message is None else _decode(message, frame)
         if message is None or values is None:
             return None
-        wanted = {full: values[name] for name, full in self._answers[message.name].items() if name in values}
-        if not all(abs(value) <= _LARGEST_ANSWER for value in wanted.values()):  # false for NaN
-            return None
+        wanted = {}
+        for name, full in self._answers[message.name].items():
+            if name in values:
+                wanted[full] = value = values[name]
+                if not abs(value) <= _LARGEST_ANSWER:  # true for NaN
+                    return None
         counter = self._receive_counters.get(message.name)
         return Answer(message.name, wanted, None if counter is None else int(values.get(counter.signal.name, -1)))
 
@@ -190,10 +195,16 @@ class EcuMessages:
             bytes(other.data),
         )
 
+    def is_of_sample(self, frame: can.Message) -> bool:
+        """True if the frame has the identifier of a message of [send]."""
+        return any((frame.arbitration_id, frame.is_extended_id) == _identifier(self._frames[n]) for n in self.order)
+
     def sample_part(self, frame: can.Message) -> SamplePart | None:
         """Part of a sample in a captured frame of the harness; None if it is damaged, or none of [send]."""
         identifier = frame.arbitration_id, frame.is_extended_id
-        message = next((self._frames[name] for name in self.order if _identifier(self._frames[name]) == identifier), None)
+        message = next(
+            (self._frames[name] for name in self.order if _identifier(self._frames[name]) == identifier), None
+        )
         values = None if message is None else _decode(message, frame)
         if message is None or values is None:
             return None
@@ -209,7 +220,8 @@ class EcuMessages:
 
         It is the inverse of ``encoder``, as far as the signals have a step for each code.
         """
-        scales = {key: self._scale(key, channels[name]) for key, name in _CHANNELS.items()}
+        known = {key: scale(self._units(key), channels[name]) for key, name in _CHANNELS.items()}
+        scales = {key: factors for key, factors in known.items() if factors is not None}
         most = {key: channels[name].codes for key, name in _CHANNELS.items()}
 
         def decode(values: Mapping[str, float]) -> tuple[int, int, bool] | None:
@@ -219,11 +231,6 @@ class EcuMessages:
             return codes["u"], codes["y"], bool(values.get("valid", 1))
 
         return decode
-
-    def _scale(self, key: str, channel: Channel) -> tuple[float, float]:
-        factors = scale(self._units(key), channel)
-        assert factors is not None  # the channel is known
-        return factors
 
     # ------------------------------------------------------------------------------------------------------------- send
 
@@ -456,8 +463,10 @@ class EcuMessages:
         else:
             low, high = _integer_range(signal)
         if not low <= raw <= high:
-            raise self._error(where, f"{what} is {value:g} {signal.unit or ''}, raw {raw:g}; {signal.length} bits hold"
-                              f" {low:g} to {high:g}")
+            raise self._error(
+                where,
+                f"{what} is {value:g} {signal.unit or ''}, raw {raw:g}; {signal.length} bits hold {low:g} to {high:g}",
+            )
         least = -math.inf if signal.minimum is None else float(signal.minimum)
         most = math.inf if signal.maximum is None else float(signal.maximum)
         slack = 1e-6 * abs(signal.scale)
@@ -501,12 +510,11 @@ def _frame_bytes(n: int) -> int:
 
 def _decode(message: Any, frame: can.Message) -> dict[str, float] | None:
     """Physical values of the signals in a frame; None if it is damaged."""
-    if len(frame.data) not in (message.length, _frame_bytes(message.length)):
+    length = message.length
+    if len(frame.data) != length and len(frame.data) != _frame_bytes(length):
         return None
     try:
-        values: dict[str, float] = message.decode(
-            bytes(frame.data[: message.length]), decode_choices=False, scaling=True
-        )
+        values: dict[str, float] = message.decode_simple(bytes(frame.data[:length]), decode_choices=False)
     except Exception:  # noqa: BLE001 - the exceptions of cantools and bitstruct have no common base
         return None
     return values

@@ -11,6 +11,7 @@ import errno
 import importlib
 import inspect
 import logging
+import operator
 import os
 import termios
 import time
@@ -162,7 +163,9 @@ class PythonCanBus:
             self._bus.shutdown()
 
 
-_FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator")
+_flags = operator.attrgetter(
+    "is_extended_id", "is_remote_frame", "is_error_frame", "is_fd", "bitrate_switch", "error_state_indicator"
+)
 _MOST_BYTES = 64
 
 
@@ -175,7 +178,7 @@ def _is_valid(frame: can.Message) -> bool:
     return (
         type(identifier) is int
         and 0 <= identifier < 1 << bits
-        and all(isinstance(getattr(frame, flag), bool) for flag in _FLAGS)
+        and set(map(type, _flags(frame))) == {bool}
         and isinstance(data, bytes | bytearray)
         and len(data) <= _MOST_BYTES
         and type(code) is int

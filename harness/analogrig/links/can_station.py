@@ -52,6 +52,7 @@ class CanStation:
         self.counted: Counter[str] = Counter()
         """Counts of frames that were not used, by name."""
         self._own, self._device = frozenset(own), frozenset(device)
+        self._known = self._own | self._device
         self._state = ""
         self._last_error = ""
         self._sent: dict[tuple[int, bytes], None] = {}
@@ -117,7 +118,7 @@ class CanStation:
         identifier = frame.arbitration_id, frame.is_extended_id
         if frame.is_error_frame:
             self._note_error(frame)
-        elif frame.is_remote_frame or identifier not in self._own | self._device:
+        elif frame.is_remote_frame or identifier not in self._known:
             self.counted["frames_foreign"] += 1
         elif identifier in self._device:
             return True

@@ -66,9 +66,7 @@ def check_layout(message: Any) -> None:
 
     :raises ValueError: names the signals.
     """
-    from cantools.database import Error
-
     try:
         message.refresh(strict=True)
-    except Error as error:
+    except Exception as error:  # errors of cantools, and of bitstruct for impossible lengths
         raise ValueError(str(error)) from error

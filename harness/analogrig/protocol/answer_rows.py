@@ -24,7 +24,12 @@ class AnswerRows:
         """Enter a sample without a report: the estimate of the sample before, and no innovation."""
         row = self.values[-self.width :] or self._last_taken[0]
         self.values += [*row[:-1], 0.0]
-        self.finish(flags, (self.statistics or self._last_taken[1:])[-1] if statistic is None else statistic)
+        self.finish(flags, self.statistic if statistic is None else statistic)
+
+    @property
+    def statistic(self) -> float:
+        """Statistic of the latest sample."""
+        return (self.statistics or self._last_taken[1:])[-1]
 
     def finish(self, flags: int, statistic: float) -> None:
         self.flags.append(flags)

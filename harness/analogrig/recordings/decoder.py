@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import struct
 from collections import Counter as Tally
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analogrig import catalogue
+from analogrig.answers import Answers, RaisedAlarm, ReportedDiagnosis
 from analogrig.catalogue import INDICES, LAYOUTS, RUNS, Message, brief, index_up_to, pack, unpack
 from analogrig.errors import ConfigurationError, RecordingError
+from analogrig.estimator_config import MAX_PARAMETERS, EstimatorConfig
 from analogrig.links.dbc import check_layout, load_dbc
+from analogrig.protocol.answer_rows import AnswerRows
+from analogrig.recordings.captured import CapturedRun
+from analogrig.run import LOST, UNREPORTED
+from analogrig.wording import number_of
 
 if TYPE_CHECKING:
     import can
+
+
+_COUNTERS = ("updated", "refused", "alarms", "samples_lost")
+"""Counters of the device that prove whether the capture is complete."""
 
 
 class FrameDictionary:
@@ -99,9 +109,9 @@ def _decode_by_dbc(known: Any, data: bytes) -> Message | None:
         return None
 
 
-@dataclass(slots=True)
-class CapturedRun:
-    """Data of one run of a device, from its START to the next."""
+@dataclass
+class CatalogueRun(CapturedRun):
+    """Run of a device of our catalogue, from its START to the next."""
 
     run: int | None = None
     """Run id; None if the capture began during the run."""
@@ -109,8 +119,6 @@ class CapturedRun:
     settings: Mapping[int, float] = field(default_factory=dict)
     """Captured settings of the estimator, by Key."""
     identity: Mapping[str, int] = field(default_factory=dict)
-    samples: dict[int, tuple[int, int, bool]] = field(default_factory=dict)
-    """Force code, displacement code, and True if sent as missing; by sample index."""
     estimates: dict[int, dict[int, float]] = field(default_factory=dict)
     """Values by sample index, then by element."""
     steps: dict[int, tuple[int, float]] = field(default_factory=dict)
@@ -120,13 +128,57 @@ class CapturedRun:
     counters: dict[str, int] = field(default_factory=dict)
     incomplete: set[int] = field(default_factory=set)
     """Samples some of whose answers are not in the capture."""
-    faults: list[str] = field(default_factory=list)
-    """Reasons that the run is not valid."""
 
     @property
     def extent(self) -> int:
-        """Number of samples up to the last one in the capture."""
         return 1 + max((*self.samples, *self.steps), default=-1)
+
+    def device(self, path: Path) -> Mapping[str, Any]:
+        estimator = self._estimator(path)
+        return {
+            "name": "captured",
+            "kind": "log",
+            "report_interval_n": self.report_interval_n,
+            "estimator": estimator.as_table(),
+            "assumed_n": sum(key not in self.settings for key, _ in estimator.settings()),
+            "identity": dict(self.identity),
+        }
+
+    def _estimator(self, path: Path) -> EstimatorConfig:
+        most = min(MAX_PARAMETERS, self.identity.get("theta_max", MAX_PARAMETERS))
+        return EstimatorConfig.from_settings(self.settings, str(path), most)
+
+    def answers(self, path: Path) -> Answers:
+        parameters = self._estimator(path).parameters
+        rows = AnswerRows(parameters + 1)
+        elements = (*range(parameters), int(catalogue.Element.INNOVATION))
+        for k in range(self.extent):
+            self._enter(rows, k, elements)
+        rows.alarms = [RaisedAlarm(*alarm) for alarm in self.alarms if 0 <= alarm[0] < self.extent]
+        rows.diagnoses = [ReportedDiagnosis(*each) for each in self.diagnoses if 0 <= each[0] < self.extent]
+        return rows.take(self.extent, self.extent)
+
+    def _enter(self, rows: AnswerRows, k: int, elements: Sequence[int]) -> None:
+        """Enter the answer to sample k."""
+        estimate = self.estimates.get(k, {})
+        is_whole = set(estimate) >= set(elements)
+        is_due = bool(estimate) or self.report_interval_n == 1
+        flags, statistic = self.steps.get(k, (LOST, None))
+        if k not in self.samples or k in self.incomplete or (is_due and not is_whole):
+            flags |= LOST
+        if is_whole:
+            rows.values += [estimate[element] for element in elements]
+            rows.finish(flags, rows.statistic if statistic is None else statistic)
+        else:
+            rows.repeat(flags if flags & LOST else flags | UNREPORTED, statistic)
+
+    def capture_faults(self, path: Path) -> Iterator[str]:
+        alarms = self.counters.get("alarms", len(self.alarms))
+        if alarms != len(self.alarms):
+            yield f"the device raised {number_of(alarms, 'alarm')}, {path} holds {len(self.alarms)}"
+        lacking = [name for name in _COUNTERS if name not in self.counters]
+        if lacking:
+            yield f"the device's counters {', '.join(lacking)} after the run are not in {path}"
 
 
 class CaptureDecoder:
@@ -138,7 +190,7 @@ class CaptureDecoder:
         :raises RecordingError: the device uses another catalogue, and no DBC was given.
         """
         self._dictionary = dictionary
-        self.runs: list[CapturedRun] = []
+        self.runs: list[CatalogueRun] = []
         """Runs with samples, and possibly a last one without."""
         self.line: Tally[str] = Tally()
         """Counts of foreign frames and of damaged, repeated or missing messages, by name."""
@@ -193,7 +245,7 @@ class CaptureDecoder:
             if not faults:
                 faults.append(fault)
 
-    def _current_run(self) -> CapturedRun:
+    def _current_run(self) -> CatalogueRun:
         if not self.runs:
             self._begin(None)
         return self.runs[-1]
@@ -202,7 +254,13 @@ class CaptureDecoder:
         if self.runs and not self.runs[-1].samples:
             self.runs.pop()
         self.runs.append(
-            CapturedRun(run, self._report_interval_n, self._settings, self._identity, faults=self._early_faults)
+            CatalogueRun(
+                run=run,
+                report_interval_n=self._report_interval_n,
+                settings=self._settings,
+                identity=self._identity,
+                faults=self._early_faults,
+            )
         )
         self._early_faults = []
         self._at, self._has_gap, self._undated = {True: 0, False: 0}, False, None
