@@ -117,7 +117,8 @@ class ScriptedEcu:
         self._estimator = Estimator(config)
         self._answering, self._hearing = answering, hearing
         self._index, self._received = 0, 0
-        self._force = 0.0
+        self.forces: list[float] = []
+        """Forces received, in newtons."""
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
 
@@ -145,7 +146,7 @@ class ScriptedEcu:
             self._index = self._received = 0
             self._send([self.frame("EST_State", Ready=1)])
         elif "Force" in values:
-            self._force = values["Force"]
+            self.forces.append(values["Force"])
         else:
             answer = self._step(values)
             self._send(self._answering(self._index, answer))
@@ -153,7 +154,7 @@ class ScriptedEcu:
 
     def _step(self, travel: dict[str, Any]) -> Answer:
         """Answer to a sample; the core takes codes, of 0.25 N and -100 N at 0."""
-        force = (self._force + 100.0) / 0.25
+        force = (self.forces[-1] + 100.0) / 0.25
         out = self._estimator.run([force], [travel["Travel"]], np.array([travel["Valid"]]))
         parts = [
             self.frame("EST_Par", Index=i, Ctr=travel["Ctr"], **{f"V{i}": float(out.theta[0, i])})

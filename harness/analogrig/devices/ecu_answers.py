@@ -45,6 +45,8 @@ class EcuAnswers:
         """Values of its answer so far."""
         self._seen: dict[tuple[str, ...], Mapping[str, float]] = {}
         """Values of each frame of its answer, by message and signals."""
+        self._seen_before: dict[tuple[str, ...], Mapping[str, float]] = {}
+        """The same of the sample before."""
         self._counts: dict[str, int] = {}
         """Latest own count of each message."""
         self._was_raised = False
@@ -55,47 +57,61 @@ class EcuAnswers:
         """Await the answer to a sample."""
         self._index, self._is_missing = index, missing
         self._is_open, self.is_complete = True, False
-        self._values, self._seen = {}, {}
+        self._values, self._seen, self._seen_before = {}, {}, self._seen
 
     def skip(self, index: int, flags: int) -> None:
         """Enter a sample that was not sent, or is not known."""
         self._index = index
+        self._seen, self._seen_before = {}, self._seen
         self.rows.repeat(flags)
 
     def add(self, answer: Answer) -> None:
         """Take a frame of the device.
 
-        :raises DeviceError: no sample awaits it, and nothing shows to which it belongs.
+        :raises DeviceError: no sample awaits it, and nothing shows to which it belongs; or it contradicts another.
         """
         key = (answer.message, *answer.values)
-        if not self._is_due(answer):
+        index = self._index_of(answer)
+        seen = self._seen if index == self._index else self._seen_before
+        if index is None:
             return
-        if self._is_open and key not in self._seen:
-            self._seen[key] = answer.values
+        if self._is_open and index == self._index and key not in seen:
+            seen[key] = answer.values
             self._values.update(answer.values)
             self._check_complete(answer.message)
-        elif self._is_echoed(answer) and self._seen.get(key, answer.values) == answer.values:
-            self.counted["answers_repeated" if key in self._seen else "answers_late"] += 1
+        elif not self._is_echoed(answer):
+            cure = "" if answer.counter is not None else ", and has no counter (receive.counter)"
+            raise DeviceError(
+                f"device {self._name}: a frame {answer.message} came after the answer to sample {index}{cure}"
+            )
+        elif key not in seen:
+            self.counted["answers_late"] += 1
+        elif seen[key] == answer.values:
+            self.counted["answers_repeated"] += 1
         else:
-            raise DeviceError(self._unexpected(answer, is_repeated=key in self._seen))
+            raise DeviceError(
+                f"device {self._name}: a frame {answer.message} answers sample {index} a second time with other values"
+            )
 
-    def _is_due(self, answer: Answer) -> bool:
-        """True unless the counter shows that the frame is late or repeated; counts it then."""
+    def _index_of(self, answer: Answer) -> int | None:
+        """Sample to which a frame belongs: the latest or, by an echo, the one before; None for any other."""
         if answer.counter is None:
-            return True
+            return self._index
         modulus = self._moduli[answer.message]
         if self._is_echo:
-            is_due = answer.counter == self._index % (self._sample_modulus or 1) % modulus
-            self.counted["answers_late"] += not is_due
-            return is_due
+            for index in (self._index, self._index - 1):
+                if answer.counter == index % (self._sample_modulus or 1) % modulus:
+                    return index
+            self.counted["answers_late"] += 1
+            return None
         before = self._counts.get(answer.message)
         self._counts[answer.message] = answer.counter
         step = 1 if before is None else (answer.counter - before) % modulus
         if step == 0:
             self.counted["answers_repeated"] += 1
-            return False
+            return None
         self.counted["answers_lacking"] += step - 1
-        return True
+        return self._index
 
     def _is_echoed(self, answer: Answer) -> bool:
         """True if a counter shows to which sample the frame belongs."""
@@ -106,13 +122,6 @@ class EcuAnswers:
         if message == ends or (not ends and len(self._values) == len(self._needed)):
             self.is_complete = True
             self.end()
-
-    def _unexpected(self, answer: Answer, *, is_repeated: bool) -> str:
-        frame = f"device {self._name}: a frame {answer.message}"
-        if is_repeated and self._is_echoed(answer):
-            return f"{frame} answers sample {self._index} a second time with other values"
-        cure = "" if answer.counter is not None else ", and has no counter (receive.counter)"
-        return f"{frame} came after the answer to sample {self._index}{cure}"
 
     def end(self) -> None:
         """Enter the latest sample as far as it is answered; does nothing if it has been entered."""
