@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from analogrig.bench import Bench
+from analogrig.config import read_toml
 from analogrig.devices.inproc import InprocDevice
 from analogrig.devices.qemu import QemuF405
+from analogrig.devices.registry import from_table
 from analogrig.rigs.description import open_rig
 from analogrig.run import CHANNELS, MEASURED, Run
 from analogrig.scenario import Scenario
@@ -20,6 +24,7 @@ from tests.harness.firmware import FOLDER, needs_firmware
 from tests.harness.processes import LONG_S
 
 ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "harness" / "examples" / "text_firmware"
 BANNER = "text firmware with est"
 N = 1300
 """Samples that the board plays: the stiffness falls at 1200."""
@@ -36,7 +41,7 @@ def played() -> Run:
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("text")
-    shutil.copytree(ROOT / "harness" / "examples" / "text_firmware", folder, dirs_exist_ok=True)
+    shutil.copytree(EXAMPLE, folder, dirs_exist_ok=True)
     subprocess.run(["make", "--silent", f"ESTIMATOR={ROOT / 'estimator_c'}"], cwd=folder, check=True)
     return folder / "text_firmware"
 
@@ -88,6 +93,28 @@ def test_emulated_board_gives_the_estimates_of_every_device(played: Run) -> None
     banner, *told = received.decode().splitlines()
     assert banner == BANNER
     check(told, played)
+
+
+@pytest.fixture
+def terminal() -> Iterator[str]:
+    """The pseudo-terminal of a running board."""
+    command = ["qemu-system-arm", "-machine", QemuF405.machine, "-kernel", str(FOLDER / "text_firmware.elf")]
+    command += ["-display", "none", "-monitor", "none", "-chardev", "pty,id=line", "-serial", "chardev:line"]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        (path,) = re.findall(r"/dev/\S+", process.stdout.readline())
+        yield path
+        process.kill()
+
+
+@needs_firmware
+def test_board_is_played_by_the_device_file_of_the_example(terminal: str, played: Run) -> None:
+    table = read_toml(EXAMPLE / "text_firmware.toml") | {"name": "bob", "url": terminal}
+    with open_rig("emulator") as rig, from_table(table, "bob").connect() as dut:
+        run = Bench(rig, dut).play(Scenario.load("thesis"), seed=7)
+    assert run.conditions.faults == ()
+    assert run.theta_hash() == played.theta_hash()
+    assert (run.alarm_index == played.alarm_index).all()
 
 
 def test_sample_without_an_index_has_the_next(program: Path, played: Run) -> None:
