@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
-from tests.wheels import environment_with, run
+from tests.wheels import environment_with, made_once, run
 
 pytestmark = pytest.mark.timeout(3600)  # environments are made from the package index, maybe on a loaded machine
 
@@ -112,21 +110,6 @@ def interpreter(version: str) -> str:
         if subprocess.run([python, "-c", "import venv"], capture_output=True, check=False).returncode == 0:
             return python
     pytest.skip(f"no Python {version} here: pyenv install {version}")
-
-
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A folder that the first test of the session makes, whichever process of pytest-xdist runs it."""
-    session = factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        session = session.parent
-    folder = session / name
-    with (session / f"{name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "complete").exists():
-            shutil.rmtree(folder, ignore_errors=True)
-            make(folder)
-            (folder / "complete").touch()
-    return folder
 
 
 @pytest.fixture(scope="session")

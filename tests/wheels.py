@@ -1,6 +1,6 @@
 """Fixtures of the built distributions: an sdist of this checkout, the wheel built from it, environments that hold it.
 
-tests/conftest.py imports the fixtures, so every test may ask for them. A session builds the wheel once, also where
+tests/conftest.py imports the fixtures, so every test may ask for them. A session makes each once, also where
 pytest-xdist spreads it over several processes.
 """
 
@@ -11,6 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,20 +50,25 @@ def build(folder: Path, *options: str) -> None:
     shutil.rmtree(sources)
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A folder that the first test of the session makes, whichever process of pytest-xdist runs it."""
+    session = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
+    folder = session / name
+    with (session / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "complete").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            make(folder)
+            (folder / "complete").touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an sdist of this checkout and the wheel built from that sdist."""
-    session = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        session = session.parent  # the folder that all workers of a session share
-    folder = session / "distributions"
-    with (session / "distributions.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not list(folder.glob("*.whl")):
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            build(folder)
-    return folder
+    return made_once(tmp_path_factory, "distributions", build)
 
 
 @pytest.fixture(scope="session")
@@ -75,10 +81,10 @@ def wheel(distributions: Path) -> Path:
 @pytest.fixture(scope="session")
 def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of programs of a new environment that holds the wheel and its dependencies alone."""
-    return environment_with(tmp_path_factory.mktemp("empty"), wheel)
+    return made_once(tmp_path_factory, "empty", lambda folder: environment_with(folder, wheel)) / "bin"
 
 
 @pytest.fixture(scope="session")
 def users_environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with the dependencies of the plugin for pytest."""
-    return environment_with(tmp_path_factory.mktemp("users"), f"{wheel}[pytest]")
+    return made_once(tmp_path_factory, "users", lambda folder: environment_with(folder, f"{wheel}[pytest]")) / "bin"
