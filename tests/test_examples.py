@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import shutil
 import socket
@@ -19,7 +18,6 @@ from tests.harness.processes import LONG_S
 
 CHECKOUT = Path(__file__).parents[1]
 EXAMPLES = CHECKOUT / "harness" / "examples"
-TUTORIAL = CHECKOUT / "harness/docs/tutorials/your-estimator.md"
 LIBRARY_PAGE = CHECKOUT / "harness/docs/howto/test-a-c-library.md"
 BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
@@ -39,9 +37,7 @@ def run(command: str, folder: Path, status: int = 0) -> str:
 @pytest.fixture
 def example(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of the example that the parameter names."""
-    ignored = shutil.ignore_patterns(
-        "my_device*", "text_firmware", "text_firmware.elf", "est.h", "build", "__pycache__"
-    )
+    ignored = shutil.ignore_patterns("*.so", "text_firmware", "text_firmware.elf", "build", "__pycache__")
     copy = tmp_path / str(request.param)
     shutil.copytree(EXAMPLES / request.param, copy, ignore=ignored)
     return copy
@@ -52,8 +48,7 @@ def test_first_test_passes_with_the_projects_estimator(example: Path) -> None:
     assert "3 passed" in run("pytest -q --hil-dut inproc", example)
 
 
-@pytest.mark.tools("sed")
-@pytest.mark.parametrize("example", ["estimator"], indirect=True)
+@pytest.mark.parametrize("example", ["own_estimator"], indirect=True)
 def test_estimator_compiles_and_its_tests_run(example: Path) -> None:
     assert "1 passed, 1 xfailed" in run("make && pytest -q", example)
     for line in scripts():
@@ -61,16 +56,6 @@ def test_estimator_compiles_and_its_tests_run(example: Path) -> None:
             assert "1 passed" in run(line, example)
         elif line.startswith("analogrig"):
             assert "PASSED" in run(line, example)
-
-
-def test_estimator_is_that_of_the_tutorial() -> None:
-    pasted: dict[str, str] = {}
-    pattern = r"^cat (>>?) (\S+) <<'EOF'\n(.*?)^EOF$"
-    for redirection, path, text in re.findall(pattern, TUTORIAL.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE):
-        pasted[path] = (pasted[path] if redirection == ">>" else "") + text
-    assert set(pasted) == {"src/my_state.h", "src/my_estimator.c", "Makefile"}
-    for path, text in pasted.items():
-        assert (EXAMPLES / "estimator" / path).read_text(encoding="utf-8") == text, path
 
 
 @pytest.mark.parametrize("example", ["text_firmware"], indirect=True)

@@ -12,6 +12,7 @@ FOLDERS = (
     "emulator/analogrig_emulator/engine",
     "harness/analogrig/devices",
     "harness/analogrig/include",
+    "harness/analogrig/templates",
     "estimator_c",
 )
 

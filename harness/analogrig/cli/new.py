@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ def write_repository(folder: Path, kind: str) -> list[str]:
             raise ConfigurationError(f"{folder}: holds {found[0]}: name a folder that is absent or empty")
         for name, path in files.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, folder / name)
+            (folder / name).write_bytes(path.read_bytes())
     except OSError as error:
         raise ConfigurationError(f"{folder}: cannot be written to: {error.strerror or error}") from error
     return sorted(files)

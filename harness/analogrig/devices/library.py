@@ -37,10 +37,10 @@ class IdentityStruct(ctypes.Structure):
     )
 
 
-_TUTORIAL = "sources to compile: harness/docs/tutorials/your-estimator.md"
+_HOW_TO = "sources to compile: harness/docs/howto/replace-the-core.md"
 
 
-def load_library(library: Path, functions: Iterable[str], cure: str = _TUTORIAL) -> ctypes.CDLL:
+def load_library(library: Path, functions: Iterable[str], cure: str = _HOW_TO) -> ctypes.CDLL:
     """The library of the project's device or of a user's own, with all of ``functions``.
 
     :param cure: advice if a function is lacking.
