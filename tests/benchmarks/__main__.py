@@ -21,6 +21,7 @@ from . import (
     bench_adapters,
     bench_calibration,
     bench_detection,
+    bench_detectors,
     bench_engine,
     bench_isolation,
     bench_link,
@@ -47,6 +48,7 @@ BENCHES: Mapping[str, Callable[[], Iterator[Figure]]] = {
     "self-test": bench_self_test.figures,
     "onset": bench_onset.figures,
     "properties": bench_properties.figures,
+    "detectors": bench_detectors.figures,
 }
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from . import bench_detectors
 
 FOLDER = Path("harness/docs/evidence")
 
@@ -20,8 +22,15 @@ TITLES: Mapping[str, str] = {
     "self-test": "Self-test of drawn rigs",
     "onset": "Dating of changes",
     "properties": "False failures of the shipped properties",
+    "detectors": "Detectors at the same measured ARL0",
 }
 """Page titles by the name of the benchmark."""
+
+CROSSED = {"detectors"}
+"""Benchmarks whose figures are named ROW: COLUMN, and whose page is a table of these."""
+
+NOTES: Mapping[str, str] = {"detectors": bench_detectors.NOTE}
+"""Paragraphs below the tables."""
 
 
 def write(theme: str, entries: Iterable[Mapping[str, Any]], folder: Path = FOLDER) -> Path:
@@ -30,28 +39,52 @@ def write(theme: str, entries: Iterable[Mapping[str, Any]], folder: Path = FOLDE
     entries: figures of the theme as in build/bench.json, with ``measured`` (date, commit).
     """
     path = folder / f"{theme}.md"
-    rows = [_row(entry) for entry in entries]
-    lines = [
-        f"# {TITLES[theme]}",
-        "",
-        f"Written by `make bench ARGS={theme}`. Two shared x86-64 cores.",
-        "",
-        "| figure | value | compared with | ratio | bounds | measured |",
-        "|---|---|---|---|---|---|",
-        *rows,
-    ]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    title = f"# {TITLES[theme]}"
+    origin = f"Written by `make bench ARGS={theme}`. Two shared x86-64 cores."
+    table = _crossed(entries) if theme in CROSSED else _listed(entries)
+    note = ["", NOTES[theme]] if theme in NOTES else []
+    path.write_text("\n".join([title, "", origin, "", *table, *note]) + "\n", encoding="utf-8")
     return path
 
 
-def _row(entry: Mapping[str, Any]) -> str:
-    compared, ratio, bounds = entry.get("compared_with"), entry.get("ratio"), entry.get("bounds")
-    cells = (
-        entry["name"],
-        f"{entry['value']:.4g} {entry['unit']}",
-        compared or "",
-        "" if ratio is None else f"{ratio:.4g}",
-        "" if not bounds else " to ".join(f"{each:.4g}" for each in bounds),
-        entry.get("measured", ""),
-    )
-    return f"| {' | '.join(str(cell).replace('|', '/') for cell in cells)} |"
+def _listed(entries: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Table with a row for each figure."""
+    yield "| figure | value | compared with | ratio | bounds | measured |"
+    yield "|---|---|---|---|---|---|"
+    for entry in entries:
+        ratio = entry.get("ratio")
+        yield _row(
+            entry["name"],
+            _value(entry),
+            entry.get("compared_with") or "",
+            "" if ratio is None else f"{ratio:.4g}",
+            _bounds(entry),
+            entry.get("measured", ""),
+        )
+
+
+def _crossed(entries: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Table of the figures named ROW: COLUMN."""
+    rows: dict[str, dict[str, str]] = {}
+    for entry in entries:
+        row, _, column = entry["name"].partition(": ")
+        details = ", ".join(each for each in (_bounds(entry), entry.get("compared_with")) if each)
+        rows.setdefault(row, {})[column] = f"{_value(entry)} ({details})" if details else _value(entry)
+        rows[row]["measured"] = entry.get("measured", "")
+    columns = dict.fromkeys(column for cells in rows.values() for column in cells if column != "measured")
+    yield _row("", *columns, "measured")
+    yield "|---" * (len(columns) + 2) + "|"
+    for name, cells in rows.items():
+        yield _row(name, *(cells.get(column, "") for column in (*columns, "measured")))
+
+
+def _value(entry: Mapping[str, Any]) -> str:
+    return f"{entry['value']:.4g} {entry['unit']}"
+
+
+def _bounds(entry: Mapping[str, Any]) -> str:
+    return " to ".join(f"{each:.4g}" for each in entry.get("bounds") or ())
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
