@@ -145,9 +145,9 @@ CANDIDATES: Mapping[str, Candidate] = {
         "rls_page_hinkley", (1.0, 1000.0), _as_it_is("threshold"), "padasip", "river", "narwhals"
     ),
     "RLS, ADWIN": _packaged("rls_adwin", (1.0, 100.0), _as_probability("delta"), "padasip", "river", "narwhals"),
-    "RLS, KSWIN": _packaged("rls_kswin", (1.0, 100.0), _as_probability("alpha"), "padasip", "river", "narwhals"),
     "Kalman filter, Mahalanobis limit": _packaged(
         "kalman_gate", (0.1, 1000.0), _as_it_is("standard deviations"), "filterpy"
     ),
+    "RLS, KSWIN": _packaged("rls_kswin", (1.0, 100.0), _as_probability("alpha"), "padasip", "river", "narwhals"),
 }
 """Detectors in the order of the table."""
