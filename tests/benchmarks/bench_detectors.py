@@ -48,19 +48,22 @@ LEVEL_RATIO = 1.005
 JOBS = 2
 
 NOTE = f"""\
-Each detector meets the same samples: the shipped emulator, and changes of 20 % upwards and downwards
-(B, K: in opposite directions) at {INSTANTS_N} instants of the excitation's period. Its level is calibrated by the
-first alarms of fresh devices; the ARL0 in the table is that of other seeds, with its {CONFIDENCE:.0%}
-confidence interval. Warm-up {WARM_UP_N} samples, hold-off {HOLD_OFF_N}.
+All detectors meet the same samples, from the shipped emulator. The changes are 20 % upwards or
+downwards; those of B and K at once have opposite directions. They spread over a period of the
+excitation.
 
-Delays are means over the detected changes, divided by the mean information bound at the ARL0 asked,
-with two standard errors either side. A change is missed without an alarm within {AFTER_N} samples. No
-delay is given for fewer than two detections. Alarms after a detection are repeated ones.
+A level is calibrated by the first alarms of fresh devices. The ARL0 of the table is measured with
+other seeds, and has its {CONFIDENCE:.0%} confidence interval. Warm-up: {WARM_UP_N} samples. Hold-off, but for
+ours: {HOLD_OFF_N} samples.
 
-The GLR test knows the discretised equations of the plant and of all plants that it changes to, and
-considers changes after each of the last 100 samples. The packages' detectors take the size of the
-prediction error. The mean between faults alarms mostly in the first samples after it is armed, so
-its ARL0 holds for runs of this length alone.
+A delay is the mean over the detected changes, divided by the mean information bound. In brackets:
+two standard errors either side. A change without an alarm within {AFTER_N} samples is missed. Alarms
+after the detection are repeated ones.
+
+The GLR test knows the equations of the plant before and after every change. It does not know the
+amplifiers of the computer. The detectors of packages take the size of the prediction error. The
+mean between faults alarms mostly just after it is armed: its ARL0 holds for this length of runs
+alone.
 """
 """Paragraphs below the table."""
 
