@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +65,7 @@ def rates(device: Device, block_n: int) -> list[float]:
     return sorted(found)
 
 
-def libraries() -> Iterator[Row]:
+def libraries() -> Generator[Row]:
     """Plain C libraries, in a child process and in this one."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "trivial.c"
@@ -80,7 +80,7 @@ def libraries() -> Iterator[Row]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Iterator[Row]], ...] = (libraries,)
+ROWS: tuple[Callable[[], Generator[Row]], ...] = (libraries,)
 
 
 def figures() -> Iterator[Figure]:
