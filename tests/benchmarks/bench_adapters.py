@@ -8,7 +8,6 @@ a trivial estimator, unless its name says otherwise: the rate is that of the ada
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -86,8 +85,6 @@ ROWS: tuple[Callable[[], Generator[Row]], ...] = (libraries,)
 def figures() -> Iterator[Figure]:
     """One figure for each adapter and length of blocks."""
     for rows in ROWS:
-        with contextlib.closing(rows()) as each:
-            for name, device, block_n in each:
-                found = rates(device, block_n)
-                bounds = (found[0], found[-1])
-                yield Figure(f"adapters, {name}", found[len(found) // 2], "samples/s", bounds=bounds)
+        for name, device, block_n in rows():
+            found = rates(device, block_n)
+            yield Figure(f"adapters, {name}", found[len(found) // 2], "samples/s", bounds=(found[0], found[-1]))

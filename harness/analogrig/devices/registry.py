@@ -95,8 +95,8 @@ def _check_not_compiled(name: str) -> None:
                 is_compiled = is_compiled or file.read(len(_ELF)) == _ELF
     if is_compiled:
         raise ConfigurationError(
-            f"{name}: is a compiled file, not a description of a device: use inproc:{name} for a library,"
-            f" qemu-m4:{name} for firmware"
+            f"{name}: is a compiled file, not a description of a device: use library:{name} for an estimator,"
+            f" inproc:{name} for a device of our catalogue, qemu-m4:{name} for firmware"
         )
 
 
