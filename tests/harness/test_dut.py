@@ -800,7 +800,8 @@ def test_library_is_not_read_as_a_description(stranger: Path) -> None:
     unnamed = stranger.rename(stranger.with_suffix(""))
     for name in (str(unnamed), "absent.so"):
         with pytest.raises(
-            ConfigurationError, match=f"^{name}: is a compiled file, .* use library:{name} for an estimator, inproc:{name}"
+            ConfigurationError,
+            match=f"^{name}: is a compiled file, .* use library:{name} for an estimator, inproc:{name}",
         ):
             describe(name)
     unnamed.rename(stranger)

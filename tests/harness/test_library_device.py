@@ -396,9 +396,14 @@ def test_crash_makes_the_run_inconclusive_and_the_next_one_is_whole(faulty: Path
         assert run_of(device).samples == 1800
 
 
-def test_non_finite_answers_are_no_pass(faulty: Path) -> None:
-    with EstimatorLibrary(name="bob", library=str(faulty), settings={"fault": 11, "at": 199}).connect() as device:
-        assert judge(run_of(device)).outcome != "passed"
+@WHERE
+def test_non_finite_answer_is_told_with_its_sample(
+    opened: Callable[..., EstimatorLibraryDevice], *, in_process: bool
+) -> None:
+    device = opened(Fault.NOT_A_NUMBER, 199, in_process=in_process)
+    device.start()
+    with pytest.raises(DeviceError, match=r"^device bob: sample 199: theta is non-finite: \[ +nan 1?\d+\.\]$"):
+        list(device.play(cut(samples(), 64)))
 
 
 def test_killed_child_is_told_and_recovered(opened: Callable[..., EstimatorLibraryDevice]) -> None:

@@ -300,16 +300,29 @@ class EstimatorLibraryDevice(Device):
         if sheet.armed:
             flags[records["armed"] == 0] |= UNARMED
         alarm = records["alarm"]
-        indices = np.flatnonzero(alarm).tolist() if alarm.any() else []
         return Answers(
             flags=flags,
             alarms=tuple(
-                RaisedAlarm(samples.first + index, statistic=float(records["statistic"][index])) for index in indices
-            ),
-            theta=records["theta"].copy() if sheet.theta_n else None,
-            innovation=records["innovation"].copy() if sheet.innovation else None,
-            statistic=records["statistic"].copy() if sheet.statistic else None,
+                RaisedAlarm(samples.first + k, statistic=float(records["statistic"][k]) if sheet.statistic else 0.0)
+                for k in np.flatnonzero(alarm).tolist()
+            )
+            if alarm.any()
+            else (),
+            theta=self._numbers("theta", samples.first, records) if sheet.theta_n else None,
+            innovation=self._numbers("innovation", samples.first, records) if sheet.innovation else None,
+            statistic=self._numbers("statistic", samples.first, records) if sheet.statistic else None,
         )
+
+    def _numbers(self, name: str, first: int, records: NDArray[Any]) -> NDArray[np.float32]:
+        """Copy of a field of the records, the first of which is that of the sample ``first``.
+
+        :raises DeviceError: a number is non-finite.
+        """
+        numbers: NDArray[np.float32] = records[name].copy()
+        if not (are_finite := np.isfinite(numbers)).all():
+            index = int(np.argmin(are_finite.reshape(len(records), -1).all(axis=1)))
+            raise DeviceError(f"device {self.name}: sample {first + index}: {name} is non-finite: {numbers[index]}")
+        return numbers
 
 
 def _after_missing(n: int, block: Samples) -> Samples:
