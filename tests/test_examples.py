@@ -72,12 +72,6 @@ def test_text_firmware_compiles_for_its_board(example: Path) -> None:
     assert (example / "text_firmware.elf").read_bytes().startswith(b"\x7fELF")
 
 
-@pytest.mark.parametrize("example", ["own_estimator"], indirect=True)
-def test_own_estimator_compiles_and_its_tests_run(example: Path) -> None:
-    assert "1 passed, 1 xfailed" in run("make && pytest -q", example)
-    assert "false alarms: none" in run("analogrig run --dut device.toml --allow ./my_estimator.so", example, status=1)
-
-
 def test_page_on_c_libraries_leads_to_its_verdicts(tmp_path: Path) -> None:
     (script,) = re.findall(r"^```sh\n(.*?)^```$", LIBRARY_PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     verdicts = re.findall(r"seed \d+: (\w+)$", run(f"set -e\n{script}", tmp_path), re.MULTILINE)

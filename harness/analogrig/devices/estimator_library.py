@@ -300,14 +300,13 @@ class EstimatorLibraryDevice(Device):
         if sheet.armed:
             flags[records["armed"] == 0] |= UNARMED
         alarm = records["alarm"]
+        indices = np.flatnonzero(alarm).tolist() if alarm.any() else []
         return Answers(
             flags=flags,
             alarms=tuple(
                 RaisedAlarm(samples.first + k, statistic=float(records["statistic"][k]) if sheet.statistic else 0.0)
-                for k in np.flatnonzero(alarm).tolist()
-            )
-            if alarm.any()
-            else (),
+                for k in indices
+            ),
             theta=self._numbers("theta", samples.first, records) if sheet.theta_n else None,
             innovation=self._numbers("innovation", samples.first, records) if sheet.innovation else None,
             statistic=self._numbers("statistic", samples.first, records) if sheet.statistic else None,
