@@ -22,6 +22,8 @@ EXAMPLES = CHECKOUT / "harness" / "examples"
 LIBRARY_PAGE = CHECKOUT / "harness/docs/howto/test-a-c-library.md"
 BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
+THESIS_7 = "2ba8713bf6ac34db"
+"""First digits of the hash of every device of ours."""
 
 
 def run(command: str, folder: Path, status: int = 0) -> str:
@@ -38,7 +40,7 @@ def run(command: str, folder: Path, status: int = 0) -> str:
 @pytest.fixture
 def example(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of the example that the parameter names."""
-    ignored = shutil.ignore_patterns("*.so", "text_firmware", "text_firmware.elf", "build", "__pycache__")
+    ignored = shutil.ignore_patterns("*.so", "my_program", "text_firmware", "text_firmware.elf", "build", "__pycache__")
     copy = tmp_path / str(request.param)
     shutil.copytree(EXAMPLES / request.param, copy, ignore=ignored)
     return copy
@@ -63,6 +65,18 @@ def test_estimator_compiles_and_its_tests_run(example: Path) -> None:
 def test_text_firmware_answers_as_a_program(example: Path) -> None:
     told = run("make --silent && printf 'R\\n7,1000,2000\\n' | ./text_firmware", example)
     assert told.splitlines() == ["text firmware with est", "OK", f"7,{6 * '00000000,'}0"]
+
+
+@pytest.mark.parametrize(
+    ("example", "program"), [("program", "my_program"), ("text_firmware", "text_firmware")], indirect=["example"]
+)
+def test_program_is_judged(example: Path, program: str) -> None:
+    file = {"my_program": "my_program.toml", "text_firmware": "program.toml"}[program]
+    played = f"analogrig run --scenario thesis --seed 7 --dut {file}"
+    shown = run(f"make --silent && {played} --allow ./{program}", example)
+    assert "PASSED" in shown
+    assert f"theta hash {THESIS_7}" in shown
+    assert "--allow" in run(played, example, status=2)
 
 
 @pytest.mark.tools("arm-none-eabi-gcc")

@@ -20,6 +20,7 @@ from analogrig.devices.device import Device
 from analogrig.devices.estimator_library import EstimatorLibrary
 from tests.harness.library_builds import OWN, build
 
+from . import text_programs
 from .figure import Figure
 
 PLAY_S = 0.5
@@ -79,7 +80,7 @@ def libraries() -> Generator[Row]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Generator[Row]], ...] = (libraries,)
+ROWS: tuple[Callable[[], Iterator[Row]], ...] = (libraries, text_programs.rows)
 
 
 def figures() -> Iterator[Figure]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from analogrig.answers import Answers, RaisedAlarm
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import MOST_THETA, Datasheet
-from analogrig.devices.templates import CHECKSUM, MOST_FLOAT32, Field
+from analogrig.devices.templates import CHECKSUM, MOST_FLOAT32, TemplateField
 from analogrig.errors import DeviceError
 from analogrig.run import LOST, UNARMED, Channel
 
@@ -60,7 +60,7 @@ class AnswerForm:
     def has(self, name: str) -> bool:
         return name in self._known
 
-    def check_types(self, fields: Sequence[Field]) -> None:
+    def check_types(self, fields: Sequence[TemplateField]) -> None:
         """:raises ValueError: an index, or a field that is 0 or not 0, is no whole number."""
         for field in fields:
             if field.name in (INDEX, *_SWITCHES) and field.type in _NOT_WHOLE:

@@ -10,7 +10,7 @@ from analogrig.datasheet import Datasheet
 from analogrig.devices.adapted import AdaptedDescription
 from analogrig.devices.answer_form import INDEX, AnswerForm
 from analogrig.devices.device import Device
-from analogrig.devices.templates import CHECKSUM, CHECKSUMS, Checksum, Field, Reader, Writer, parse
+from analogrig.devices.templates import CHECKSUM, CHECKSUMS, Checksum, Reader, TemplateField, Writer, parse
 from analogrig.links.wire import Wire
 
 MOST_WINDOW = 4096
@@ -103,7 +103,7 @@ class TemplateDescription(AdaptedDescription):
     def form(self) -> AnswerForm:
         """Meaning of the fields of an answer."""
         parts = parse("receive", self.receive, TYPES_READ)
-        names = [part.name for part in parts if isinstance(part, Field) and part.type != "s"]
+        names = [part.name for part in parts if isinstance(part, TemplateField) and part.type != "s"]
         return AnswerForm(names, self.theta)
 
     def reader(self) -> Reader:

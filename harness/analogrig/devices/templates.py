@@ -30,7 +30,7 @@ _FIXED = frozenset({"f32"})
 """Types whose values need no separator."""
 
 
-class Field(NamedTuple):
+class TemplateField(NamedTuple):
     """A field of a template."""
 
     name: str
@@ -123,7 +123,7 @@ CHECKSUM = "checksum"
 """Name of its field, which has the type x."""
 
 
-def parse(key: str, text: str, types: Sequence[str]) -> tuple[str | Field, ...]:
+def parse(key: str, text: str, types: Sequence[str]) -> tuple[str | TemplateField, ...]:
     """Literal texts and fields of a template.
 
     :param key: name of the template in its file; it begins every error message.
@@ -131,20 +131,20 @@ def parse(key: str, text: str, types: Sequence[str]) -> tuple[str | Field, ...]:
     """
     if len(text) > MOST_TEMPLATE:
         raise ValueError(f"{key}: longer than {MOST_TEMPLATE} characters")
-    parts: list[str | Field] = []
+    parts: list[str | TemplateField] = []
     for token in _TOKENS.finditer(text):
         brace, name, kind, literal = token.groups()
         if name:
             if kind not in types:
                 raise ValueError(f"{key}: the type of {token[0]} must be one of {', '.join(types)}")
-            parts.append(Field(name, kind))
+            parts.append(TemplateField(name, kind))
         elif not (brace or literal):
             raise ValueError(f"{key}: {token[0]!r} is neither {{NAME:TYPE}} nor two braces, which stand for one")
         elif parts and isinstance(parts[-1], str):
             parts[-1] += literal or brace[0]
         else:
             parts.append(literal or brace[0])
-    names = [part.name for part in parts if isinstance(part, Field)]
+    names = [part.name for part in parts if isinstance(part, TemplateField)]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"{key}: the field {twice[0]} is there twice")
     return tuple(parts)
@@ -156,7 +156,7 @@ class Writer:
     def __init__(self, key: str, text: str, names: Sequence[str], checksum: Checksum | None = None) -> None:
         """:raises ValueError: the template is wrong, or has other fields than ``names``."""
         parts = parse(key, text, (*_TYPES,))
-        self.fields = tuple(part for part in parts if isinstance(part, Field) and part.name != CHECKSUM)
+        self.fields = tuple(part for part in parts if isinstance(part, TemplateField) and part.name != CHECKSUM)
         for field in self.fields:
             if field.name not in names:
                 raise ValueError(f"{key}: has no field {field.name} (known: {', '.join((*names, CHECKSUM))})")
@@ -185,24 +185,26 @@ class Writer:
         return b"%s%0*x%s" % (head, self._checksum.digits, self._checksum.compute(head), self._tail)
 
 
-def _format(part: str | Field) -> bytes:
+def _format(part: str | TemplateField) -> bytes:
     """Part of a template for Python's bytes formatting."""
-    return _TYPES[part.type].write.encode() if isinstance(part, Field) else part.replace("%", "%%").encode()
+    return _TYPES[part.type].write.encode() if isinstance(part, TemplateField) else part.replace("%", "%%").encode()
 
 
-def _split_at_checksum(key: str, parts: Sequence[str | Field], checksum: Checksum | None) -> int | None:
+def _split_at_checksum(key: str, parts: Sequence[str | TemplateField], checksum: Checksum | None) -> int | None:
     """Position of the checksum; None if there is none.
 
     :raises ValueError: a field follows it, or its kind or type is wrong.
     """
-    position = next((i for i, part in enumerate(parts) if isinstance(part, Field) and part.name == CHECKSUM), None)
+    position = next(
+        (i for i, part in enumerate(parts) if isinstance(part, TemplateField) and part.name == CHECKSUM), None
+    )
     if position is None:
         return None
     if checksum is None:
         raise ValueError(f"{key}: has a field {CHECKSUM}: set checksum to one of {', '.join(CHECKSUMS)}")
-    if parts[position] != Field(CHECKSUM, "x"):
+    if parts[position] != TemplateField(CHECKSUM, "x"):
         raise ValueError(f"{key}: the field {CHECKSUM} must have the type x")
-    if any(isinstance(part, Field) for part in parts[position + 1 :]):
+    if any(isinstance(part, TemplateField) for part in parts[position + 1 :]):
         raise ValueError(f"{key}: no field may follow {CHECKSUM}")
     return position
 
@@ -218,21 +220,21 @@ class Reader:
         parts = parse(key, text, (*_TYPES, _WORD))
         if not text.endswith("\n") or "\n" in text[:-1] or "\r" in text:
             raise ValueError(f"{key}: must be one line that ends with \\n; \\r before it is ignored")
-        if any(isinstance(part, Field) and part.name == CHECKSUM for part in parts):
+        if any(isinstance(part, TemplateField) and part.name == CHECKSUM for part in parts):
             _split_at_checksum(key, parts, checksum)
-        self.fields: list[Field] = []
+        self.fields: list[TemplateField] = []
         pattern = ""
         for part, after in zip(parts, (*parts[1:], ""), strict=True):
             if isinstance(part, str):
                 pattern += re.escape(part.removesuffix("\n"))
                 continue
-            if isinstance(after, Field) and part.type not in _FIXED:
+            if isinstance(after, TemplateField) and part.type not in _FIXED:
                 raise ValueError(f"{key}: nothing separates {part.name} from {after.name}")
             pattern += self._add(part, after, checksum, ignored=ignored(part.name))
         self._match = re.compile(f"{pattern} *+".encode()).fullmatch
         self._checksum = checksum if CHECKSUM in [each.name for each in self.fields] else None
 
-    def _add(self, part: Field, after: str | Field, checksum: Checksum | None, *, ignored: bool) -> str:
+    def _add(self, part: TemplateField, after: str | TemplateField, checksum: Checksum | None, *, ignored: bool) -> str:
         """Pattern of a field, which is added to ``fields`` if it is read."""
         if part.type == _WORD:
             end = after[0] if isinstance(after, str) and after else "\n"
@@ -281,7 +283,7 @@ def record(key: str, text: str) -> np.dtype[np.void]:
     :raises ValueError: the template is wrong, or has text beside its fields.
     """
     parts = parse(key, text, (*BINARY,))
-    fields = [part for part in parts if isinstance(part, Field)]
+    fields = [part for part in parts if isinstance(part, TemplateField)]
     if len(fields) < len(parts) or not fields:
         raise ValueError(f"{key}: a binary record has fields only, such as {{alarm:u8}}{{a1:f32}}")
     return np.dtype([(field.name, BINARY[field.type]) for field in fields])
