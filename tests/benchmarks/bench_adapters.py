@@ -80,7 +80,7 @@ def libraries() -> Generator[Row]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Iterator[Row]], ...] = (libraries, text_programs.rows)
+ROWS: tuple[Callable[[], Generator[Row]], ...] = (libraries, text_programs.rows)
 
 
 def figures() -> Iterator[Figure]:

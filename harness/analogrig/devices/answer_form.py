@@ -87,7 +87,7 @@ class AnswerForm:
         return (*self.theta, *(name for name in (*_VALUES, *_SWITCHES) if name in self._known))
 
 
-class AnswerRows:
+class AnswerAssembler:
     """Answers of one record in the order of its samples."""
 
     def __init__(self, form: AnswerForm, name: str, to_codes: ToCodes | None) -> None:

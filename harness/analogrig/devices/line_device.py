@@ -17,7 +17,7 @@ import numpy as np
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import SteppedFlag
 from analogrig.datasheet import Datasheet
-from analogrig.devices.answer_form import INDEX, LOST_ON_THE_WAY, NO_ANSWER, AnswerRows, ToCodes
+from analogrig.devices.answer_form import INDEX, LOST_ON_THE_WAY, NO_ANSWER, AnswerAssembler, ToCodes
 from analogrig.devices.device import Device
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import ChecksumError
@@ -170,7 +170,7 @@ class LineDevice(TemplateDevice):
         self._unanswered_bytes = 0
 
     def _begin_record(self) -> None:
-        self._rows = AnswerRows(self._form, self.name, self._to_codes)
+        self._rows = AnswerAssembler(self._form, self.name, self._to_codes)
         self._flags: list[int] = []
         """Flags of the samples whose rows are complete, with NO_ANSWER for one without an answer."""
         self._words: list[tuple[bytes, ...]] = []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import SteppedFlag
-from analogrig.devices.answer_form import NO_ANSWER, AnswerRows
+from analogrig.devices.answer_form import NO_ANSWER, AnswerAssembler
 from analogrig.devices.line_device import TemplateDevice
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import record
@@ -31,7 +31,7 @@ class RecordDevice(TemplateDevice):
             1, min(description.window, _BUFFER_BYTES // max(self._sent.itemsize, self._received.itemsize))
         )
         self._answered = 0
-        self._rows = AnswerRows(self._form, self.name, self._to_codes)
+        self._rows = AnswerAssembler(self._form, self.name, self._to_codes)
 
     def recover(self) -> None:
         if self._has_failed or not self._is_fresh:
@@ -41,7 +41,7 @@ class RecordDevice(TemplateDevice):
         self.recover()
         self._is_fresh = False
         self._next_index = self._answered = 0
-        self._rows = AnswerRows(self._form, self.name, self._to_codes)
+        self._rows = AnswerAssembler(self._form, self.name, self._to_codes)
 
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         try:
