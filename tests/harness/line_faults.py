@@ -117,6 +117,10 @@ class Firmware:
             return
         if line == b"R":
             self._count = self._received = 0
+            if self.fault == "late start":
+                self.fault = ""
+                self._late.append(b"OK\n")
+                return
             self._write(b"OK\n")
             return
         k, self._received = self._received, self._received + 1

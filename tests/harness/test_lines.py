@@ -46,6 +46,13 @@ def test_answers_of_a_firmware_belong_to_their_samples(protocol: str) -> None:
     check_clean(Scripted.with_fault(protocol))
 
 
+def test_reset_line_is_repeated_while_a_board_starts_and_may_be_answered_twice() -> None:
+    device = Scripted.with_fault("plain", "late start")
+    for _ in range(3):
+        check_clean(device)
+    device.close()
+
+
 def test_counters_of_the_line_name_the_faults() -> None:
     found = {}
     for fault in ("debug line", "twice back", "late back", "garbled back", "wrong digit"):

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analogrig.answers import Answers, Samples
 from analogrig.catalogue import SteppedFlag
@@ -89,19 +90,18 @@ class TemplateDevice(Device):
         self._wire = self._description.wire()
         self._is_fresh, self._has_failed = True, False
 
-    def _columns(self, block: Samples) -> dict[str, Sequence[Any]]:
+    def _columns(self, block: Samples) -> dict[str, NDArray[Any]]:
         """Values of the fields that are sent."""
-        u: Sequence[Any] = block.u.tolist()
-        y: Sequence[Any] = block.y.tolist()
+        u: NDArray[Any] = block.u
+        y: NDArray[Any] = block.y
         if self._description.units == "volts":
             if self._to_codes is None:
                 raise ValueError("volts need the scales of the channels: call prepare()")
-            u, y = self._to_codes.u.volts(block.u).tolist(), self._to_codes.y.volts(block.y).tolist()
-        first, modulus = block.first, self._description.indices
-        indices: Sequence[int] = range(first, first + len(block))
-        if modulus:
-            indices = [index % modulus for index in indices]
-        return {INDEX: indices, "u": u, "y": y, "valid": block.valid.astype(np.uint8).tolist()}
+            u, y = self._to_codes.u.volts(block.u), self._to_codes.y.volts(block.y)
+        indices = np.arange(block.first, block.first + len(block))
+        if self._description.indices:
+            indices %= self._description.indices
+        return {INDEX: indices, "u": u, "y": y, "valid": block.valid.astype(np.uint8)}
 
     def _with_gaps(self, blocks: Iterable[Samples]) -> Iterator[tuple[Samples, bool]]:
         """Blocks, with True for one that stands for skipped indices, which are missing samples."""
@@ -159,8 +159,8 @@ class LineDevice(TemplateDevice):
         self._other = b""
         """Last line that was no answer."""
         self._forget_input()
-        self._excess_resets = 0
-        """Reset lines that may still be answered."""
+        self._unanswered_resets = 0
+        """Reset lines whose answer may still come."""
         self._begin_record()
 
     def _forget_input(self) -> None:
@@ -239,17 +239,17 @@ class LineDevice(TemplateDevice):
                 self._discard()
             return
         deadline_s = self._wire.clock() + self._description.timeout_s + starting_s
-        self._excess_resets = -1
         self._unanswered_bytes = 0
         while True:
             self._wire.write(self._description.reset.encode())
             if not self._reset_answer:
                 self._discard()
                 return
-            self._excess_resets += 1
+            self._unanswered_resets += 1
             again_s = min(deadline_s, self._wire.clock() + repeat_s)
             while (line := self._next_line(again_s)) is not None:
                 if line == self._reset_answer:
+                    self._unanswered_resets -= 1
                     return
                 if is_record:
                     self._accept(line)
@@ -339,12 +339,14 @@ class LineDevice(TemplateDevice):
         """Line of each sample; None for a missing one that is left out."""
         columns = self._columns(block)
         n = len(block)
-        lines: list[bytes | None] = list(self._send.lines([columns[each.name] for each in self._send.fields], n))
+        lines: list[bytes | None] = list(
+            self._send.lines([columns[each.name].tolist() for each in self._send.fields], n)
+        )
         if self._tells_missing or bool(block.valid.all()):
             return lines
         missing: Sequence[bytes | None] = [None] * n
         if self._missing is not None:
-            missing = self._missing.lines([columns[each.name] for each in self._missing.fields], n)
+            missing = self._missing.lines([columns[each.name].tolist() for each in self._missing.fields], n)
         return [line if valid else other for line, other, valid in zip(lines, missing, block.valid, strict=True)]
 
     def _collect(self, most: int) -> None:
@@ -412,8 +414,8 @@ class LineDevice(TemplateDevice):
 
         :raises DeviceError: it shows that the device was reset.
         """
-        if line == self._reset_answer and self._excess_resets > 0:
-            self._excess_resets -= 1
+        if line == self._reset_answer and self._unanswered_resets > 0:
+            self._unanswered_resets -= 1
         elif line and line in (self._reset_answer, self._banner):
             raise self._error(f"was reset before the answer to sample {self._answered}: it sent {_brief(line)}")
         elif not line.startswith(self._ignored):
