@@ -22,8 +22,7 @@ EXAMPLES = CHECKOUT / "harness" / "examples"
 LIBRARY_PAGE = CHECKOUT / "harness/docs/howto/test-a-c-library.md"
 BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
-THESIS_7 = "2ba8713bf6ac34db"
-"""First digits of the hash of every device of ours."""
+GROUP_OF_THE_EXAMPLES = "239.74.163.2"
 
 
 def run(command: str, folder: Path, status: int = 0) -> str:
@@ -90,6 +89,24 @@ def test_page_on_c_libraries_leads_to_its_verdicts(tmp_path: Path) -> None:
     (script,) = re.findall(r"^```sh\n(.*?)^```$", LIBRARY_PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     verdicts = re.findall(r"seed \d+: (\w+)$", run(f"set -e\n{script}", tmp_path), re.MULTILINE)
     assert verdicts == ["PASSED", "FAILED"]
+
+
+@pytest.mark.parametrize("example", ["own_dbc"], indirect=True)
+def test_ecu_is_judged_on_its_bus_and_by_its_log(example: Path) -> None:
+    group = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255}"  # of this process alone on this machine
+    file = example / "ecu.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace(GROUP_OF_THE_EXAMPLES, group), encoding="utf-8")
+    command = [sys.executable, "ecu.py", "udp_multicast", group]
+    with subprocess.Popen(command, cwd=example, stdout=subprocess.PIPE, text=True) as ecu:
+        try:
+            assert ecu.stdout is not None and "listening" in ecu.stdout.readline()
+            played = f"analogrig run --dut ecu.toml --scenario ./mass.toml --allow can:udp_multicast/{group}"
+            live = run(played, example)
+        finally:
+            ecu.terminate()
+    logged = run("analogrig judge build/run/can.log --dut ecu.toml --scenario ./mass.toml", example)
+    assert "PASSED" in live and "PASSED" in logged
+    assert re.findall("theta hash .*", live) == re.findall("theta hash .*", logged) != []
 
 
 @pytest.mark.parametrize("example", ["rig"], indirect=True)

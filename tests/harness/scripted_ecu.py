@@ -113,7 +113,7 @@ class ScriptedEcu:
         hearing: Callable[[int, can.Message], Iterable[can.Message]] = lambda _, frame: (frame,),
     ) -> None:
         self._database: Any = cantools.database.load_string(DBC, "dbc")
-        self._bus = can.Bus(interface=interface, channel=channel)
+        self.bus = can.Bus(interface=interface, channel=channel)
         self._estimator = Estimator(config)
         self._answering, self._hearing = answering, hearing
         self._index, self._received = 0, 0
@@ -129,11 +129,11 @@ class ScriptedEcu:
     def __exit__(self, *_: object) -> None:
         self._ends.set()
         self._thread.join()
-        self._bus.shutdown()
+        self.bus.shutdown()
 
     def _serve(self) -> None:
         while not self._ends.is_set():
-            frame = self._bus.recv(0.05)
+            frame = self.bus.recv(0.05)
             if frame is not None:
                 self._received += 1
                 for heard in self._hearing(self._received - 1, frame):
@@ -172,4 +172,4 @@ class ScriptedEcu:
 
     def _send(self, frames: Iterable[can.Message]) -> None:
         for frame in frames:
-            self._bus.send(frame)
+            self.bus.send(frame)

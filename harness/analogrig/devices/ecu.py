@@ -11,7 +11,7 @@ from analogrig.answers import Answers, Samples
 from analogrig.devices.can_dbc import CanDbcDevice, Request
 from analogrig.devices.device import Device
 from analogrig.devices.ecu_answers import MISSING, EcuAnswers
-from analogrig.errors import LinkError, LinkTimeout, TimeLimitReached
+from analogrig.errors import ConfigurationError, LinkError, LinkTimeout, TimeLimitReached
 from analogrig.links.can_bus import CanBus
 from analogrig.links.can_station import CanStation
 from analogrig.links.link import CanListener
@@ -57,7 +57,10 @@ class EcuDevice(Device):
 
         :raises ConfigurationError: a code does not fit its signal.
         """
-        self._encode = self._messages.encoder(channels)
+        try:
+            self._encode = self._messages.encoder(channels)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"device {self.name}: {error}") from error
 
     def pace(self, period_s: float) -> Pace:
         return Pace(self._clock, period_s)
@@ -216,7 +219,7 @@ class EcuDevice(Device):
 
     @property
     def link_name(self) -> str:
-        return f"can:{self._station.name}"
+        return self._station.name
 
     @property
     def link_counters(self) -> Mapping[str, int]:
