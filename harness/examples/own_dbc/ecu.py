@@ -15,7 +15,7 @@ import numpy as np
 WARM_UP_N, HOLD_OFF_N, LIMIT = 150, 60, 10.0
 
 
-class Estimator:
+class LeastSquares:
     """Least squares of y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k) + b1 u(k-1) + b2 u(k-2) + d, in N and m."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Estimator:
         return True
 
 
-def answers(database: Any, counter: int, estimator: Estimator, *, alarm: bool) -> list[can.Message]:
+def answers(database: Any, counter: int, estimator: LeastSquares, *, alarm: bool) -> list[can.Message]:
     """Frames of the answer to the sample with this counter."""
     a1, a2, b0, b1 = estimator.theta[:4] * (1.0, 1.0, 1e-3, 1e-3)
     limits = np.clip((a1, a2, 1e4 * b0, 1e4 * b1), -8.0, 8.0) * (1.0, 1.0, 1e-4, 1e-4)
@@ -69,14 +69,14 @@ def serve(bus: can.BusABC) -> None:
     """Answer every sample on the bus."""
     database: Any = cantools.database.load_file("ecu.dbc")
     names = {message.frame_id: message.name for message in database.messages}
-    estimator, force = Estimator(), 0.0
+    estimator, force = LeastSquares(), 0.0
     for received in bus:
         name = names.get(received.arbitration_id)
         if name not in {"Force", "Travel", "Command"}:
             continue
         values = database.decode_message(name, received.data)
         if name == "Command":
-            estimator = Estimator()
+            estimator = LeastSquares()
             bus.send(frame(database, "Ready", Restarted=1))
         elif name == "Force":
             force = values["Value"]
