@@ -65,7 +65,7 @@ def rates(device: Device, block_n: int) -> list[float]:
     return sorted(found)
 
 
-def libraries() -> Generator[Row]:
+def libraries() -> Generator[Row, None, None]:
     """Plain C libraries, in a child process and in this one."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "trivial.c"
@@ -80,7 +80,7 @@ def libraries() -> Generator[Row]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Iterator[Row]], ...] = (libraries, ecus)
+ROWS: tuple[Callable[[], Generator[Row, None, None]], ...] = (libraries, ecus)
 
 
 def figures() -> Iterator[Figure]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from analogrig.devices.device import Device
@@ -36,7 +36,7 @@ def answer_from_table(ecu: ScriptedEcu, ends: threading.Event) -> None:
                 ecu.bus.send(answer)
 
 
-def ecus() -> Iterator[tuple[str, Device, int]]:
+def ecus() -> Generator[tuple[str, Device, int], None, None]:
     """ECU on a virtual bus: two frames to it and seven back for each sample."""
     with tempfile.TemporaryDirectory() as folder:
         file, ends = write(Path(folder), folder), threading.Event()
