@@ -15,6 +15,7 @@ import pytest
 from analogrig.testing.conformance.test_device import *  # noqa: F403 - the tests, run here on each device
 from tests.harness.faulty_devices import FAULTS, SHARED_MEMORY
 from tests.harness.library_builds import OWN, build
+from tests.harness.scripted_ecu import ScriptedEcu, write
 from tests.harness.test_third_party import install
 
 HERE = Path(__file__).parent
@@ -32,6 +33,7 @@ DEVICES = {
     "python of the page": "python:my_estimator:Rls",
     "library": f"library:{FOLDER / 'own.so'}",
     "library in process": f"library:{FOLDER / 'own.so'}?in_process=true",
+    "ECU": str(FOLDER / "ecu.toml"),
 }
 """Devices of each kind that this machine can run without tools."""
 
@@ -55,14 +57,16 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def _devices() -> Iterator[None]:
-    """Build the library, and write the estimator of the page."""
+    """Build the library, write the estimator of the page, and start an ECU."""
     FOLDER.mkdir()
     build(FOLDER / "own.so", OWN)
     (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     (FOLDER / "my_estimator.py").write_text(source)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(FOLDER)
-        yield
+        write(FOLDER, str(FOLDER))
+        with ScriptedEcu(str(FOLDER)):
+            yield
     shutil.rmtree(FOLDER)
 
 

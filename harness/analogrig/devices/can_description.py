@@ -69,16 +69,19 @@ class CanBusDescription(CanLineDescription):
         return f"the bus was opened as can:{link_name}: is the device on it, at the same bit rate?"
 
     @property
-    def only_one(self) -> str:
-        if self.interface == "virtual":
-            return ""
+    def bus_name(self) -> str:
+        """Name of the bus as described."""
         return f"can:{self.interface}{'/' if self.channel else ''}{self.channel}"
+
+    @property
+    def only_one(self) -> str:
+        return "" if self.interface == "virtual" else self.bus_name
 
     @property
     def things(self) -> tuple[Thing, ...]:
         """The bus. Options are part of its name: python-can takes hosts, ports and driver libraries as such."""
-        if not self.only_one:
+        if self.interface == "virtual":
             return ()
         texts = {key: str(value).lower() if isinstance(value, bool) else value for key, value in self.options.items()}
         options = urlencode(sorted(texts.items()), quote_via=quote)
-        return (Thing("CAN bus", f"{self.only_one}{'?' if options else ''}{options}", "the device opens the CAN bus"),)
+        return (Thing("CAN bus", f"{self.bus_name}{'?' if options else ''}{options}", "the device opens the CAN bus"),)

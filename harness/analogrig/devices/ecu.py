@@ -108,6 +108,7 @@ class EcuDevice(Device):
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
         for block in blocks:
             samples = zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True)
+            self._skip(block.first)
             try:
                 for index, sample in enumerate(samples, block.first):
                     self._exchange(index, *sample)
@@ -116,6 +117,13 @@ class EcuDevice(Device):
                 yield self._take(answered, block.first + answered)
                 raise
             yield self._take(len(block), block.first + len(block))
+
+    def _skip(self, until: int) -> None:
+        """Send the skipped samples before ``until`` as missing ones, and forget their answers."""
+        skipped = range(self._answers.next_index, until)
+        for index in skipped:
+            self._exchange(index, 0, 0, valid=False)
+        self._answers.rows.take(len(skipped), until)
 
     def _exchange(self, index: int, u: int, y: int, valid: bool) -> None:  # noqa: FBT001
         """Send one sample, and take its answer.

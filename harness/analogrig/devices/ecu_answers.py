@@ -53,6 +53,11 @@ class EcuAnswers:
         self.is_complete = False
         """True if the latest sample is answered."""
 
+    @property
+    def next_index(self) -> int:
+        """Index of the sample after the latest."""
+        return self._index + 1
+
     def begin(self, index: int, *, missing: bool) -> None:
         """Await the answer to a sample."""
         self._index, self._is_missing = index, missing
