@@ -95,6 +95,7 @@ class Sound(Device):
             yield self.answer(block)
 
     def answer(self, block: Samples) -> Answers:
+        self.n = block.first
         rows = np.zeros((len(block), 2), np.float32)
         statistic, alarms = np.zeros(len(block), np.float32), []
         for k, (y, valid) in enumerate(zip(block.y.tolist(), block.valid.tolist(), strict=True)):
@@ -129,7 +130,7 @@ class DropsAnswer(Sound):
 
     def answer(self, block: Samples) -> Answers:
         whole = super().answer(block)
-        if not block.first <= 300 < block.first + len(block):
+        if not block.first <= 200 < block.first + len(block):
             return whole
         arrays = {name: getattr(whole, name)[1:] for name in ("flags", "theta", "statistic")}
         return dataclasses.replace(whole, **arrays)
@@ -174,7 +175,7 @@ class Crashes(Sound):
     needs_process = True
 
     def answer(self, block: Samples) -> Answers:
-        if block.first >= 300:
+        if block.first >= 200:
             os.abort()
         return super().answer(block)
 
@@ -184,7 +185,7 @@ class Leaves(Sound):
     needs_process = True
 
     def answer(self, block: Samples) -> Answers:
-        if block.first >= 300:
+        if block.first >= 200:
             os._exit(0)
         return super().answer(block)
 
@@ -194,7 +195,7 @@ class Hangs(Sound):
     needs_process = True
 
     def answer(self, block: Samples) -> Answers:
-        if block.first >= 300:
+        if block.first >= 200:
             threading.Event().wait()
         return super().answer(block)
 
@@ -235,7 +236,7 @@ class ChangesSheet(Sound):
 
     @property
     def datasheet(self) -> Datasheet:
-        return dataclasses.replace(SHEET, hold_off_n=10 if self.n < 300 else 5)
+        return dataclasses.replace(SHEET, hold_off_n=10 if self.n < 200 else 5)
 
 
 class LeaksProcess(Sound):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
+import subprocess
 import tempfile
+import tty
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -19,21 +22,22 @@ from tests.harness.scripted_ecu import ScriptedEcu, write
 from tests.harness.test_third_party import install
 
 HERE = Path(__file__).parent
-PAGE = HERE.parents[1] / "harness/docs/howto/test-a-python-estimator.md"
+ROOT = HERE.parents[1]
+PAGE = ROOT / "harness/docs/howto/test-a-python-estimator.md"
+PROGRAM = ROOT / "harness/examples/program"
 
 FOLDER = Path(tempfile.gettempdir()) / f"analogrig-conformance-{os.getpid()}"
 """Folder of the devices that the tests build."""
 
-ESTIMATORS = "python:tests.harness.python_estimators"
 DEVICES = {
     "inproc": "inproc",
     "host": "host",
-    "python": f"{ESTIMATORS}:Core",
-    "python in blocks": f"{ESTIMATORS}:CoreInBlocks",
-    "python of the page": "python:my_estimator:Rls",
+    "python": "python:my_estimator:Rls",
+    "python in blocks": "python:tests.harness.python_estimators:CoreInBlocks",
     "library": f"library:{FOLDER / 'own.so'}",
-    "library in process": f"library:{FOLDER / 'own.so'}?in_process=true",
-    "ECU": str(FOLDER / "ecu.toml"),
+    "exec": str(FOLDER / "my_program.toml"),
+    "lines": str(FOLDER / "lines.toml"),
+    "can-dbc": str(FOLDER / "ecu.toml"),
 }
 """Devices of each kind that this machine can run without tools."""
 
@@ -56,18 +60,35 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _devices() -> Iterator[None]:
-    """Build the library, write the estimator of the page, and start an ECU."""
+def _devices(pytestconfig: pytest.Config) -> Iterator[None]:
+    """Build the devices, and start the firmware on a terminal and the ECU on a bus."""
     FOLDER.mkdir()
     build(FOLDER / "own.so", OWN)
     (source,) = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     (FOLDER / "my_estimator.py").write_text(source)
-    with pytest.MonkeyPatch.context() as patch:
+    shutil.copytree(PROGRAM, FOLDER, dirs_exist_ok=True)
+    subprocess.run(["make", "--silent", f"ESTIMATOR={ROOT / 'estimator_c'}"], cwd=FOLDER, check=True)
+    with pytest.MonkeyPatch.context() as patch, firmware() as port, ScriptedEcu(FOLDER.name):
         patch.syspath_prepend(FOLDER)
-        write(FOLDER, str(FOLDER))
-        with ScriptedEcu(str(FOLDER)):
-            yield
+        patch.setattr(pytestconfig.option, "hil_allow", [str(FOLDER / "my_program"), port])
+        program = (FOLDER / "my_program.toml").read_text()
+        lines = program.replace('kind = "exec"\narguments = ["./my_program"]', f'kind = "lines"\nurl = "{port}"')
+        (FOLDER / "lines.toml").write_text(lines)
+        write(FOLDER, FOLDER.name)
+        yield
     shutil.rmtree(FOLDER)
+
+
+@contextlib.contextmanager
+def firmware() -> Iterator[str]:
+    """Terminal behind which the program runs as a firmware would."""
+    theirs, ours = os.openpty()
+    tty.setraw(ours)
+    with subprocess.Popen([FOLDER / "my_program"], stdin=theirs, stdout=theirs) as process:
+        os.close(theirs)
+        yield os.ttyname(ours)
+        process.kill()
+        os.close(ours)
 
 
 @pytest.fixture
@@ -96,7 +117,7 @@ def test_suite_finds_every_fault(pytester: pytest.Pytester) -> None:
     pytester.runpytest_subprocess("-q", "--hil-time-limit", "1", "--junitxml", "out.xml")
     cases = ET.parse(pytester.path / "out.xml").getroot().iter("testcase")  # noqa: S314 - written a moment ago
     found = {case.attrib["name"] for case in cases if any(each.tag in ("failure", "error") for each in case)}
-    assert len(wanted) >= 20
+    assert len(wanted) >= 24
     assert found == set(wanted)
 
 
@@ -104,5 +125,5 @@ def test_suite_finds_every_fault(pytester: pytest.Pytester) -> None:
 def test_suite_runs_as_shipped_on_a_device_of_another_package(pytester: pytest.Pytester) -> None:
     done = pytester.runpytest_subprocess("--pyargs", "analogrig.testing.conformance", "--hil-dut", "faulty", "-rs")
     assert done.ret == 0
-    done.assert_outcomes(passed=23, skipped=1)
+    done.assert_outcomes(passed=24, skipped=1)
     done.stdout.fnmatch_lines("*has not the capability blocks")

@@ -242,7 +242,10 @@ def test_missing_samples_are_left_out_of_records_without_valid(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("fault", "told"),
     [
-        ("sys.stdout.buffer.flush(); import os; os.kill(os.getpid(), 11)", "status -11 (SIGSEGV) after sample 4"),
+        (
+            "sys.stdout.buffer.flush(); import os; os.kill(os.getpid(), 11)",
+            "ended with status -11 (SIGSEGV) after sample 4",
+        ),
         ("sys.stdout.buffer.flush(); sys.exit(0)", "ended with status 0 after sample 4"),
         ("u = float('nan')", "a1 = nan for sample 5, which is not finite"),
         ("sys.stdout.buffer.write(bytes(13))", "sent more answers than samples"),

@@ -125,6 +125,11 @@ class CanDbcDevice(CanBusDescription, AdaptedDescription):
         raise ConfigurationError(f"{name}: the signals of a device of the kind {cls.kind} need a device file (.toml)")
 
     @property
+    def only_one(self) -> str:
+        """The bus, also a virtual one: a second process would not find the ECU there."""
+        return self.bus_name
+
+    @property
     def capabilities(self) -> frozenset[Capability]:
         return frozenset({"pace"})
 

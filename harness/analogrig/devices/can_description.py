@@ -70,7 +70,7 @@ class CanBusDescription(CanLineDescription):
 
     @property
     def bus_name(self) -> str:
-        """Name of the bus as described."""
+        """Name of the bus: ``can:INTERFACE/CHANNEL``."""
         return f"can:{self.interface}{'/' if self.channel else ''}{self.channel}"
 
     @property

@@ -19,7 +19,7 @@ from analogrig.rigs.description import open_rig
 from analogrig.run import Channel
 from analogrig.scenario import PotChange, Scenario
 
-SAMPLES_N, CHANGE_AT, BLOCK_N = 600, 400, 97
+SAMPLES_N, CHANGE_AT, BLOCK_N = 360, 240, 97
 """Samples of a record, sample of its change, and usual length of a block: a prime, so that none fits a buffer."""
 
 _ARRAYS = ("flags", "theta", "innovation", "statistic")
