@@ -17,7 +17,6 @@ KINDS = sorted(_FOLDERS)
 
 BREAKS = {
     "ceiling": (r"(define CEILING +)30\.0", r"\g<1>300.0"),
-    "no reset": (r"\(out->alarm != 0U\) \|\| ", ""),
     "stale regressor": (r"self->u\[0\], self->u\[1\], 1\.0", "self->u[1], self->u[1], 1.0"),
     "swapped parameters": (r"= \(float\)self->theta\[i\];", "= (float)self->theta[(i < 2) ? 1 - i : i];"),
 }

@@ -15,6 +15,7 @@ _TEMPLATES = Path(__file__).parents[1] / "templates"
 
 _FOLDERS = {
     "c": ("all", "estimator_c", "c"),
+    "python": ("all", "estimator_py", "python"),
 }
 """Template folders of each kind; no two of them hold the same file."""
 
@@ -28,11 +29,11 @@ def add(commands: Any) -> None:
         "new",
         "write a repository that works: an estimator of your own, its tests, a scenario and CI jobs",
         "new my_estimator",
-        "new my_estimator --kind c",
+        "new my_estimator --kind python",
     )
     command.add_argument("folder", type=Path, metavar="DIR", help="folder to write; must be absent or empty")
     command.add_argument(
-        "--kind", choices=_FOLDERS, default="c", help="estimator as a C library (default: %(default)s)"
+        "--kind", choices=_FOLDERS, default="c", help="device: C library or Python class (default: %(default)s)"
     )
     command.set_defaults(command=_new)
 
