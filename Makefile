@@ -54,7 +54,7 @@ export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects kills \
+        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects repositories kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -103,6 +103,9 @@ metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares com
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+repositories: $(PRODUCTS) ## write a repository of each kind by analogrig new from the wheel, and run all its tests
+	@ANALOGRIG_ALL=1 $(BIN)/pytest tests/harness/test_new.py $(PYTEST_ARGS)
 
 kills: $(PRODUCTS) ## end commands by signals at random instants, 40 of each command by each signal; ARGS="5 7" takes 5 with the seed 7
 	@$(BIN)/python -m tests.harness.kills $(ARGS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -23,6 +24,10 @@ BREAKS = {
 """Mistakes in estimator.c: a pattern, and what replaces it."""
 
 
+QUICK = {} if "ANALOGRIG_ALL" in os.environ else dict.fromkeys(("lines", "can", "python"), "-k learned")
+"""Arguments of pytest for kinds whose tests take longer: `make repositories` runs all of them."""
+
+
 def make(programs: Path, repository: Path, *words: str, status: int = 0) -> str:
     return run("make", *words, f"PYTHON={programs / 'python'}", cwd=repository, status=status)
 
@@ -39,7 +44,7 @@ def repository(
 
 
 def test_tests_of_a_new_repository_pass(users_environment: Path, repository: Path) -> None:
-    output = make(users_environment, repository, "test")
+    output = make(users_environment, repository, "test", f"PYTEST_ARGS={QUICK.get(repository.name, '')}")
     assert re.search(r"= \d\d passed in ", output), output
 
 

@@ -16,6 +16,7 @@ _TEMPLATES = Path(__file__).parents[1] / "templates"
 _FOLDERS = {
     "c": ("all", "estimator_c", "c"),
     "lines": ("all", "estimator_c", "lines"),
+    "can": ("all", "estimator_py", "can"),
     "python": ("all", "estimator_py", "python"),
 }
 """Template folders of each kind; no two of them hold the same file."""
@@ -34,7 +35,10 @@ def add(commands: Any) -> None:
     )
     command.add_argument("folder", type=Path, metavar="DIR", help="folder to write; must be absent or empty")
     command.add_argument(
-        "--kind", choices=_FOLDERS, default="c", help="device: C library, firmware with lines of text or Python class (default: %(default)s)"
+        "--kind",
+        choices=_FOLDERS,
+        default="c",
+        help="C library, firmware with lines of text, ECU on a CAN bus, or Python class (default: %(default)s)",
     )
     command.set_defaults(command=_new)
 

@@ -47,7 +47,7 @@ class Estimator:
             answer["armed"] = self.known_n > LEARN_N
             if answer["armed"]:
                 self.sum = max(0.0, self.sum + square - DRIFT)
-                answer["alarm"] = self.sum > self.ceiling
+                answer["alarm"] = bool(self.sum > self.ceiling)
         scale = [1.0, 1.0, 1.0, 1.0, (1.0 - POLE) ** 2]  # the filter amplifies a constant
         answer |= {"statistic": self.sum, "theta": self.theta * scale}
         if answer["alarm"] or not valid:
