@@ -20,6 +20,7 @@ from analogrig.devices.device import Device
 from analogrig.devices.estimator_library import EstimatorLibrary
 from tests.harness.library_builds import OWN, build
 
+from . import text_programs
 from .ecus import ecus
 from .figure import Figure
 
@@ -80,7 +81,7 @@ def libraries() -> Generator[Row, None, None]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Generator[Row, None, None]], ...] = (libraries, ecus)
+ROWS: tuple[Callable[[], Generator[Row, None, None]], ...] = (libraries, text_programs.rows, ecus)
 
 
 def figures() -> Iterator[Figure]:

@@ -133,10 +133,6 @@ class CanDbcDevice(CanBusDescription, AdaptedDescription):
     def capabilities(self) -> frozenset[Capability]:
         return frozenset({"pace"})
 
-    @property
-    def only_one(self) -> str:
-        return self.bus_name
-
     def known_datasheet(self) -> Datasheet:
         received = self.receive
         return dataclasses.replace(

@@ -54,7 +54,7 @@ def description(request: pytest.FixtureRequest) -> DeviceDescription:
     return trusted(DUT.of(request.node).value, trust_of(request.config))
 
 
-class Known:
+class _Known:
     """Results of one device that several tests read."""
 
     alone: Alone | None = None
@@ -62,17 +62,17 @@ class Known:
     extremes: Mapping[str, Answered] | None = None
 
 
-_KNOWN = pytest.StashKey[dict[str, Known]]()
+_KNOWN = pytest.StashKey[dict[str, _Known]]()
 
 
 @pytest.fixture
-def known(request: pytest.FixtureRequest) -> Known:
+def known(request: pytest.FixtureRequest) -> _Known:
     """Results of the device so far."""
-    return request.config.stash.setdefault(_KNOWN, {}).setdefault(DUT.of(request.node).value, Known())
+    return request.config.stash.setdefault(_KNOWN, {}).setdefault(DUT.of(request.node).value, _Known())
 
 
 @pytest.fixture(autouse=True)
-def alone(request: pytest.FixtureRequest, known: Known, stimulus: Stimulus) -> Alone | None:
+def alone(request: pytest.FixtureRequest, known: _Known, stimulus: Stimulus) -> Alone | None:
     """Results of the device in a process of its own; None if only one process can use it.
 
     A device that crashes or hangs fails every test here, and harms no other.
@@ -100,14 +100,14 @@ def dut(request: pytest.FixtureRequest, alone: Alone | None, hil_dut: Device) ->
 
 
 @pytest.fixture
-def reference(known: Known, dut: Device, stimulus: Stimulus) -> Answered:
+def reference(known: _Known, dut: Device, stimulus: Stimulus) -> Answered:
     """Answers to the usual record, the first time that it was played."""
     known.reference = known.reference or play(dut, stimulus)
     return known.reference
 
 
 @pytest.fixture
-def extremes(known: Known, dut: Device, stimulus: Stimulus) -> Mapping[str, Answered]:
+def extremes(known: _Known, dut: Device, stimulus: Stimulus) -> Mapping[str, Answered]:
     """Answers to records that no plant gives, by name."""
     if known.extremes is None:
         known.extremes = {name: play(dut, extreme) for name, extreme in extreme_stimuli(stimulus)}
