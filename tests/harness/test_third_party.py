@@ -147,4 +147,4 @@ def test_broken_packages_are_listed_and_break_nothing_else(site: Path, folder: P
 
 
 def test_every_kind_states_what_a_list_shows() -> None:
-    assert all(cls.kind == kind and cls.usage.startswith(kind) and cls.summary for kind, cls in KINDS.items())
+    assert all(cls.kind == kind and cls.usage and cls.summary for kind, cls in KINDS.items())

@@ -54,7 +54,7 @@ def description(request: pytest.FixtureRequest) -> DeviceDescription:
     return trusted(DUT.of(request.node).value, trust_of(request.config))
 
 
-class _Known:
+class DeviceResults:
     """Results of one device that several tests read."""
 
     alone: Alone | None = None
@@ -62,23 +62,23 @@ class _Known:
     extremes: Mapping[str, Answered] | None = None
 
 
-_KNOWN = pytest.StashKey[dict[str, _Known]]()
+_RESULTS = pytest.StashKey[dict[str, DeviceResults]]()
 
 
 @pytest.fixture
-def known(request: pytest.FixtureRequest) -> _Known:
+def results(request: pytest.FixtureRequest) -> DeviceResults:
     """Results of the device so far."""
-    return request.config.stash.setdefault(_KNOWN, {}).setdefault(DUT.of(request.node).value, _Known())
+    return request.config.stash.setdefault(_RESULTS, {}).setdefault(DUT.of(request.node).value, DeviceResults())
 
 
 @pytest.fixture(autouse=True)
-def alone(request: pytest.FixtureRequest, known: _Known, stimulus: Stimulus) -> Alone | None:
+def alone(request: pytest.FixtureRequest, results: DeviceResults, stimulus: Stimulus) -> Alone | None:
     """Results of the device in a process of its own; None if only one process can use it.
 
     A device that crashes or hangs fails every test here, and harms no other.
     """
     name = DUT.of(request.node).value
-    if known.alone is None:
+    if results.alone is None:
         try:
             described = trusted(name, trust_of(request.config))
         except AnalogrigError as error:
@@ -86,10 +86,10 @@ def alone(request: pytest.FixtureRequest, known: _Known, stimulus: Stimulus) -> 
         if described.only_one:
             return None
         limit_s = time_limit_s(request.config) or LIMIT_S
-        known.alone = play_alone(described.as_table(), stimulus.as_table(), limit_s)
-    if known.alone.failure:
-        pytest.fail(f"device {name}: in a process of its own it {known.alone.failure}", pytrace=False)
-    return known.alone
+        results.alone = play_alone(described.as_table(), stimulus.as_table(), limit_s)
+    if results.alone.failure:
+        pytest.fail(f"device {name}: in a process of its own it {results.alone.failure}", pytrace=False)
+    return results.alone
 
 
 @pytest.fixture
@@ -100,18 +100,18 @@ def dut(request: pytest.FixtureRequest, alone: Alone | None, hil_dut: Device) ->
 
 
 @pytest.fixture
-def reference(known: _Known, dut: Device, stimulus: Stimulus) -> Answered:
+def reference(results: DeviceResults, dut: Device, stimulus: Stimulus) -> Answered:
     """Answers to the usual record, the first time that it was played."""
-    known.reference = known.reference or play(dut, stimulus)
-    return known.reference
+    results.reference = results.reference or play(dut, stimulus)
+    return results.reference
 
 
 @pytest.fixture
-def extremes(known: _Known, dut: Device, stimulus: Stimulus) -> Mapping[str, Answered]:
+def extremes(results: DeviceResults, dut: Device, stimulus: Stimulus) -> Mapping[str, Answered]:
     """Answers to records that no plant gives, by name."""
-    if known.extremes is None:
-        known.extremes = {name: play(dut, extreme) for name, extreme in extreme_stimuli(stimulus)}
-    return known.extremes
+    if results.extremes is None:
+        results.extremes = {name: play(dut, extreme) for name, extreme in extreme_stimuli(stimulus)}
+    return results.extremes
 
 
 def check_same(found: Answered, expected: Answered, *, without: tuple[str, ...] = ()) -> None:
