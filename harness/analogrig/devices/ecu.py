@@ -106,12 +106,7 @@ class EcuDevice(Device):
     # --------------------------------------------------------------------------------------------------------- the run
 
     def play(self, blocks: Iterable[Samples]) -> Iterator[Answers]:
-        next_sample = 0
         for block in blocks:
-            for index in range(next_sample, block.first):
-                self._exchange(index, 0, 0, valid=False)
-            self._take(block.first - next_sample, block.first)
-            next_sample = block.first + len(block)
             samples = zip(block.u.tolist(), block.y.tolist(), block.valid.tolist(), strict=True)
             self._skip(block.first)
             try:
@@ -121,7 +116,7 @@ class EcuDevice(Device):
                 answered = len(self._answers.rows.flags)
                 yield self._take(answered, block.first + answered)
                 raise
-            yield self._take(len(block), next_sample)
+            yield self._take(len(block), block.first + len(block))
 
     def _skip(self, until: int) -> None:
         """Send the skipped samples before ``until`` as missing ones, and forget their answers."""
