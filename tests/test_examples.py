@@ -24,7 +24,6 @@ BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
 THESIS_7 = "2ba8713bf6ac34db"
 """First digits of the hash of every device of ours."""
-GROUP_OF_THE_EXAMPLES = "239.74.163.2"
 
 
 def run(command: str, folder: Path, status: int = 0) -> str:
