@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from analogrig.devices.device import Device
@@ -53,7 +53,7 @@ int main(void) {
 """Program with binary records that answers u and y."""
 
 
-def rows() -> Iterator[tuple[str, Device, int]]:
+def rows() -> Generator[tuple[str, Device, int]]:
     """Name, connected device and samples in a block, of each row."""
     with tempfile.TemporaryDirectory() as folder:
         lines = ProgramDevice(name="lines", arguments=(_built(Path(folder) / "lines", ALARM_ONLY),))
