@@ -63,9 +63,9 @@ class Tree:
     """Text of each file, by path."""
 
     def python(self, *parts: str) -> Iterator[tuple[str, ast.Module]]:
-        """Path and syntax tree of each Python file of the parts."""
+        """Path and syntax tree of each Python file of the parts; not of what `analogrig new` writes."""
         for path, text in self.files.items():
-            if path.endswith(".py") and path.partition("/")[0] in parts:
+            if path.endswith(".py") and path.partition("/")[0] in parts and "/templates/" not in path:
                 yield path, ast.parse(text)
 
 

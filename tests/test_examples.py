@@ -23,7 +23,8 @@ LIBRARY_PAGE = CHECKOUT / "harness/docs/howto/test-a-c-library.md"
 BIN = Path(sys.executable).parent
 PORT_OF_THE_EXAMPLES = "5000"
 THESIS_7 = "2ba8713bf6ac34db"
-"""First digits of the hash of every device of ours."""
+"""First digits of the theta hash of the scenario thesis, seed 7."""
+GROUP_OF_THE_EXAMPLES = "239.74.163.2"
 
 
 def run(command: str, folder: Path, status: int = 0) -> str:

@@ -21,6 +21,7 @@ from analogrig.devices.estimator_library import EstimatorLibrary
 from tests.harness.library_builds import OWN, build
 
 from . import text_programs
+from .ecus import ecus
 from .figure import Figure
 
 PLAY_S = 0.5
@@ -80,7 +81,7 @@ def libraries() -> Generator[Row, None, None]:
                         yield f"library {place}, blocks of {block_n}{estimator}", device, block_n
 
 
-ROWS: tuple[Callable[[], Generator[Row]], ...] = (libraries, text_programs.rows)
+ROWS: tuple[Callable[[], Generator[Row, None, None]], ...] = (libraries, text_programs.rows, ecus)
 
 
 def figures() -> Iterator[Figure]:
