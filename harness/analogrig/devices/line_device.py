@@ -39,6 +39,8 @@ _AGAIN_S = 0.25
 """Time after which the reset line is repeated: a board that starts when its port is opened misses the first."""
 _QUIET_S = 0.1
 """Silence that ends what a device without an answer to the reset line sends."""
+_REMEMBERED_N = 256
+"""Answers beyond the window that are remembered, to recognise repetitions."""
 _BATCH_BYTES = 2048
 """Most bytes in one write. A pseudo-terminal holds 4,096."""
 
@@ -433,7 +435,7 @@ class LineDevice(TemplateDevice):
             for _ in range(position):
                 self._lose()
             self._recent[echoed] = line
-            if len(self._recent) > self._description.window + _AGAIN_N:
+            if len(self._recent) > self._description.window + _REMEMBERED_N:
                 del self._recent[next(iter(self._recent))]
             self._answer(words)
         elif self._recent.get(echoed, line) != line:
@@ -514,10 +516,6 @@ class LineDevice(TemplateDevice):
                 self._accept(line)
         except (LinkError, DeviceError, TimeLimitReached):
             return
-
-
-_AGAIN_N = 256
-"""Answers beyond the window that are remembered, to recognise repetitions."""
 
 
 def _brief(line: bytes) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from analogrig.devices.answer_form import NO_ANSWER, AnswerAssembler
 from analogrig.devices.line_device import TemplateDevice
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import record
-from analogrig.errors import LinkClosed, LinkTimeout, TimeLimitReached
+from analogrig.errors import DeviceError, LinkClosed, LinkTimeout, TimeLimitReached
 from analogrig.protocol.pace import Pace
 
 _BUFFER_BYTES = 65_536
@@ -55,6 +55,18 @@ class RecordDevice(TemplateDevice):
             self._has_failed = True
             raise
 
+    def stop(self) -> Mapping[str, int]:
+        """:raises DeviceError: there are more answers than samples."""
+        try:
+            if self._wire.read(0.0):
+                raise self._excess(self._answered - 1)
+        except LinkClosed as error:
+            raise self._closed(error, self._answered) from error
+        return {}
+
+    def _excess(self, last: int) -> DeviceError:
+        return self._error(f"sent more answers than samples, the first after sample {last}")
+
     def _exchange(self, block: Samples) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Values and flags of the answers to a block."""
         n = len(block)
@@ -95,7 +107,7 @@ class RecordDevice(TemplateDevice):
             n += len(received)
             parts.append(received)
         if n > needed:
-            raise self._error(f"sent more answers than samples, the first after sample {int(indices[-1])}")
+            raise self._excess(int(indices[-1]))
         return b"".join(parts)
 
     def _silence(self, rest: int) -> LinkTimeout:
