@@ -19,3 +19,10 @@ def recorded_thesis(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with open_rig("emulator") as rig, open_dut("host") as dut:
         Bench(rig, dut).play(Scenario.load("thesis"), seed=3).save(path)
     return path
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let a worker play on the devices that the tests of conformance start themselves: the file has one worker."""
+    for item in items:
+        if item.path.name == "test_conformance.py":
+            vars(item)["hil_equipment"] = lambda: ("", "")
