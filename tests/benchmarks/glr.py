@@ -1,9 +1,9 @@
 """Window-limited generalised likelihood ratio test that knows the plant and every plant it may change to.
 
-The yardstick of ``bench_detectors``: no estimate, no model error. Each hypothesis, a change to one of the plants after
-one of the last samples, has the innovations of its own stationary Kalman filter; the statistic is the largest sum of
-log-likelihood ratios (Willsky and Jones, IEEE Transactions on Automatic Control 21, 1976; Lai, IEEE Transactions on
-Information Theory 44, 1998).
+The yardstick of ``bench_detectors``: it estimates nothing but an offset. Each hypothesis, a change to one of the plants
+after one of the last samples, has the innovations of its own stationary Kalman filter; the statistic is the largest
+sum of log-likelihood ratios (Willsky and Jones, IEEE Transactions on Automatic Control 21, 1976; Lai, IEEE
+Transactions on Information Theory 44, 1998).
 """
 
 from __future__ import annotations
