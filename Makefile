@@ -54,7 +54,7 @@ export UV_NATIVE_TLS := 1
 
 .DELETE_ON_ERROR:
 .PHONY: help setup run test test-bare test-wheels wheels tools check lint strict layout format docs metrics bench firmware no-firmware \
-        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects repositories kills \
+        cost coverage bit-exact analyze eva mutate fuzz fuzz-serve faults hostile defects repositories line-faults packages kills \
         can-guest wheel dist lock clean distclean
 MAKEFLAGS += --no-builtin-rules
 
@@ -103,6 +103,12 @@ metrics: ## figures of structure and documents; ARGS="dea2ac6 HEAD" compares com
 
 bench: $(PRODUCTS) ## measure: one table, and build/bench.json; ARGS="engine" goes to tests.benchmarks
 	@$(BIN)/python -m tests.benchmarks $(ARGS)
+
+packages: $(PRODUCTS) ## the manifests of the C estimator under PlatformIO, ESP-IDF and kconfiglib; downloads 60 MB
+	@$(BIN)/python -m tests.estimator_c.ecosystems
+
+line-faults: $(PRODUCTS) ## every fault of a firmware with lines of text at every step, against a scripted one on a pty
+	@$(BIN)/python -m tests.harness.line_faults
 
 repositories: $(PRODUCTS) ## write a repository of each kind by analogrig new from the wheel, and run all its tests
 	@ANALOGRIG_ALL=1 $(BIN)/pytest tests/harness/test_new.py $(PYTEST_ARGS)

@@ -19,7 +19,7 @@ import pytest
 from analogrig import device_program
 from tests.wheels import CHECKOUT, run
 
-HELP_PER_START_LIMIT = 5.0
+HELP_PER_START_LIMIT = 6.0
 """`analogrig --help` against `python -c pass`: 0.1 s where the interpreter itself needs 20 ms."""
 
 

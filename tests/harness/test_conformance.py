@@ -33,7 +33,6 @@ DEVICES = {
     "inproc": "inproc",
     "host": "host",
     "python": "python:my_estimator:Rls",
-    "python in blocks": "python:tests.harness.python_estimators:CoreInBlocks",
     "library": f"library:{FOLDER / 'own.so'}",
     "exec": str(FOLDER / "my_program.toml"),
     "lines": str(FOLDER / "lines.toml"),
