@@ -305,8 +305,11 @@ def steps(fault: str) -> range:
 
 
 if __name__ == "__main__":
+    unexpected = 0
     for a_protocol, a_fault in cases():
         found = {outcome(a_protocol, a_fault, step) for step in steps(a_fault)}
         kinds = {each for each, _ in found}
+        unexpected += kinds != {EXPECTED[a_protocol][a_fault]}
         state = "" if kinds == {EXPECTED[a_protocol][a_fault]} else "   NOT AS EXPECTED"
         sys.stdout.write(f"{a_protocol:<16}{a_fault:<16}{'/'.join(sorted(kinds)):<12}{min(found)[1]}{state}\n")
+    sys.exit(1 if unexpected else 0)
