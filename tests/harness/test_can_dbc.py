@@ -278,6 +278,7 @@ def test_silent_device_makes_the_run_inconclusive(file: Path) -> None:
     run = played(file, answering=lambda k, frames: frames if k < 1 else [])
     (fault,) = run.conditions.faults
     assert re.search(r"device ecu: sample 11: no complete answer within 0.02 s, for the 11th time \(the bus was", fault)
+    assert run.samples == 12
     assert judge(run).outcome == "inconclusive"
 
 
@@ -386,7 +387,7 @@ def test_closed_bus_names_device_and_sample(file: Path) -> None:
         next(answers)
         dut.close()
         with pytest.raises(LinkError, match="^device ecu: sample 8: virtual/"):
-            next(answers)
+            list(answers)
 
 
 def test_bus_off_is_named_in_the_time_out(file: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analogrig.answers import Samples
+from analogrig.answers import Answers, Samples
 from analogrig.bench import Bench
 from analogrig.config import read_toml
 from analogrig.devices.lines import LinesDevice
@@ -22,7 +22,7 @@ from analogrig.devices.program import ProgramDevice
 from analogrig.devices.registry import from_table, recorded, trusted
 from analogrig.devices.template_description import TemplateDescription
 from analogrig.devices.templates import Reader, Writer
-from analogrig.errors import ConfigurationError, LinkTimeout
+from analogrig.errors import ConfigurationError, LinkError, LinkTimeout
 from analogrig.rigs.description import open_rig
 from analogrig.run import Channel
 from analogrig.scenario import Scenario
@@ -39,6 +39,17 @@ EXAMPLE = ROOT / "harness" / "examples" / "program"
 def test_fault_of_a_line_ends_as_documented(protocol: str, fault: str) -> None:
     for step in (N // 2,) if fault in FLOODS else (0, N // 2, line_faults.steps(fault)[-1]):
         assert outcome(protocol, fault, step)[0] == EXPECTED[protocol][fault]
+
+
+@pytest.mark.parametrize(("fault", "kept"), [("hang-up", 4), ("silence", 5)])
+def test_samples_before_a_failure_are_kept(fault: str, kept: int) -> None:
+    device = Scripted.with_fault("plain", fault, 4)
+    device.recover()
+    answers: list[Answers] = []
+    with pytest.raises(LinkError, match="sample"):
+        answers.extend(line_faults.record(device))
+    assert sum(map(len, answers)) == kept, "a sample of which the time-out has passed counts as lost"
+    device.close()
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -112,7 +112,7 @@ class EcuDevice(Device):
             try:
                 for index, sample in enumerate(samples, block.first):
                     self._exchange(index, *sample)
-            except TimeLimitReached:
+            except (LinkError, TimeLimitReached):
                 answered = len(self._answers.rows.flags)
                 yield self._take(answered, block.first + answered)
                 raise

@@ -280,13 +280,14 @@ class LineDevice(TemplateDevice):
                 self._feed(block)
                 yield from self._take_complete(waiting)
             self._collect(0)
-        except LinkClosed as error:
-            self._accept_rest()
-            raise self._closed(error, self._answered) from error
-        except TimeLimitReached:
+        except (LinkTimeout, TimeLimitReached):
             self._has_failed = True
             yield from self._take_complete(waiting, in_part=True)
             raise
+        except LinkError as error:
+            self._accept_rest()
+            yield from self._take_complete(waiting, in_part=True)
+            raise self._closed(error, self._answered) from error
         yield from self._take_complete(waiting)
 
     def _take_complete(self, waiting: deque[tuple[int, int, bool]], *, in_part: bool = False) -> Iterator[Answers]:
