@@ -121,6 +121,18 @@ def test_silent_firmware_is_told_with_the_speed_of_the_line() -> None:
     os.close(theirs)
 
 
+def test_line_that_matches_no_template_is_told_with_the_template() -> None:
+    device = Scripted.with_fault("plain")
+    device._reader = Reader("receive", "{alarm:d}\n", lambda _: False, None)
+    device.recover()
+    with pytest.raises(LinkTimeout) as raised:
+        list(line_faults.record(device))
+    assert str(raised.value).endswith(
+        r"; its last line '101,0' does not match receive = '{a1:g},{alarm:d}\n'; correct receive in the device file"
+    )
+    device.close()
+
+
 # --------------------------------------------------------------------------------------------------------- templates
 
 MINIMAL: dict[str, Any] = {"name": "bob", "url": "port"}

@@ -505,6 +505,9 @@ class LineDevice(TemplateDevice):
         """Error for a device that does not answer, with what it sent instead."""
         self._has_failed = True
         text = f"device {self.name}: {problem} within {self._description.timeout_s:g} s"
+        if self._other and not (self._tail or self._has_answered):
+            problem = f"its last line {_brief(self._other)} does not match receive = {self._description.receive!r}"
+            return LinkTimeout(f"{text}; {problem}; correct receive in the device file")
         if self._tail or self._other:
             text += f"; its last line was {_brief(self._tail or self._other)}"
         hint = self._description.hint()
