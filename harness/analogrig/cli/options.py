@@ -156,9 +156,9 @@ def add_dut(command: argparse.ArgumentParser, default: str | None, shown: str = 
 
 def changes_of_dut(arguments: argparse.Namespace) -> dict[str, Any]:
     """Changes of the device settings that the command line makes beyond the device's name."""
-    in_real_time = "stream" if arguments.real_time is not None else None
     return {
-        "exchange": arguments.exchange or in_real_time,
+        "exchange": arguments.exchange,
+        "in_real_time": arguments.real_time is not None,
         "baud": arguments.baud,
         "bitrate": arguments.bitrate,
         "report_interval_n": arguments.report_interval,
