@@ -7,13 +7,14 @@ with file, table and key. Nothing read from a file is ever executed.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
 import re
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -69,6 +70,15 @@ def generated_c() -> Path:
 def _folder(in_package: str, in_checkout: str) -> Path:
     installed = Path(__file__).parent / in_package
     return installed if installed.is_dir() else Path(__file__).parents[2] / in_checkout
+
+
+def suggest(name: str, known: Collection[str], *, cutoff: float = 0.6) -> str:
+    """End of an error about an unknown name: the known name that is most like it; empty if none is.
+
+    :param cutoff: least similarity, from 0 to 1.
+    """
+    near = difflib.get_close_matches(name, known, 1, cutoff)
+    return f": did you mean {near[0]!r}?" if near else ""
 
 
 def locate(kind: Kind, name: str) -> Path:

@@ -151,6 +151,7 @@ MINIMAL: dict[str, Any] = {"name": "bob", "url": "port"}
         ({"receive": "{a:g}{b:g}\n"}, "receive: nothing separates a from b"),
         ({"receive": "{a:g}\n{b:g}\n"}, "receive: must be one line"),
         ({"receive": "{alarm:g}\n"}, "receive: alarm must be a whole number, not of the type g"),
+        ({"receive": "{alram:d}\n"}, "receive: field alram: did you mean 'alarm'? If it is an element of theta, state"),
         ({"receive": "x" * 5000}, "receive: longer than 4000 characters"),
         ({"theta": ["a1"]}, "theta: receive has no field a1"),
         ({"window": 2}, 'window: more than 1 sample in flight needs echo = "index"'),

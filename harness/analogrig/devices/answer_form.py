@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from analogrig.answers import Answers, RaisedAlarm
 from analogrig.catalogue import SteppedFlag
+from analogrig.config import suggest
 from analogrig.datasheet import MOST_THETA, Datasheet
 from analogrig.devices.templates import CHECKSUM, MOST_FLOAT32, TemplateField
 from analogrig.errors import DeviceError
@@ -43,9 +44,13 @@ class AnswerForm:
     def __init__(self, names: Sequence[str], theta: Sequence[str] | None) -> None:
         """:param theta: elements of theta in their order; other names that are not known are ignored.
 
-        :raises ValueError: an element of theta is not there, or there are too many.
+        :raises ValueError: an element of theta is not there, there are too many, or a name is almost a known one.
         """
         present = tuple(name for name in names if name not in KNOWN)
+        if theta is None:
+            for name in present:
+                if suggestion := suggest(name, KNOWN, cutoff=0.8):
+                    raise ValueError(f"receive: field {name}{suggestion} If it is an element of theta, state theta")
         self.theta = present if theta is None else tuple(theta)
         for name in self.theta:
             if name not in present:

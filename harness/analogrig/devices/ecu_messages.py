@@ -5,12 +5,12 @@ cantools encodes and decodes. Every name and every range is checked once, when t
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from analogrig.config import suggest
 from analogrig.devices.can_dbc import CanDbcDevice, Request, Units, scale
 from analogrig.errors import ConfigurationError
 from analogrig.links.can_station import Identifier
@@ -406,7 +406,7 @@ class EcuMessages:
         message = next((each for each in self._database.messages if each.name == name), None)
         if message is None:
             known = [each.name for each in self._database.messages]
-            raise self._error(where, f"{self._path} has no message {name!r}{_near(name, known)}")
+            raise self._error(where, f"{self._path} has no message {name!r}{suggest(name, known)}")
         most = FD_BYTES if self._description.fd else CLASSIC_BYTES
         if message.length > most:
             cure = "" if self._description.fd or message.length > FD_BYTES else ": set fd = true"
@@ -432,7 +432,7 @@ class EcuMessages:
         signal = next((each for each in message.signals if each.name == name), None)
         if signal is None:
             known = [each.name for each in message.signals]
-            raise self._error(where, f"message {message.name} has no signal {name!r}{_near(name, known)}")
+            raise self._error(where, f"message {message.name} has no signal {name!r}{suggest(name, known)}")
         if signal.scale == 0:
             raise self._error(where, f"{message.name}.{name} has the scale 0 in the DBC")
         return signal
@@ -477,11 +477,6 @@ class EcuMessages:
 
 def _identifier(message: Any) -> Identifier:
     return message.frame_id, message.is_extended_frame
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    return f": did you mean {near[0]!r}?" if near else ""
 
 
 def _integer_range(signal: Any) -> tuple[int, int]:

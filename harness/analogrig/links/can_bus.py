@@ -6,7 +6,6 @@ Exceptions of python-can become errors of one line that name the bus, the cause 
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import importlib
 import inspect
@@ -18,6 +17,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
+from analogrig.config import suggest
 from analogrig.errors import ConfigurationError, LinkClosed, LinkError
 from analogrig.links.line import CanLine
 from analogrig.links.python_can import BACKENDS, BitTimingDict, BitTimingFdDict, can, slcanBus
@@ -220,8 +220,7 @@ def complete_config(given: Mapping[str, Any]) -> dict[str, Any]:
         return config
     for key in arguments:
         if key not in known:
-            near = difflib.get_close_matches(key, known, 1)
-            hint = f": did you mean {near[0]!r}?" if near else ""
+            hint = suggest(key, known)
             raise ConfigurationError(f"can:{interface}: python-can's {interface} has no key {key!r}{hint}")
     return {key: value for key, value in config.items() if key in known}
 
